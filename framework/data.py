@@ -1,0 +1,290 @@
+"""The data that flow through the pipeline.
+
+Conventions, used everywhere:
+
+- metres, seconds, radians;
+- camera axes x right, y down, z forward; pixel centres at integer coordinates, so that (0, 0) is the centre of
+  the first pixel and the image covers [-0.5, width - 0.5] x [-0.5, height - 0.5];
+- `T_a_b` maps coordinates in b to coordinates in a, so that neighbouring names cancel:
+  `p_world = T_world_camera @ p_camera`;
+- depth is float32 metres along z (not along the ray), 0 = no reading;
+- colour is uint8 RGB;
+- instance 0 = no instance; class index -1 = no class; cluster -1 = the point belongs to no cluster;
+- `None` in place of a pose or of ground truth = not known.
+
+Every dataclass here is frozen and checks shapes, dtypes and finiteness where it is made: data enter the pipeline
+through these types, and the code behind them trusts what it gets.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from framework.errors import DataError
+
+Array = npt.NDArray[np.generic]
+Float32 = npt.NDArray[np.float32]
+Float64 = npt.NDArray[np.float64]
+Int32 = npt.NDArray[np.int32]
+UInt8 = npt.NDArray[np.uint8]
+Bool = npt.NDArray[np.bool_]
+
+ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| that still counts as rigid: published poses carry 4 digits
+PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera without distortion."""
+
+    width: int  # px
+    height: int  # px
+    fx: float  # px
+    fy: float  # px
+    cx: float  # px, of the pixel centre
+    cy: float  # px, of the pixel centre
+
+    def __post_init__(self) -> None:
+        if self.width < 1 or self.height < 1:
+            raise DataError(f"Camera: the image is at least 1x1 px, not {self.width}x{self.height}")
+        numbers = (self.fx, self.fy, self.cx, self.cy)
+        if not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
+            raise DataError(f"Camera: fx, fy must be positive and cx, cy finite; found fx, fy, cx, cy = {numbers}")
+
+    @property
+    def K(self) -> Float64:
+        """The (3, 3) intrinsic matrix."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(height, width), the shape of this camera's images."""
+        return self.height, self.width
+
+    def scaled(self, factor: float) -> Camera:
+        """The camera of the image resized by `factor`, with the pixel centres kept at integers."""
+        width, height = round(self.width * factor), round(self.height * factor)
+        sx, sy = width / self.width, height / self.height
+        return Camera(width, height, self.fx * sx, self.fy * sy, (self.cx + 0.5) * sx - 0.5, (self.cy + 0.5) * sy - 0.5)
+
+
+@dataclass(frozen=True)
+class FrameTruth:
+    """The instances that are really visible in a frame: for ground-truth detectors and for evaluation only."""
+
+    instance_ids: Int32  # (H, W)
+    class_names: Mapping[int, str | None]  # instance id -> class name; None = the class is not known, do not evaluate
+
+    def __post_init__(self) -> None:
+        _check("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One RGB-D image, colour and depth registered to each other."""
+
+    index: int  # the frame's number in its sequence, counted before start, stop and stride choose from it
+    timestamp: float  # s
+    color: UInt8  # (H, W, 3) RGB
+    depth: Float32  # (H, W) m along z, 0 = no reading
+    camera: Camera
+    T_world_camera: Float64 | None = None  # (4, 4) ground truth
+    truth: FrameTruth | None = None
+
+    def __post_init__(self) -> None:
+        where = f"frame {self.index}: "
+        _check(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
+        _check(where + "depth", self.depth, self.camera.shape, np.float32)
+        if self.depth.size and self.depth.min() < 0:
+            raise DataError(f"{where}depth must be 0 or positive, found {self.depth.min()} m")
+        if self.T_world_camera is not None:
+            check_rigid(where + "T_world_camera", self.T_world_camera)
+        if self.truth is not None:
+            _check(where + "truth.instance_ids", self.truth.instance_ids, self.camera.shape, np.int32)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a tracker believes the camera to be. A lost pose is never integrated into the map."""
+
+    T_world_camera: Float64  # (4, 4); for a lost pose the last one that was trusted
+    lost: bool = False
+    reason: str = ""  # why it is lost, for the log
+
+    def __post_init__(self) -> None:
+        check_rigid("Pose.T_world_camera", self.T_world_camera)
+
+
+@dataclass(frozen=True)
+class Detections:
+    """The N objects that a detector found in one image, best first. Masks may overlap; N may be 0."""
+
+    masks: Bool  # (N, H, W)
+    boxes: Float32  # (N, 4) x1 y1 x2 y2, px
+    scores: Float32  # (N,) in [0, 1]
+    class_probabilities: Float32  # (N, C), each row a distribution over `classes`
+    classes: tuple[str, ...]  # names of the C columns
+
+    def __post_init__(self) -> None:
+        n, c = len(self.scores), len(self.classes)
+        _check("Detections.masks", self.masks, (n, None, None), np.bool_)
+        _check("Detections.boxes", self.boxes, (n, 4), np.float32)
+        _check("Detections.scores", self.scores, (n,), np.float32)
+        _check_scores("Detections.scores", self.scores)
+        _check_distributions("Detections.class_probabilities", self.class_probabilities, (n, c))
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    @classmethod
+    def none(cls, shape: tuple[int, int], classes: tuple[str, ...]) -> Detections:
+        """No detection in an image of `shape` (height, width)."""
+        return cls(
+            masks=np.zeros((0, *shape), np.bool_),
+            boxes=np.zeros((0, 4), np.float32),
+            scores=np.zeros(0, np.float32),
+            class_probabilities=np.zeros((0, len(classes)), np.float32),
+            classes=classes,
+        )
+
+
+@dataclass(frozen=True)
+class PointClusters:
+    """The detections of one frame lifted to 3D: P points in N clusters.
+
+    A pixel under several masks appears once for each, so that every mask is a cluster of its own.
+    """
+
+    points_world: Float32  # (P, 3) m
+    pixels: Int32  # (P, 2) (u, v), where the points were seen
+    cluster: Int32  # (P,) in [0, N), -1 = none
+    class_probabilities: Float32  # (N, C), each row a distribution over `classes`
+    scores: Float32  # (N,) in [0, 1]
+    classes: tuple[str, ...]  # names of the C columns
+
+    def __post_init__(self) -> None:
+        p, n, c = len(self.points_world), len(self.scores), len(self.classes)
+        _check("PointClusters.points_world", self.points_world, (p, 3), np.float32)
+        _check("PointClusters.pixels", self.pixels, (p, 2), np.int32)
+        _check("PointClusters.cluster", self.cluster, (p,), np.int32)
+        _check("PointClusters.scores", self.scores, (n,), np.float32)
+        _check_scores("PointClusters.scores", self.scores)
+        _check_distributions("PointClusters.class_probabilities", self.class_probabilities, (n, c))
+        if p and (self.cluster.min() < -1 or self.cluster.max() >= n):
+            raise DataError(
+                f"PointClusters.cluster must be in [-1, {n}), found {self.cluster.min()} to {self.cluster.max()}"
+            )
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+
+@dataclass(frozen=True)
+class View:
+    """What the map shows to a camera: the model side of tracking, association and pictures."""
+
+    camera: Camera
+    T_world_camera: Float64  # (4, 4)
+    depth: Float32  # (H, W) m along z, 0 = nothing mapped there
+    normals_world: Float32  # (H, W, 3) unit length, towards the camera; 0 where depth is 0
+    color: UInt8  # (H, W, 3) RGB
+    instance_ids: Int32  # (H, W), 0 = no instance
+    class_ids: Int32  # (H, W) index into the map's classes, -1 = no class
+
+
+@dataclass(frozen=True)
+class Box:
+    """An oriented box. `rotation`'s columns are its axes in the world; identity for an axis-aligned one."""
+
+    center: Float64  # (3,) m
+    extent: Float64  # (3,) m, full side lengths
+    rotation: Float64  # (3, 3)
+
+
+@dataclass(frozen=True)
+class Instance:
+    """One object of the map."""
+
+    id: int  # 32-bit, from 1
+    class_probabilities: Float32  # (C,) a distribution over the map's classes
+    confidence: float  # in [0, 1], ranks instances in the evaluation
+    observations: int  # frames in which it was detected
+    vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
+    aabb: Box
+    obb: Box
+
+
+@dataclass(frozen=True)
+class InstanceMesh:
+    """The map's surface."""
+
+    vertices: Float32  # (V, 3) m, world
+    triangles: Int32  # (F, 3)
+    colors: UInt8  # (V, 3) RGB
+    instance_ids: Int32  # (V,), 0 = no instance
+    class_ids: Int32  # (V,) index into `classes`, -1 = no class
+    classes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        v = len(self.vertices)
+        _check("InstanceMesh.vertices", self.vertices, (v, 3), np.float32)
+        _check("InstanceMesh.triangles", self.triangles, (None, 3), np.int32)
+        _check("InstanceMesh.colors", self.colors, (v, 3), np.uint8)
+        _check("InstanceMesh.instance_ids", self.instance_ids, (v,), np.int32)
+        _check("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
+
+
+@dataclass(frozen=True)
+class SceneTruth:
+    """The true instances of a sequence as labelled surface points: what a map is evaluated against."""
+
+    points_world: Float32  # (V, 3) m, on the surface that the camera has seen
+    instance_ids: Int32  # (V,), 0 = no instance
+    class_names: Mapping[int, str | None] = field(default_factory=dict)  # as in FrameTruth; None = not evaluated
+
+    def __post_init__(self) -> None:
+        v = len(self.points_world)
+        _check("SceneTruth.points_world", self.points_world, (v, 3), np.float32)
+        _check("SceneTruth.instance_ids", self.instance_ids, (v,), np.int32)
+
+
+def check_rigid(name: str, T: Float64) -> None:
+    """Raises DataError, naming `name`, unless `T` is a finite (4, 4) float64 rigid transform."""
+    _check(name, T, (4, 4), np.float64)
+    R = T[:3, :3]
+    error = float(np.abs(R @ R.T - np.eye(3)).max())
+    if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
+        raise DataError(f"{name} is not a rigid transform: |R R^T - I| is {error:.2g}, det R {np.linalg.det(R):.2g}")
+
+
+def _check(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:
+    """Raises DataError unless `array` has this shape (None = any length) and dtype and only finite values."""
+    if not isinstance(array, np.ndarray) or array.dtype != dtype:
+        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+        raise DataError(f"{name} must be an array of {np.dtype(dtype)}, found {found}")
+    matches = len(array.shape) == len(shape) and all(
+        want in (None, have) for have, want in zip(array.shape, shape, strict=True)
+    )
+    if not matches:
+        wanted = "(" + ", ".join("any" if want is None else str(want) for want in shape) + ")"
+        raise DataError(f"{name} must have shape {wanted}, found {array.shape}")
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise DataError(f"{name} holds values that are not finite")
+
+
+def _check_scores(name: str, scores: Float32) -> None:
+    if scores.size and (scores.min() < 0 or scores.max() > 1):
+        raise DataError(f"{name} must be in [0, 1], found {scores.min()} to {scores.max()}")
+
+
+def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> None:
+    _check(name, rows, shape, np.float32)
+    if rows.size and (rows.min() < 0 or np.abs(rows.sum(axis=1) - 1).max() > PROBABILITY_TOLERANCE):
+        worst = rows.sum(axis=1)[np.abs(rows.sum(axis=1) - 1).argmax()]
+        raise DataError(
+            f"{name}: each row must be a distribution; found a sum of {worst:.4f}, minimum {rows.min():.4f}"
+        )

@@ -1,0 +1,21 @@
+"""What can go wrong in a way that the user can mend. Each error is one line: expected, found, where, what to do."""
+
+
+class InstanceMapError(Exception):
+    """Base of every known error. `python -m framework` prints it as one line; `debug=true` adds the traceback."""
+
+
+class ConfigError(InstanceMapError):
+    """A configuration names something that does not exist or gives a parameter a value that it cannot have."""
+
+
+class DataError(InstanceMapError):
+    """Input that cannot be used: a file is missing, corrupt or inconsistent, or an array has the wrong form."""
+
+
+class FrameError(DataError):
+    """One frame cannot be used and the rest of its sequence can: the pipeline counts it in `frames_skipped`."""
+
+
+class MapFullError(InstanceMapError):
+    """The map has reached its block budget; what was mapped so far is kept."""

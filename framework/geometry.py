@@ -1,0 +1,88 @@
+"""Rigid motions and the pinhole camera, as pure functions. Conventions: see `framework.data`."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+
+from framework.data import Camera, Detections, Float32, Float64, Frame, Int32, PointClusters, Pose
+
+
+def inverse(T_a_b: Float64) -> Float64:
+    """T_b_a of a rigid (4, 4) transform, exactly rigid again."""
+    T_b_a = np.eye(4)
+    T_b_a[:3, :3] = T_a_b[:3, :3].T
+    T_b_a[:3, 3] = -T_a_b[:3, :3].T @ T_a_b[:3, 3]
+    return T_b_a
+
+
+def transform(T_a_b: Float64, points_b: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """The points (..., 3) of frame b in frame a, in the dtype that they came in."""
+    moved = points_b @ T_a_b[:3, :3].T.astype(points_b.dtype) + T_a_b[:3, 3].astype(points_b.dtype)
+    return np.asarray(moved, points_b.dtype)
+
+
+def skew(v: Float64) -> Float64:
+    """The (3, 3) matrix with skew(v) @ w = v x w."""
+    return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
+
+
+def exp_se3(xi: Float64) -> Float64:
+    """The rigid motion exp(xi^) of a twist xi = (translation part, rotation part), (6,) m and rad."""
+    rho, phi = np.asarray(xi[:3], np.float64), np.asarray(xi[3:], np.float64)
+    theta = float(np.linalg.norm(phi))
+    W = skew(phi)
+    if theta < 1e-8:  # the series' next terms are below double precision
+        A, B, C = 1.0, 0.5, 1.0 / 6.0
+    else:
+        A = np.sin(theta) / theta
+        B = (1.0 - np.cos(theta)) / theta**2
+        C = (theta - np.sin(theta)) / theta**3
+    T = np.eye(4)
+    T[:3, :3] = np.eye(3) + A * W + B * W @ W
+    T[:3, 3] = (np.eye(3) + B * W + C * W @ W) @ rho
+    return T
+
+
+def rotation_angle(R: Float64) -> float:
+    """The angle of a (3, 3) rotation, rad, accurate for small angles too."""
+    sine = np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]]) / 2
+    return float(np.arctan2(sine, (np.trace(R) - 1) / 2))
+
+
+def nearest_rotation(R: Float64) -> Float64:
+    """The rotation nearest to a (3, 3) matrix in the Frobenius norm (orthogonal Procrustes)."""
+    U, _, Vt = np.linalg.svd(R)
+    return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
+    """Pixel coordinates (..., 2) (u, v) of points (..., 3) in front of the camera."""
+    x, y, z = points_camera[..., 0], points_camera[..., 1], points_camera[..., 2]
+    return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
+
+
+def back_project(camera: Camera, pixels: Int32, depth: Float32) -> Float32:
+    """Points (P, 3) in camera coordinates of pixels (P, 2) (u, v) with depths (P,) along z."""
+    x = (pixels[:, 0] - np.float32(camera.cx)) * (depth / np.float32(camera.fx))
+    y = (pixels[:, 1] - np.float32(camera.cy)) * (depth / np.float32(camera.fy))
+    return np.stack([x, y, depth], axis=1).astype(np.float32, copy=False)
+
+
+def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
+    """Each mask's pixels that have a depth reading, as points in the world: eq. [5] of the paper.
+
+    Overlapping masks give overlapping clusters. A mask without any reading gives an empty cluster, so that cluster k
+    always is detection k.
+    """
+    cluster, v, u = np.nonzero(detections.masks & (frame.depth > 0))
+    pixels = np.stack([u, v], axis=1).astype(np.int32)
+    points_camera = back_project(frame.camera, pixels, frame.depth[v, u])
+    return PointClusters(
+        points_world=np.asarray(transform(pose.T_world_camera, points_camera), np.float32),
+        pixels=pixels,
+        cluster=cluster.astype(np.int32),
+        class_probabilities=detections.class_probabilities,
+        scores=detections.scores,
+        classes=detections.classes,
+    )

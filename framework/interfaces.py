@@ -1,0 +1,132 @@
+"""The contracts: four stages that plugins fill in, the map that they build, and the sequence that feeds them.
+
+    frame --> Detector --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
+      '-----> PoseTracker ----'                                 |
+                  ^                                             |
+                  '------------- view of the map ---------------'
+
+A plugin is a dataclass that implements one of the four interfaces. Its dataclass fields are its parameters (bool, int,
+float, str, Path or Enum, with unit and bounds beside the default), checked in `__post_init__`; whatever else it keeps
+is assigned there as a plain attribute, never declared as a field. One YAML file in the stage's config group registers it.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from pathlib import Path
+
+from framework.data import (
+    Camera,
+    Detections,
+    Float64,
+    Frame,
+    Instance,
+    InstanceMesh,
+    PointClusters,
+    Pose,
+    SceneTruth,
+    View,
+)
+
+
+class RGBDSequence(ABC):
+    """A recorded or rendered RGB-D video, read frame by frame.
+
+    Every dataset has the parameters `start`, `stop` and `stride`, which choose from the frames that there are.
+    """
+
+    camera: Camera
+    name: str  # for tables: the scene
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """The number of frames chosen."""
+
+    @abstractmethod
+    def __getitem__(self, k: int) -> Frame:
+        """Frame k of the chosen ones, 0 <= k < len. Raises FrameError when that frame cannot be read."""
+
+    def scene_truth(self) -> SceneTruth | None:
+        """The true instances of the chosen frames' scene, None where nobody labelled it."""
+        return None
+
+
+class Detector(ABC):
+    """Finds object instances in one image."""
+
+    classes: tuple[str, ...]  # names of the columns of class_probabilities; known once the detector is built
+
+    @abstractmethod
+    def detect(self, frame: Frame) -> Detections:
+        """The objects in `frame`. The same frame gives the same detections, in whatever order frames come."""
+
+
+class PoseTracker(ABC):
+    """Estimates the camera pose."""
+
+    @abstractmethod
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        """The pose of `frame`; called once per frame, in order. `scene` is read only.
+
+        `Pose.lost` says that the tracker cannot tell; the frame is then not integrated. The first frame defines the
+        world: its true pose where known, else the identity.
+        """
+
+
+class ClusterRefiner(ABC):
+    """Cleans, splits or merges this frame's point clusters."""
+
+    @abstractmethod
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        """Points in, points out. `pixels` say where in `frame` each point was seen; N may change."""
+
+
+class MapFuser(ABC):
+    """Associates clusters with map instances and integrates the frame. The only stage that writes the map."""
+
+    scene: SceneMap
+
+    @abstractmethod
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        """Integrates `frame`, seen from `pose`, with the evidence of its `clusters`.
+
+        Raises MapFullError when the map's block budget is reached.
+        """
+
+
+class SceneMap(ABC):
+    """What a fuser builds."""
+
+    classes: tuple[str, ...]  # the label space; empty until the first frame is fused
+
+    @property
+    @abstractmethod
+    def voxel_count(self) -> int:
+        """Voxels allocated."""
+
+    @property
+    @abstractmethod
+    def byte_count(self) -> int:
+        """Bytes that the map's arrays take."""
+
+    @abstractmethod
+    def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        """What `camera` would see of the map, by ray-casting."""
+
+    @abstractmethod
+    def mesh(self) -> InstanceMesh:
+        """The surface, with colour, instance and class for each vertex."""
+
+    @abstractmethod
+    def instances(self) -> Mapping[int, Instance]:
+        """The objects found so far, by id. Vertex indices refer to `mesh()` of the same map."""
+
+    @abstractmethod
+    def save(self, path: Path) -> None:
+        """Writes the map to one file, whole or not at all."""
+
+    @classmethod
+    @abstractmethod
+    def load(cls, path: Path) -> SceneMap:
+        """The map that `save` wrote. Raises DataError when the file is not such a map or was damaged."""

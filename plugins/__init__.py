@@ -1,0 +1,1 @@
+"""The plugins that ship with InstanceMap: one file, one plugin."""

@@ -1,0 +1,1 @@
+"""Detectors: object instances in one image."""

@@ -1,0 +1,1 @@
+"""Map fusers: associate clusters with instances and integrate the frame."""

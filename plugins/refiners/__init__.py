@@ -1,0 +1,1 @@
+"""Cluster refiners: clean the point clusters of one frame."""

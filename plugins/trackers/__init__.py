@@ -1,0 +1,1 @@
+"""Pose trackers: the camera pose, frame by frame."""
