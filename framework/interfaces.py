@@ -7,7 +7,8 @@
 
 A plugin is a dataclass that implements one of the four interfaces. Its dataclass fields are its parameters (bool, int,
 float, str, Path or Enum, with unit and bounds beside the default), checked in `__post_init__`; whatever else it keeps
-is assigned there as a plain attribute, never declared as a field. One YAML file in the stage's config group registers it.
+is assigned there as a plain attribute, never declared as a field. One YAML file in the stage's config group
+registers it.
 """
 
 from __future__ import annotations
