@@ -1,3 +1,9 @@
 """InstanceMap: incremental instance-oriented semantic 3D mapping from RGB-D video."""
 
+import os
+
 __version__ = "0.1.0"
+
+# The detector's thread and the mapping thread both launch parallel kernels. Of numba's threading layers only OpenMP and TBB
+# allow that; OpenMP comes with torch's requirements, TBB does not, and an old one on the system only gives a warning.
+os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")

@@ -1,0 +1,1 @@
+"""The voxel-hashed map: storage, integration, evidence, association, ray-casting, meshing."""

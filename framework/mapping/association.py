@@ -1,0 +1,120 @@
+"""Data association: which instance of the map is each cluster of the frame?
+
+A cluster's pixels vote for the instances that the map holds at the surface measured there. One cluster gets at most one
+instance and the reverse, best overlap first; the overlap is counted over the smaller of the two, so that a part of an object
+still finds the whole.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Bool, Float32, Int32, PointClusters
+from framework.mapping.evidence import Evidence, best_instance
+from framework.mapping.sensor import Pinhole
+from framework.mapping.voxel_grid import Grid, find_block
+from framework.mapping.voxel_walk import voxel_number
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """How N clusters lie on the M instances that the frame sees."""
+
+    instance_ids: Int32  # (M,) ascending
+    visible: Int32  # (M,) pixels that see each instance
+    sizes: Int32  # (N,) pixels of each cluster
+    votes: Int32  # (N, M) pixels of both
+
+    @property
+    def over_smaller(self) -> npt.NDArray[np.float64]:
+        """(N, M) shared pixels over the smaller of cluster and visible instance, in [0, 1]."""
+        return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), 1)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def look_up_instances(grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, instance_ids: Int32) -> None:
+    """Fills instance_ids (H, W) with the instance of the voxel nearest to each reading of `depth`; 0 = none.
+
+    This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object that is
+    new, and it costs one look-up a pixel. `view` holds T_world_camera.
+    """
+    height, width = depth.shape
+    scale = np.float32(1.0) / grid.voxel_size
+    half = np.float32(0.5)
+    for v in prange(height):
+        ray_y = (np.float32(v) - view.cy) / view.fy
+        key = np.int64(-2)
+        region = np.int32(-1)
+        for u in range(width):
+            instance_ids[v, u] = 0
+            z = depth[v, u]
+            if z <= np.float32(0.0):
+                continue
+            ray_x = (np.float32(u) - view.cx) / view.fx
+            x = view.t[0] + z * (view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2])
+            y = view.t[1] + z * (view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2])
+            w = view.t[2] + z * (view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2])
+            i = int(np.floor(x * scale + half))
+            j = int(np.floor(y * scale + half))
+            k = int(np.floor(w * scale + half))
+            block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+            if block >= 0 and grid.label_row[block] >= 0:
+                instance_ids[v, u] = best_instance(evidence, grid.label_row[block], voxel_number(i, j, k))
+
+
+def count_overlaps(clusters: PointClusters, instance_ids: Int32) -> Overlaps:
+    """Votes of the clusters' pixels on `instance_ids` (H, W), the instances seen in the frame."""
+    visible = np.bincount(instance_ids.ravel())
+    visible[0] = 0
+    seen = np.flatnonzero(visible)
+    column = np.full(len(visible), len(seen))  # of each id in the table of votes; the last one stands for no instance
+    column[seen] = np.arange(len(seen))
+    members = clusters.cluster >= 0
+    cluster = clusters.cluster[members].astype(np.int64)
+    u, v = clusters.pixels[members].T
+    n, m = len(clusters), len(seen) + 1
+    votes = np.bincount(cluster * m + column[instance_ids[v, u]], minlength=n * m).reshape(n, m)
+    return Overlaps(
+        instance_ids=seen.astype(np.int32),
+        visible=visible[seen].astype(np.int32),
+        sizes=votes.sum(axis=1).astype(np.int32),
+        votes=votes[:, :-1].astype(np.int32),
+    )
+
+
+def match_one_to_one(overlap: npt.NDArray[np.float64], threshold: float) -> Int32:
+    """(N,) the column that each row is matched with, -1 = none: best overlap (N, M) first, above `threshold`.
+
+    Ties go to the smaller column, then to the smaller row.
+    """
+    match = np.full(len(overlap), -1, np.int32)
+    rows, columns = np.nonzero(overlap > threshold)
+    taken = np.zeros(overlap.shape[1], np.bool_)
+    for i in np.lexsort((rows, columns, -overlap[rows, columns])):
+        row, column = rows[i], columns[i]
+        if match[row] < 0 and not taken[column]:
+            match[row] = column
+            taken[column] = True
+    return match
+
+
+def cover_another(clusters: PointClusters, shape: tuple[int, int], threshold: float) -> Bool:
+    """(N,) clusters that share more than `threshold` of the smaller one's pixels with a cluster of a better score.
+
+    Such a cluster is most likely the same object found twice and must not become an instance of its own.
+    """
+    n = len(clusters)
+    members = clusters.cluster >= 0
+    u, v = clusters.pixels[members].T.astype(np.int64)
+    masks = np.zeros((n, shape[0] * shape[1]), np.float32)
+    masks[clusters.cluster[members], v * shape[1] + u] = 1
+    shared = masks @ masks.T
+    sizes = shared.diagonal()
+    over_smaller = shared / np.maximum(np.minimum(sizes[:, None], sizes[None, :]), 1)
+    rank = np.lexsort((np.arange(n), -clusters.scores)).argsort()
+    better = rank[None, :] < rank[:, None]
+    return np.asarray((better & (over_smaller > threshold)).any(axis=1))

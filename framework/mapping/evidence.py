@@ -1,0 +1,273 @@
+"""The voxel-wise Bayesian update: class and instance distributions as two independent recursions, eqs. [7] and [8].
+
+    P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
+
+runs in log space as a sum of log-likelihoods, from a uniform start. Only the ratios between labels matter, so a voxel stores
+each label's sum relative to the labels that nobody named there, whose sum is 0 by that definition ("the rest"). A voxel
+keeps the SLOTS most likely instances and classes and drops the least likely one when another one is named (an eviction,
+counted). What a dropped or unnamed label would have gained over the rest is lost; everything that stays is exact.
+
+Rows of 512 voxels exist only for blocks in which something was detected: 8 bytes an instance slot, 6 a class slot, so
+56 bytes a labelled voxel.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Bool, Float32, Int32
+from framework.mapping.sensor import Pinhole
+from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, VoxelGrid, grown
+
+SLOTS = 4  # instances and classes that a voxel can tell apart
+NEW_CLASSES = 4  # a detection can bring its best so many classes into a voxel's slots
+
+
+class Evidence(NamedTuple):
+    """Log-likelihoods of labels, relative to every label not named. The best label is always in slot 0."""
+
+    instance_ids: Int32  # (R, 512, SLOTS), 0 = free slot
+    instance_log: Float32  # (R, 512, SLOTS)
+    class_ids: npt.NDArray[np.int16]  # (R, 512, SLOTS), -1 = free slot
+    class_log: Float32  # (R, 512, SLOTS)
+
+
+class Measurement(NamedTuple):
+    """What one frame's clusters say, P(O_u | I_t): N clusters, C classes."""
+
+    first_point: Int32  # (H, W) the first entry of each pixel's list of cluster points, -1 = under no cluster
+    next_point: Int32  # (P,) the next entry of the same pixel, -1 = last
+    cluster: Int32  # (P,) whose point it is
+    instance_id: Int32  # (N,) the instance that each cluster was associated with, 0 = none: it says nothing
+    instance_gain: Float32  # (N,) log P(O = that instance) / P(O = any other)
+    absence_loss: np.float32  # log-likelihood ratio, negative, for an instance matched in this frame but not seen here
+    matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
+    class_gain: Float32  # (N, C) log P(O = c) / P(O = a class not named)
+    named_classes: npt.NDArray[np.int16]  # (N, NEW_CLASSES) each cluster's best classes
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def best_instance(evidence, row, n):
+    """The most likely instance of a voxel, 0 when none is more likely than the rest."""
+    return evidence.instance_ids[row, n, 0] if evidence.instance_log[row, n, 0] > 0 else np.int32(0)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def best_class(evidence, row, n):
+    """The most likely class of a voxel, -1 when none was ever named."""
+    return np.int32(evidence.class_ids[row, n, 0])
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def add_evidence(labels, logs, free, label, gain):
+    """Adds `gain` to a label's slot, or gives it the free or least likely one. Returns 1 when that evicted another."""
+    least = 0
+    for s in range(SLOTS):
+        if labels[s] == label:
+            logs[s] += gain
+            return 0
+        if labels[s] == free:
+            labels[s] = label
+            logs[s] = gain
+            return 0
+        if logs[s] < logs[least]:
+            least = s
+    if logs[least] >= gain:
+        return 1  # the newcomer is itself the least likely: it is the one that is dropped
+    labels[least] = label
+    logs[least] = gain
+    return 1
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _best_first(labels, logs, free):
+    """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not matter."""
+    best = 0
+    for s in range(1, SLOTS):
+        if labels[s] != free and (logs[s] > logs[best] or (logs[s] == logs[best] and labels[s] < labels[best])):
+            best = s
+    if best > 0:
+        labels[0], labels[best] = labels[best], labels[0]
+        logs[0], logs[best] = logs[best], logs[0]
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def update_voxel(evidence, row, n, measurement, point):
+    """Both recursions for one voxel that is seen at a pixel whose list of cluster points starts at `point`, -1 = empty.
+
+    Returns the number of evictions.
+    """
+    ids = evidence.instance_ids[row, n]
+    id_logs = evidence.instance_log[row, n]
+    classes = evidence.class_ids[row, n]
+    class_logs = evidence.class_log[row, n]
+    evicted = 0
+    # evidence of absence: an instance that was found in this frame, but not here
+    for s in range(SLOTS):
+        if ids[s] > 0 and measurement.matched[ids[s]]:
+            covered = False
+            p = point
+            while p >= 0:
+                covered = covered or measurement.instance_id[measurement.cluster[p]] == ids[s]
+                p = measurement.next_point[p]
+            if not covered:
+                id_logs[s] += measurement.absence_loss
+    p = point
+    while p >= 0:
+        k = measurement.cluster[p]
+        p = measurement.next_point[p]
+        if measurement.instance_id[k] == 0:
+            continue
+        evicted += add_evidence(ids, id_logs, 0, measurement.instance_id[k], measurement.instance_gain[k])
+        for s in range(SLOTS):
+            if classes[s] >= 0:
+                class_logs[s] += measurement.class_gain[k, classes[s]]
+        for m in range(NEW_CLASSES):
+            label = measurement.named_classes[k, m]
+            known = False
+            for s in range(SLOTS):
+                known = known or classes[s] == label
+            if not known:
+                evicted += add_evidence(classes, class_logs, -1, label, measurement.class_gain[k, label])
+    _best_first(ids, id_logs, 0)
+    _best_first(classes, class_logs, -1)
+    return evicted
+
+
+@njit(cache=True, nogil=True)
+def list_points_by_pixel(pixels, cluster, first_point, next_point):
+    """Links the points of each pixel into a list: a pixel under overlapping masks has several."""
+    first_point[:] = -1
+    for p in range(pixels.shape[0] - 1, -1, -1):
+        if cluster[p] >= 0:
+            u, v = pixels[p, 0], pixels[p, 1]
+            next_point[p] = first_point[v, u]
+            first_point[v, u] = p
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _visit(grid, active, depth, camera, band, evidence, measurement, wants_row, update, evicted):
+    """Visits every voxel of the active blocks within `band` of the surface that `camera` (T_camera_world) measured.
+
+    update False: notes in wants_row (A,) which blocks without a row have a voxel under some cluster.
+    update True: updates the voxels of the blocks that have a row; evicted (A,) counts.
+    """
+    height, width = depth.shape
+    half = np.float32(0.5)
+    one = np.float32(1.0)
+    right = np.float32(width) - half
+    bottom = np.float32(height) - half
+    for a in prange(active.shape[0]):
+        block = active[a]
+        label_row = grid.label_row[block]
+        wants_row[a] = False
+        evicted[a] = 0
+        if (label_row >= 0) != update:
+            continue
+        x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE) * grid.voxel_size
+        y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE) * grid.voxel_size
+        z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE) * grid.voxel_size
+        for n in range(BLOCK_VOXELS):
+            x = x0 + np.float32(n & 7) * grid.voxel_size
+            y = y0 + np.float32((n >> 3) & 7) * grid.voxel_size
+            z = z0 + np.float32(n >> 6) * grid.voxel_size
+            qz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
+            if qz <= np.float32(0.0):
+                continue
+            w = one / qz
+            qx = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
+            u = camera.fx * qx * w + camera.cx
+            if not (u > -half and u < right):
+                continue
+            qy = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
+            v = camera.fy * qy * w + camera.cy
+            if not (v > -half and v < bottom):
+                continue
+            column = np.int32(u + half)
+            line = np.int32(v + half)
+            d = depth[line, column]
+            if d <= np.float32(0.0) or abs(d - qz) > band:
+                continue
+            point = measurement.first_point[line, column]
+            if update:
+                evicted[a] += update_voxel(evidence, label_row, n, measurement, point)
+            elif point >= 0:
+                wants_row[a] = True
+                break
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _merge(evidence, rows, kept, dropped):
+    for row in prange(rows):
+        for n in range(BLOCK_VOXELS):
+            ids = evidence.instance_ids[row, n]
+            logs = evidence.instance_log[row, n]
+            for s in range(SLOTS):
+                if ids[s] == dropped:
+                    gain = logs[s]
+                    last = SLOTS - 1  # slots stay filled from the front
+                    while ids[last] == 0:
+                        last -= 1
+                    ids[s], logs[s] = ids[last], logs[last]
+                    ids[last], logs[last] = 0, 0
+                    add_evidence(ids, logs, 0, kept, gain)
+                    _best_first(ids, logs, 0)
+                    break
+
+
+class EvidenceRows:
+    """Owns the label evidence of a grid's blocks and makes it grow. The kernels work on `self.evidence`."""
+
+    def __init__(self, voxels: VoxelGrid) -> None:
+        self.voxels = voxels
+        self.row_count = 0
+        self.evicted = 0  # slots given to another label so far
+        self.evidence = Evidence(
+            instance_ids=np.zeros((64, BLOCK_VOXELS, SLOTS), np.int32),
+            instance_log=np.zeros((64, BLOCK_VOXELS, SLOTS), np.float32),
+            class_ids=np.full((64, BLOCK_VOXELS, SLOTS), -1, np.int16),
+            class_log=np.zeros((64, BLOCK_VOXELS, SLOTS), np.float32),
+        )
+
+    @property
+    def byte_count(self) -> int:
+        return sum(array.nbytes for array in self.evidence)
+
+    def update(self, active: Int32, depth: Float32, camera: Pinhole, band: float, measurement: Measurement) -> None:
+        """Updates the voxels of the `active` blocks within `band` m of the surface `depth` (H, W) m, seen by `camera`.
+
+        `camera` holds T_camera_world.
+        """
+        wants_row = np.zeros(len(active), np.bool_)
+        evicted = np.zeros(len(active), np.int32)
+        arguments = (depth, camera, np.float32(band))
+        _visit(
+            self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, False, evicted
+        )
+        self._add_rows(active[wants_row])
+        _visit(
+            self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, True, evicted
+        )
+        self.evicted += int(evicted.sum())
+
+    def merge_instances(self, kept: int, dropped: int) -> None:
+        """Adds the evidence for instance `dropped` to that for `kept` in every voxel. Rare, and it visits the whole map."""
+        _merge(self.evidence, self.row_count, np.int32(kept), np.int32(dropped))
+
+    def _add_rows(self, blocks: Int32) -> None:
+        """Gives each of these blocks a row, in the order given."""
+        needed = self.row_count + len(blocks)
+        if needed > len(self.evidence.instance_ids):
+            capacity = max(needed, 2 * len(self.evidence.instance_ids))
+            self.evidence = Evidence(
+                instance_ids=grown(self.evidence.instance_ids, capacity, 0),
+                instance_log=grown(self.evidence.instance_log, capacity, 0),
+                class_ids=grown(self.evidence.class_ids, capacity, -1),
+                class_log=grown(self.evidence.class_log, capacity, 0),
+            )
+        self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
+        self.row_count = needed

@@ -1,0 +1,191 @@
+"""The map of object instances: voxels, label evidence and the table of instances, as one SceneMap."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from dataclasses import asdict
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import open3d as o3d
+
+from framework.atomic_files import written_whole
+from framework.data import Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, View
+from framework.errors import DataError
+from framework.interfaces import SceneMap
+from framework.mapping.evidence import Evidence, EvidenceRows
+from framework.mapping.instance_table import InstanceRecord, InstanceTable
+from framework.mapping.meshing import extract_mesh
+from framework.mapping.raycasting import render
+from framework.mapping.sensor import Sensor
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
+
+FORMAT = 1  # of the saved file; a change of meaning counts it up
+
+
+class InstanceMap(SceneMap):
+    """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads.
+
+    An instance counts, in `mesh` and `instances`, once it has been observed `min_observations` times and has
+    `min_vertices` vertices; before, it is tentative: `render` shows it, because association needs it.
+    """
+
+    def __init__(
+        self, voxel_size: float, sensor: Sensor, max_blocks: int, min_observations: int, min_vertices: int
+    ) -> None:
+        self.classes: tuple[str, ...] = ()
+        self.sensor = sensor
+        self.min_observations = min_observations
+        self.min_vertices = min_vertices
+        self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
+        self.labels = EvidenceRows(self.voxels)
+        self.table = InstanceTable()
+
+    @property
+    def voxel_size(self) -> float:
+        """m"""
+        return float(self.voxels.grid.voxel_size)
+
+    @property
+    def voxel_count(self) -> int:
+        return self.voxels.block_count * BLOCK_VOXELS
+
+    @property
+    def byte_count(self) -> int:
+        return self.voxels.byte_count + self.labels.byte_count
+
+    def changed(self) -> None:
+        """To be called after the map was written: what was derived from it is out of date."""
+        self.__dict__.pop("_surface", None)
+
+    def merge(self, kept: int, dropped: int) -> None:
+        """Makes instance `dropped` a part of `kept`, in the table and in every voxel."""
+        self.table.merge(kept, dropped)
+        self.labels.merge_instances(kept, dropped)
+
+    def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        return render(self.voxels, self.labels.evidence, self.sensor, camera, T_world_camera)
+
+    def mesh(self) -> InstanceMesh:
+        return self._surface
+
+    @cached_property
+    def _surface(self) -> InstanceMesh:
+        vertices, triangles, colors, instance_ids, class_ids = extract_mesh(
+            self.voxels.grid, self.voxels.block_count, self.labels.evidence
+        )
+        shown = np.zeros(self.table.last_id + 1, np.bool_)
+        sizes = np.bincount(instance_ids, minlength=len(shown))
+        for record in self.table.records.values():
+            enough = record.observations >= self.min_observations and sizes[record.id] >= self.min_vertices
+            shown[record.id] = enough
+        counts = shown[instance_ids]
+        instance_ids[~counts] = 0
+        class_ids[~counts] = -1  # a voxel of no object has no class, whatever a mask once said that bled over it
+        return InstanceMesh(vertices, triangles, colors, instance_ids, class_ids, self.classes)
+
+    def instances(self) -> Mapping[int, Instance]:
+        mesh = self.mesh()
+        order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
+        ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
+        members = np.split(order, starts[1:])
+        return {
+            int(k): _instance(self.table.records[int(k)], vertices, mesh.vertices[vertices])
+            for k, vertices in zip(ids, members, strict=True)
+            if k > 0
+        }
+
+    def save(self, path: Path) -> None:
+        grid, evidence = self.voxels.grid, self.labels.evidence
+        b, r = self.voxels.block_count, self.labels.row_count
+        header = {
+            "format": FORMAT,
+            "voxel_size": self.voxel_size,
+            "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
+            "max_blocks": self.voxels.max_blocks,
+            "min_observations": self.min_observations,
+            "min_vertices": self.min_vertices,
+            "classes": self.classes,
+            "last_id": self.table.last_id,
+            "evicted": self.labels.evicted,
+            "instances": [
+                {**asdict(record), "class_log": record.class_log.tolist()} for record in self.table.records.values()
+            ],
+        }
+        arrays: dict[str, npt.NDArray[Any]] = {
+            "block_coords": grid.block_coords[:b],
+            "tsdf": grid.tsdf[:b],
+            "weight": grid.weight[:b],
+            "color": grid.color[:b],
+            "label_row": grid.label_row[:b],
+            **{name: array[:r] for name, array in evidence._asdict().items()},
+        }
+        with written_whole(path) as temporary, temporary.open("wb") as file:
+            np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> InstanceMap:
+        header, arrays = _read(path)
+        scene = cls(
+            header["voxel_size"],
+            Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()}),
+            header["max_blocks"],
+            header["min_observations"],
+            header["min_vertices"],
+        )
+        scene.classes = tuple(header["classes"])
+        scene.voxels.allocate(arrays["block_coords"])
+        b = scene.voxels.block_count
+        for name in ("tsdf", "weight", "color", "label_row"):
+            getattr(scene.voxels.grid, name)[:b] = arrays[name]
+        scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
+        scene.labels.row_count = len(scene.labels.evidence.instance_ids)
+        scene.labels.evicted = header["evicted"]
+        scene.table.last_id = header["last_id"]
+        for entry in header["instances"]:
+            record = InstanceRecord(**{**entry, "class_log": np.array(entry["class_log"])})
+            scene.table.records[record.id] = record
+        return scene
+
+
+def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
+    """The header and the arrays of a saved map. Raises DataError unless every checksum holds."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+        if damaged is not None:
+            raise DataError(f"{path}: the checksum of {damaged} does not hold; the file is damaged, map again")
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = json.loads(arrays.pop("header").tobytes())
+    except (OSError, ValueError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+        raise DataError(f"{path} is not a map that can be read: {error}") from error
+    if header.get("format") != FORMAT:
+        raise DataError(f"{path} has map format {header.get('format')}, this version reads {FORMAT}")
+    return header, arrays
+
+
+def _instance(record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    return Instance(
+        id=record.id,
+        class_probabilities=record.class_probabilities,
+        confidence=record.confidence,
+        observations=record.observations,
+        vertices=vertices,
+        aabb=Box((low + high) / 2, high - low, np.eye(3)),
+        obb=_oriented_box(points),
+    )
+
+
+def _oriented_box(points: Float32) -> Box:
+    """The box along the principal axes of the points' convex hull (Open3D); `robust` lets flat and thin sets pass."""
+    box = o3d.geometry.OrientedBoundingBox.create_from_points(
+        o3d.utility.Vector3dVector(points.astype(np.float64)), robust=True
+    )
+    return Box(np.asarray(box.center), np.asarray(box.extent), np.asarray(box.R))

@@ -1,0 +1,261 @@
+"""From a depth image to the map: which blocks it touches, and the running averages of their voxels.
+
+The signed distance is projective, along z; its running average is the TSDF of Curless and Levoy (1996). The truncation
+distance widens with depth as the sensor's noise does, and the weight of an observation falls with depth squared.
+
+All kernels are parallel over independent rows or blocks; candidates are gathered in chunks whose number does not depend on
+the number of threads, and blocks are numbered in a serial pass, so that the map is the same with any number of threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numba import njit, prange
+
+from framework.data import Float64, Frame, Int32
+from framework.geometry import inverse
+from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.voxel_grid import BLOCK_SIDE, REGION_SIDE, WEIGHT_ONE, VoxelGrid, find_block, grown
+from framework.mapping.voxel_walk import inverses, leave_cell
+
+CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
+RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
+GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _remember(recent, bx, by, bz):
+    """True when the block was passed to `recent` (RECENT, 4) lately; remembers it otherwise."""
+    slot = (bx * 73856093 ^ by * 19349669 ^ bz * 83492791) & (RECENT - 1)
+    if recent[slot, 3] == 1 and recent[slot, 0] == bx and recent[slot, 1] == by and recent[slot, 2] == bz:
+        return True
+    recent[slot, 0] = bx
+    recent[slot, 1] = by
+    recent[slot, 2] = bz
+    recent[slot, 3] = 1
+    return False
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _note(found, n, bx, by, bz):
+    """Writes a block into `found` (M, 3) if there is room; the caller counts on, and asks again with more room."""
+    if n < found.shape[0]:
+        found[n, 0] = bx
+        found[n, 1] = by
+        found[n, 2] = bz
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _surface_blocks(depth, view, sensor, block_size, stride, found, counts):
+    """Blocks along the truncation band of every stride-th reading, chunk by chunk, into `found` (CHUNKS, M, 3)."""
+    height, width = depth.shape
+    rows = (height + stride - 1) // stride
+    inverse_size = np.float32(1.0) / block_size
+    for chunk in prange(CHUNKS):
+        recent = np.zeros((RECENT, 4), np.int32)
+        n = 0
+        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
+            v = row * stride
+            ray_y = (np.float32(v) - view.cy) / view.fy
+            for u in range(0, width, stride):
+                d = depth[v, u]
+                if d < sensor.min_depth or d > sensor.max_depth:
+                    continue
+                ray_x = (np.float32(u) - view.cx) / view.fx
+                dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]
+                dy = view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2]
+                dz = view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2]
+                band = sensor.truncation + sensor.truncation_slope * d
+                # samples at most half a block apart along the ray
+                length = np.sqrt(ray_x * ray_x + ray_y * ray_y + np.float32(1.0))
+                steps = int(np.ceil(np.float32(4.0) * band * length * inverse_size))
+                for s in range(steps + 1):
+                    z = d - band + np.float32(2.0) * band * np.float32(s) / np.float32(steps)
+                    bx = int(np.floor((view.t[0] + z * dx) * inverse_size))
+                    by = int(np.floor((view.t[1] + z * dy) * inverse_size))
+                    bz = int(np.floor((view.t[2] + z * dz) * inverse_size))
+                    if not _remember(recent, bx, by, bz):
+                        _note(found[chunk], n, bx, by, bz)
+                        n += 1
+        counts[chunk] = n
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _free_blocks(grid, depth, view, sensor, block_size, stride, found, counts):
+    """Allocated blocks that lie between the camera and the readings, to be carved. Same output as _surface_blocks."""
+    height, width = depth.shape
+    rows = (height + stride - 1) // stride
+    inverse_size = np.float32(1.0) / block_size
+    for chunk in prange(CHUNKS):
+        recent = np.zeros((RECENT, 4), np.int32)
+        n = 0
+        key = np.int64(-2)
+        region = np.int32(-1)
+        region_size = block_size * np.float32(REGION_SIDE)
+        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
+            v = row * stride
+            ray_y = (np.float32(v) - view.cy) / view.fy
+            for u in range(0, width, stride):
+                d = depth[v, u]
+                if d < sensor.min_depth or d > sensor.max_depth:
+                    continue
+                ray_x = (np.float32(u) - view.cx) / view.fx
+                dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]
+                dy = view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2]
+                dz = view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2]
+                length = np.sqrt(ray_x * ray_x + ray_y * ray_y + np.float32(1.0))
+                step = np.float32(0.75) * block_size / length
+                z = sensor.min_depth
+                stop = d - sensor.truncation - sensor.truncation_slope * d
+                while z < stop:
+                    bx = int(np.floor((view.t[0] + z * dx) * inverse_size))
+                    by = int(np.floor((view.t[1] + z * dy) * inverse_size))
+                    bz = int(np.floor((view.t[2] + z * dz) * inverse_size))
+                    block, key, region = find_block(grid, bx, by, bz, key, region)
+                    if block >= 0 and not _remember(recent, bx, by, bz):
+                        _note(found[chunk], n, bx, by, bz)
+                        n += 1
+                    if region >= 0:
+                        z += step
+                    else:
+                        d_world = (dx, dy, dz)
+                        z = np.float32(0.1) * step + leave_cell(
+                            z, view.t, d_world, inverses(d_world), region_size, np.float32(1.0) / region_size
+                        )
+        counts[chunk] = n
+
+
+@njit(cache=True, nogil=True)
+def _number_blocks(grid, coords, stamp, frame, active):
+    """The blocks at `coords`, each once, in order of first mention, into `active`; returns how many."""
+    n = 0
+    key = np.int64(-2)
+    region = np.int32(-1)
+    for i in range(coords.shape[0]):
+        block, key, region = find_block(grid, coords[i, 0], coords[i, 1], coords[i, 2], key, region)
+        if block >= 0 and stamp[block] != frame:
+            stamp[block] = frame
+            active[n] = block
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _integrate(grid, active, depth, color, camera, sensor, rounding):
+    """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
+
+    `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
+    """
+    height, width = depth.shape
+    to_units = np.float32(1.0) / grid.tsdf_unit
+    one = np.float32(1.0)
+    half = np.float32(0.5)
+    step_x = camera.R[0, 0] * grid.voxel_size
+    step_y = camera.R[1, 0] * grid.voxel_size
+    step_z = camera.R[2, 0] * grid.voxel_size
+    full2 = sensor.full_weight_depth * sensor.full_weight_depth
+    weight_one = np.float32(WEIGHT_ONE)
+    max_weight = sensor.max_weight * weight_one
+    right = np.float32(width) - half
+    bottom = np.float32(height) - half
+    for a in prange(active.shape[0]):
+        block = active[a]
+        tsdf = grid.tsdf[block]
+        weight = grid.weight[block]
+        rgb = grid.color[block]
+        x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE) * grid.voxel_size
+        y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE) * grid.voxel_size
+        z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE) * grid.voxel_size
+        for row in range(BLOCK_SIDE * BLOCK_SIDE):
+            y = y0 + np.float32(row & 7) * grid.voxel_size
+            z = z0 + np.float32(row >> 3) * grid.voxel_size
+            px = camera.R[0, 0] * x0 + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
+            py = camera.R[1, 0] * x0 + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
+            pz = camera.R[2, 0] * x0 + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
+            for i in range(BLOCK_SIDE):
+                qx = px + np.float32(i) * step_x
+                qy = py + np.float32(i) * step_y
+                qz = pz + np.float32(i) * step_z
+                if qz < sensor.min_depth:
+                    continue
+                w = one / qz
+                u = camera.fx * qx * w + camera.cx
+                v = camera.fy * qy * w + camera.cy
+                if not (u > -half and v > -half and u < right and v < bottom):
+                    continue
+                column = np.int32(u + half)
+                line = np.int32(v + half)
+                d = depth[line, column]
+                if d < sensor.min_depth or d > sensor.max_depth:
+                    continue
+                band = sensor.truncation + sensor.truncation_slope * d
+                distance = d - qz
+                if distance < -band:
+                    continue
+                n = row * BLOCK_SIDE + i
+                w_new = weight_one * min(one, full2 / (d * d))
+                w_old = np.float32(weight[n])
+                share = w_new / (w_old + w_new)
+                new = min(distance, band) * to_units
+                if w_old > np.float32(0.0):
+                    new = np.float32(tsdf[n]) + share * (new - np.float32(tsdf[n]))
+                tsdf[n] = np.int16(np.floor(new + rounding))
+                weight[n] = np.uint16(min(w_old + w_new, max_weight))
+                if distance < band:
+                    for c in range(3):
+                        old_c = np.float32(rgb[n, c])
+                        new_c = old_c + share * (np.float32(color[line, column, c]) - old_c)
+                        rgb[n, c] = np.uint8(new_c + rounding)
+
+
+class Integrator:
+    """Integrates frames into a grid; remembers what it needs between frames."""
+
+    def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
+        self.voxels = voxels
+        self.sensor = sensor
+        self.frames = 0
+        self._stamp = np.zeros(0, np.int32)  # (B,) the last frame, counted from 1, in which a block was active
+        self._found = np.empty((CHUNKS, 4096, 3), np.int32)
+
+    def integrate(self, frame: Frame, T_world_camera: Float64) -> Int32:
+        """Integrates one frame. Returns the numbers of the blocks it saw, (A,).
+
+        Raises MapFullError when the block budget is reached; the frame is then not integrated.
+        """
+        self.frames += 1
+        active = self._find_blocks(frame, T_world_camera)
+        rounding = np.float32((self.frames * GOLDEN) % 1.0)
+        view = pinhole(frame.camera, inverse(T_world_camera))
+        _integrate(self.voxels.grid, active, frame.depth, frame.color, view, self.sensor, rounding)
+        return active
+
+    def _find_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
+        """The blocks around the surface that the frame sees (allocated here) and those that it sees through."""
+        view = pinhole(frame.camera, T_world_camera)
+        block_size = np.float32(BLOCK_SIDE * self.voxels.grid.voxel_size)
+        # readings this far apart are at most a quarter of a block apart at the greatest depth
+        footprint = float(self.sensor.max_depth) / frame.camera.fx
+        stride = max(1, min(8, int(0.25 * block_size / footprint)))
+        surface = self._gathered(_surface_blocks, frame.depth, view, self.sensor, block_size, stride)
+        self.voxels.allocate(surface)
+        seen_through = self._gathered(
+            _free_blocks, self.voxels.grid, frame.depth, view, self.sensor, block_size, 2 * stride
+        )
+        coords = np.concatenate([surface, seen_through])
+        capacity = len(self.voxels.grid.block_coords)
+        if len(self._stamp) < capacity:
+            self._stamp = grown(self._stamp, capacity, 0)
+        active = np.empty(len(coords), np.int32)
+        return active[: _number_blocks(self.voxels.grid, coords, self._stamp, self.frames, active)]
+
+    def _gathered(self, kernel: Callable[..., None], *arguments: object) -> Int32:
+        """What `kernel` finds, chunk after chunk, (N, 3); more room is made until it fits."""
+        counts = np.zeros(CHUNKS, np.int32)
+        while True:
+            kernel(*arguments, self._found, counts)
+            if counts.max() <= self._found.shape[1]:
+                return np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])
+            self._found = np.empty((CHUNKS, 2 * int(counts.max()), 3), np.int32)

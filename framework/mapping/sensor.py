@@ -1,0 +1,48 @@
+"""The camera and the depth sensor as the kernels see them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import Camera, Float32, Float64
+
+
+class Sensor(NamedTuple):
+    """How depth readings become distances: the parameters of integration."""
+
+    truncation: np.float32  # m at depth 0
+    truncation_slope: np.float32  # m more for each m of depth
+    min_depth: np.float32  # m
+    max_depth: np.float32  # m
+    max_weight: np.float32  # observations
+    full_weight_depth: np.float32  # m; a reading weighs min(1, (full_weight_depth / depth)^2)
+
+    @property
+    def max_truncation(self) -> float:
+        """The widest truncation distance, m."""
+        return float(self.truncation + self.truncation_slope * self.max_depth)
+
+
+class Pinhole(NamedTuple):
+    """A camera and its pose as the kernels see them, float32."""
+
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+    R: Float32  # (3, 3)
+    t: Float32  # (3,)
+
+
+def pinhole(camera: Camera, T: Float64) -> Pinhole:
+    """`camera` with the rotation and translation of `T`, whichever way round the kernel wants it."""
+    return Pinhole(
+        fx=np.float32(camera.fx),
+        fy=np.float32(camera.fy),
+        cx=np.float32(camera.cx),
+        cy=np.float32(camera.cy),
+        R=np.ascontiguousarray(T[:3, :3], np.float32),
+        t=np.ascontiguousarray(T[:3, 3], np.float32),
+    )

@@ -1,0 +1,229 @@
+"""Voxel hashing: blocks of 8^3 voxels, allocated where surface is seen, found through a hash table.
+
+After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions of 8^3
+blocks; a region is a dense table of block numbers. Neighbouring look-ups along a ray or a row of voxels fall into the same
+region, so nearly all of them cost one comparison and one load, and a ray crosses unmapped space a region at a time.
+
+Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest:
+voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
+
+Bytes: 7 a voxel (distance 2, weight 2, colour 3), so 3.5 KiB a block, plus 2 KiB of block numbers a region (at most 512 blocks).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from framework.data import Float32, Int32, UInt8
+from framework.errors import MapFullError
+
+Element = TypeVar("Element", bound=np.generic)
+
+BLOCK_SIDE = 8  # voxels
+BLOCK_VOXELS = BLOCK_SIDE**3
+REGION_SIDE = 8  # blocks
+REGION_BLOCKS = REGION_SIDE**3
+WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
+TSDF_MAX = 32767  # the stored value of the widest truncation distance
+UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
+NO_KEY = -1
+
+_KEY_BITS = 21  # of each region coordinate in a 63-bit key: +-2^20 regions, 670 km at 1 cm voxels
+_KEY_OFFSET = 1 << (_KEY_BITS - 1)
+_KEY_MASK = (1 << _KEY_BITS) - 1
+
+
+class Grid(NamedTuple):
+    """The arrays of a VoxelGrid as the kernels see them. B and S are capacities; only the first so many are in use."""
+
+    voxel_size: np.float32  # m
+    tsdf_unit: np.float32  # m, the distance that a stored tsdf of 1 stands for
+    table_keys: npt.NDArray[np.int64]  # (T,) packed region coordinates, NO_KEY = free; T is a power of two
+    table_regions: Int32  # (T,) region number
+    region_coords: Int32  # (S, 3) region coordinates; its first block is 8 times that
+    region_blocks: Int32  # (S, 512) block number, -1 = not allocated
+    block_coords: Int32  # (B, 3) block coordinates; its first voxel is 8 times that
+    tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
+    weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
+    color: UInt8  # (B, 512, 3) RGB
+    label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def region_key(rx, ry, rz):
+    """The packed key of region coordinates."""
+    return (
+        ((np.int64(rx) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
+        | ((np.int64(ry) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
+        | ((np.int64(rz) + _KEY_OFFSET) & _KEY_MASK)
+    )
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _slot(key, size):
+    """Where the search for `key` starts in a table of `size` slots (Fibonacci hashing)."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(mixed >> np.uint64(32)) & (size - 1)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def find_region(grid, key):
+    """The number of the region with this key, -1 if there is none. Linear probing."""
+    size = grid.table_keys.shape[0]
+    slot = _slot(key, size)
+    while True:
+        found = grid.table_keys[slot]
+        if found == key:
+            return grid.table_regions[slot]
+        if found == NO_KEY:
+            return np.int32(-1)
+        slot = (slot + 1) & (size - 1)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def child_number(bx, by, bz):
+    """The place of a block in its region's table."""
+    return ((bz & 7) * 8 + (by & 7)) * 8 + (bx & 7)
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def find_block(grid, bx, by, bz, last_key, last_region):
+    """(block, key, region) at block coordinates; block -1 = not allocated.
+
+    `last_key` and `last_region` are what the previous call returned: the cache that makes neighbouring look-ups cheap.
+    """
+    key = region_key(bx >> 3, by >> 3, bz >> 3)
+    if key != last_key:
+        last_region = find_region(grid, key)
+    if last_region < 0:
+        return np.int32(-1), key, last_region
+    return grid.region_blocks[last_region, child_number(bx, by, bz)], key, last_region
+
+
+@njit(cache=True, nogil=True)
+def insert_blocks(grid, coords, start, region_count, block_count):
+    """Allocates the blocks of coords[start:] that do not exist yet, in order.
+
+    Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call again.
+    """
+    size = grid.table_keys.shape[0]
+    for i in range(start, coords.shape[0]):
+        bx, by, bz = coords[i, 0], coords[i, 1], coords[i, 2]
+        key = region_key(bx >> 3, by >> 3, bz >> 3)
+        region = find_region(grid, key)
+        if region < 0:
+            if region_count == grid.region_blocks.shape[0] or 2 * (region_count + 1) > size:
+                return i, region_count, block_count
+            region = region_count
+            region_count += 1
+            slot = _slot(key, size)
+            while grid.table_keys[slot] != NO_KEY:
+                slot = (slot + 1) & (size - 1)
+            grid.table_keys[slot] = key
+            grid.table_regions[slot] = region
+            grid.region_coords[region, 0] = bx >> 3
+            grid.region_coords[region, 1] = by >> 3
+            grid.region_coords[region, 2] = bz >> 3
+        child = child_number(bx, by, bz)
+        if grid.region_blocks[region, child] < 0:
+            if block_count == grid.block_coords.shape[0]:
+                return i, region_count, block_count
+            grid.region_blocks[region, child] = block_count
+            grid.block_coords[block_count, 0] = bx
+            grid.block_coords[block_count, 1] = by
+            grid.block_coords[block_count, 2] = bz
+            block_count += 1
+    return coords.shape[0], region_count, block_count
+
+
+@njit(cache=True, nogil=True)
+def _rehash(old_keys, old_regions, keys, regions):
+    size = keys.shape[0]
+    for i in range(old_keys.shape[0]):
+        if old_keys[i] != NO_KEY:
+            slot = _slot(old_keys[i], size)
+            while keys[slot] != NO_KEY:
+                slot = (slot + 1) & (size - 1)
+            keys[slot] = old_keys[i]
+            regions[slot] = old_regions[i]
+
+
+class VoxelGrid:
+    """Owns the arrays of the grid and makes them grow. The kernels work on `self.grid`."""
+
+    def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
+        self.max_blocks = max_blocks
+        self.block_count = 0
+        self.region_count = 0
+        first = min(1024, max_blocks)
+        self.grid = Grid(
+            voxel_size=np.float32(voxel_size),
+            tsdf_unit=np.float32(max_truncation / TSDF_MAX),
+            table_keys=np.full(256, NO_KEY, np.int64),
+            table_regions=np.full(256, -1, np.int32),
+            region_coords=np.zeros((64, 3), np.int32),
+            region_blocks=np.full((64, REGION_BLOCKS), -1, np.int32),
+            block_coords=np.zeros((first, 3), np.int32),
+            tsdf=np.full((first, BLOCK_VOXELS), UNSEEN, np.int16),
+            weight=np.zeros((first, BLOCK_VOXELS), np.uint16),
+            color=np.zeros((first, BLOCK_VOXELS, 3), np.uint8),
+            label_row=np.full(first, -1, np.int32),
+        )
+
+    @property
+    def byte_count(self) -> int:
+        return sum(array.nbytes for array in self.grid[2:])
+
+    def allocate(self, coords: Int32) -> None:
+        """Makes sure that the blocks at `coords` (N, 3) exist, numbering new ones in the order given.
+
+        Raises MapFullError when that takes more than `max_blocks`; the blocks before stay.
+        """
+        done = 0
+        while True:
+            done, self.region_count, self.block_count = insert_blocks(
+                self.grid, coords, done, self.region_count, self.block_count
+            )
+            if done == len(coords):
+                return
+            if self.block_count == self.max_blocks:
+                raise MapFullError(
+                    f"the map is full: {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
+                    f"({self.byte_count / 2**20:.0f} MiB); raise fuser.max_blocks or fuser.voxel_size"
+                )
+            self._grow()
+
+    def _grow(self) -> None:
+        """Doubles whichever capacity is used up."""
+        grid = self.grid
+        if self.block_count == len(grid.block_coords):
+            more = min(2 * len(grid.block_coords), self.max_blocks)
+            grid = grid._replace(
+                block_coords=grown(grid.block_coords, more, 0),
+                tsdf=grown(grid.tsdf, more, UNSEEN),
+                weight=grown(grid.weight, more, 0),
+                color=grown(grid.color, more, 0),
+                label_row=grown(grid.label_row, more, -1),
+            )
+        if self.region_count == len(grid.region_blocks):
+            grid = grid._replace(
+                region_coords=grown(grid.region_coords, 2 * self.region_count, 0),
+                region_blocks=grown(grid.region_blocks, 2 * self.region_count, -1),
+            )
+        if 2 * (self.region_count + 1) > len(grid.table_keys):
+            keys = np.full(2 * len(grid.table_keys), NO_KEY, np.int64)
+            regions = np.full(len(keys), -1, np.int32)
+            _rehash(grid.table_keys, grid.table_regions, keys, regions)
+            grid = grid._replace(table_keys=keys, table_regions=regions)
+        self.grid = grid
+
+
+def grown(array: npt.NDArray[Element], length: int, fill: int) -> npt.NDArray[Element]:
+    """A copy of `array` with its first axis made `length` long, the new part filled with `fill`."""
+    longer = np.full((length, *array.shape[1:]), fill, array.dtype)
+    longer[: len(array)] = array
+    return longer
