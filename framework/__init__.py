@@ -4,6 +4,7 @@ import os
 
 __version__ = "0.1.0"
 
-# The detector's thread and the mapping thread both launch parallel kernels. Of numba's threading layers only OpenMP and TBB
-# allow that; OpenMP comes with torch's requirements, TBB does not, and an old one on the system only gives a warning.
+# The detector's thread and the mapping thread both launch parallel kernels. Of numba's threading layers only OpenMP
+# and TBB allow that; OpenMP comes with torch's requirements, TBB does not, and an old one on the system only gives a
+# warning.
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")

@@ -1,8 +1,8 @@
 """Data association: which instance of the map is each cluster of the frame?
 
-A cluster's pixels vote for the instances that the map holds at the surface measured there. One cluster gets at most one
-instance and the reverse, best overlap first; the overlap is counted over the smaller of the two, so that a part of an object
-still finds the whole.
+A cluster's pixels vote for the instances that the map holds at the surface measured there. One cluster gets at most
+one instance and the reverse, best overlap first; the overlap is counted over the smaller of the two, so that a part of
+an object still finds the whole.
 """
 
 from __future__ import annotations
@@ -39,8 +39,8 @@ class Overlaps:
 def look_up_instances(grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, instance_ids: Int32) -> None:
     """Fills instance_ids (H, W) with the instance of the voxel nearest to each reading of `depth`; 0 = none.
 
-    This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object that is
-    new, and it costs one look-up a pixel. `view` holds T_world_camera.
+    This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
+    that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
     """
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size

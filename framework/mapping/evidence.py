@@ -2,10 +2,11 @@
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
-runs in log space as a sum of log-likelihoods, from a uniform start. Only the ratios between labels matter, so a voxel stores
-each label's sum relative to the labels that nobody named there, whose sum is 0 by that definition ("the rest"). A voxel
-keeps the SLOTS most likely instances and classes and drops the least likely one when another one is named (an eviction,
-counted). What a dropped or unnamed label would have gained over the rest is lost; everything that stays is exact.
+runs in log space as a sum of log-likelihoods, from a uniform start. Only the ratios between labels matter, so a voxel
+stores each label's sum relative to the labels that nobody named there, whose sum is 0 by that definition ("the rest").
+A voxel keeps the SLOTS most likely instances and classes and drops the least likely one when another one is named (an
+eviction, counted). What a dropped or unnamed label would have gained over the rest is lost; everything that stays is
+exact.
 
 Rows of 512 voxels exist only for blocks in which something was detected: 8 bytes an instance slot, 6 a class slot, so
 56 bytes a labelled voxel.
@@ -85,7 +86,9 @@ def add_evidence(labels, logs, free, label, gain):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _best_first(labels, logs, free):
-    """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not matter."""
+    """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not
+    matter.
+    """
     best = 0
     for s in range(1, SLOTS):
         if labels[s] != free and (logs[s] > logs[best] or (logs[s] == logs[best] and labels[s] < labels[best])):
@@ -245,17 +248,16 @@ class EvidenceRows:
         wants_row = np.zeros(len(active), np.bool_)
         evicted = np.zeros(len(active), np.int32)
         arguments = (depth, camera, np.float32(band))
-        _visit(
-            self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, False, evicted
-        )
+        _visit(self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, False, evicted)
         self._add_rows(active[wants_row])
-        _visit(
-            self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, True, evicted
-        )
+        _visit(self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, True, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
-        """Adds the evidence for instance `dropped` to that for `kept` in every voxel. Rare, and it visits the whole map."""
+        """Adds the evidence for instance `dropped` to that for `kept` in every voxel.
+
+        Rare, and it visits the whole map.
+        """
         _merge(self.evidence, self.row_count, np.int32(kept), np.int32(dropped))
 
     def _add_rows(self, blocks: Int32) -> None:

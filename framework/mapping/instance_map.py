@@ -93,10 +93,10 @@ class InstanceMap(SceneMap):
         mesh = self.mesh()
         order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
         ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
-        members = np.split(order, starts[1:])
+        ends = [*starts[1:], len(order)]
         return {
-            int(k): _instance(self.table.records[int(k)], vertices, mesh.vertices[vertices])
-            for k, vertices in zip(ids, members, strict=True)
+            int(k): _instance(self.table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
+            for k, start, end in zip(ids, starts, ends, strict=False)
             if k > 0
         }
 
@@ -118,6 +118,7 @@ class InstanceMap(SceneMap):
             ],
         }
         arrays: dict[str, npt.NDArray[Any]] = {
+            "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
             "block_coords": grid.block_coords[:b],
             "tsdf": grid.tsdf[:b],
             "weight": grid.weight[:b],
@@ -126,7 +127,7 @@ class InstanceMap(SceneMap):
             **{name: array[:r] for name, array in evidence._asdict().items()},
         }
         with written_whole(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, header=np.frombuffer(json.dumps(header).encode(), np.uint8), **arrays)
+            np.savez(file, allow_pickle=False, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> InstanceMap:

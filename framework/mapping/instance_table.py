@@ -25,7 +25,7 @@ class InstanceRecord:
     def class_probabilities(self) -> Float32:
         """(C,) the posterior: the product of the observed distributions, normalised."""
         likelihood = np.exp(self.class_log - self.class_log.max())
-        return (likelihood / likelihood.sum()).astype(np.float32)
+        return np.asarray(likelihood / likelihood.sum(), np.float32)
 
     @property
     def confidence(self) -> float:

@@ -3,8 +3,9 @@
 The signed distance is projective, along z; its running average is the TSDF of Curless and Levoy (1996). The truncation
 distance widens with depth as the sensor's noise does, and the weight of an observation falls with depth squared.
 
-All kernels are parallel over independent rows or blocks; candidates are gathered in chunks whose number does not depend on
-the number of threads, and blocks are numbered in a serial pass, so that the map is the same with any number of threads.
+All kernels are parallel over independent rows or blocks; candidates are gathered in chunks whose number does not
+depend on the number of threads, and blocks are numbered in a serial pass, so that the map is the same with any number
+of threads.
 """
 
 from __future__ import annotations

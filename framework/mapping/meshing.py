@@ -1,8 +1,9 @@
 """The surface of the map as a triangle mesh, by surface nets (Gibson 1998).
 
-A cell is the cube between eight neighbouring voxels. A cell whose corners change sign gets one vertex, the mean of the zero
-crossings on its edges; an edge that changes sign joins the vertices of the four cells around it in a quad. Compared with
-marching cubes: no table, half the vertices, better shaped triangles, and every vertex lies within its cell.
+A cell is the cube between eight neighbouring voxels. A cell whose corners change sign gets one vertex, the mean of the
+zero crossings on its edges; an edge that changes sign joins the vertices of the four cells around it in a quad.
+Compared with marching cubes: no table, half the vertices, better shaped triangles, and every vertex lies within its
+cell.
 """
 
 from __future__ import annotations
@@ -16,7 +17,9 @@ from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid,
 from framework.mapping.voxel_walk import voxel_number
 
 NO_VERTEX = -1
-MAX_JUMP = 3.0  # voxels of distance across one voxel; true surfaces stay below 1 / cos, silhouettes seen from one side do not
+MAX_JUMP = (
+    3.0  # voxels of distance across one voxel; true surfaces stay below 1 / cos, silhouettes seen from one side do not
+)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -33,7 +36,9 @@ def _neighbours(grid, block, side, out):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _cell_corners(grid, around, x, y, z, distance):
-    """Distances (8,) m at the corners of a block's cell (x, y, z); False when one was never seen or lies off a silhouette."""
+    """Distances (8,) m at the corners of a block's cell (x, y, z); False when one was never seen or lies off a
+    silhouette.
+    """
     least = np.float32(np.inf)
     most = np.float32(-np.inf)
     for corner in range(8):
@@ -150,7 +155,9 @@ def _edge_quad(grid, around, before, cell_vertex, first, n, axis, quad):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _make_quads(grid, first, cell_vertex, fill, quad_first, counts, triangles):
-    """fill False: counts (B,) the quads of each block. fill True: writes their triangles from 2 * quad_first[block] on."""
+    """fill False: counts (B,) the quads of each block. fill True: writes their triangles from 2 * quad_first[block]
+    on.
+    """
     for block in prange(len(first)):
         around = np.empty(8, np.int32)
         before = np.empty(8, np.int32)

@@ -1,7 +1,9 @@
 """What a camera sees of the map, by sphere tracing through its blocks.
 
-First the blocks in view are projected to image tiles, which bounds the depths that each tile's rays must search. Then a ray crosses absent regions and blocks in one step each, walks the truncated distance field by steps of the distance itself,
-and finds the surface where the field changes from positive to negative, refined on the trilinear field (secant method).
+First the blocks in view are projected to image tiles, which bounds the depths that each tile's rays must search. Then
+a ray crosses absent regions and blocks in one step each, walks the truncated distance field by steps of the distance
+itself, and finds the surface where the field changes from positive to negative, refined on the trilinear field (secant
+method).
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ def _on_trilinear_field(grid, origin, dx, dy, dz, z, key, region):
 def _refined(grid, origin, dx, dy, dz, z, distance, inverse_length, key, region):
     """The zero of the trilinear field near depth z, where the nearest voxel has `distance`; 0 if there is none.
 
-    The secant method, started with a unit slope. A zero at which the field rises along the ray is the back of a surface.
+    The secant method, started with a unit slope. A zero at which the field rises along the ray is the back of a
+    surface.
     """
     voxel = grid.voxel_size
     reach = np.float32(2.0) * voxel * inverse_length
@@ -111,8 +114,9 @@ def _first_surface(grid, origin, dx, dy, dz, near, far):
 def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_far):
     """Fills tile_near and tile_far (Y, X) m with the depths between which a tile's rays can meet a block.
 
-    Regions and blocks are taken for their bounding spheres, so the bounds are never too tight. `camera` holds T_camera_world.
-    The cost is a sphere test a region of the map (0.26 m^3 at 1 cm voxels) and the blocks of those in view.
+    Regions and blocks are taken for their bounding spheres, so the bounds are never too tight. `camera` holds
+    T_camera_world. The cost is a sphere test a region of the map (0.26 m^3 at 1 cm voxels) and the blocks of those in
+    view.
     """
     tile_near[:] = far
     tile_far[:] = near

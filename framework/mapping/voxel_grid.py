@@ -1,13 +1,15 @@
 """Voxel hashing: blocks of 8^3 voxels, allocated where surface is seen, found through a hash table.
 
-After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions of 8^3
-blocks; a region is a dense table of block numbers. Neighbouring look-ups along a ray or a row of voxels fall into the same
-region, so nearly all of them cost one comparison and one load, and a ray crosses unmapped space a region at a time.
+After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions
+of 8^3 blocks; a region is a dense table of block numbers. Neighbouring look-ups along a ray or a row of voxels fall
+into the same region, so nearly all of them cost one comparison and one load, and a ray crosses unmapped space a region
+at a time.
 
 Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest:
 voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
 
-Bytes: 7 a voxel (distance 2, weight 2, colour 3), so 3.5 KiB a block, plus 2 KiB of block numbers a region (at most 512 blocks).
+Bytes: 7 a voxel (distance 2, weight 2, colour 3), so 3.5 KiB a block, plus 2 KiB of block numbers a region (at most
+512 blocks).
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from framework.data import Float32, Int32, UInt8
+from framework.data import Int32, UInt8
 from framework.errors import MapFullError
 
 Element = TypeVar("Element", bound=np.generic)
@@ -108,7 +110,8 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 def insert_blocks(grid, coords, start, region_count, block_count):
     """Allocates the blocks of coords[start:] that do not exist yet, in order.
 
-    Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call again.
+    Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call
+    again.
     """
     size = grid.table_keys.shape[0]
     for i in range(start, coords.shape[0]):

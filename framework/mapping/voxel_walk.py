@@ -46,7 +46,10 @@ def voxel_number(i, j, k):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def trilinear(grid, x, y, z, key, region):
-    """(distance m, valid, key, region) at the point (x, y, z), in voxels. Valid when all eight voxels around it were seen."""
+    """(distance m, valid, key, region) at the point (x, y, z), in voxels.
+
+    Valid when all eight voxels around it were seen.
+    """
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
     one = np.float32(1.0)
@@ -80,7 +83,10 @@ def trilinear(grid, x, y, z, key, region):
 
 @njit(cache=True, nogil=True, forceinline=True)
 def trilinear_color(grid, x, y, z, key, region, out):
-    """The colour at (x, y, z), in voxels, into `out` (3,) uint8; voxels never seen do not count. Returns (key, region)."""
+    """The colour at (x, y, z), in voxels, into `out` (3,) uint8; voxels never seen do not count.
+
+    Returns (key, region).
+    """
     i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
     one = np.float32(1.0)

@@ -83,7 +83,7 @@ class BayesianTsdf(MapFuser):
             max_weight=np.float32(self.max_weight),
             full_weight_depth=np.float32(self.full_weight_depth),
         )
-        self.scene = InstanceMap(
+        self.scene: InstanceMap = InstanceMap(
             self.voxel_size, sensor, self.max_blocks, self.min_observations, self.min_vertices
         )
         self._integrator = Integrator(self.scene.voxels, sensor)
@@ -134,15 +134,15 @@ class BayesianTsdf(MapFuser):
         """Brings the table of instances up to date with what this frame saw."""
         log_probabilities = self._log_probabilities(clusters)
         for k in np.flatnonzero(instance_ids):
-            self.scene.table.observe(
-                int(instance_ids[k]), log_probabilities[k], float(clusters.scores[k]), frame.index
-            )
+            self.scene.table.observe(int(instance_ids[k]), log_probabilities[k], float(clusters.scores[k]), frame.index)
         in_view = set(overlaps.instance_ids[overlaps.visible >= self.create_points].tolist())
         for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
             self.scene.table.records[instance_id].visible += 1
 
     def _log_probabilities(self, clusters: PointClusters) -> Float64:
-        """(N, C) log P(O_u = c | I_t), with the uniform distribution mixed in so that no zero kills a class for good."""
+        """(N, C) log P(O_u = c | I_t), with the uniform distribution mixed in so that no zero kills a class for good.
+        (N, C) log P(O_u = c | I_t), with the uniform distribution mixed in so that no zero kills a class for good.
+        """
         p = clusters.class_probabilities.astype(np.float64)
         return np.asarray(np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)))
 
@@ -203,7 +203,7 @@ def _class_gains(log_probabilities: Float64) -> tuple[npt.NDArray[np.float32], n
 
     A cluster names its NEW_CLASSES most likely classes; the others share the mean of what is left.
     """
-    n, c = log_probabilities.shape
+    c = log_probabilities.shape[1]
     named = np.argsort(-log_probabilities, axis=1, kind="stable")[:, :NEW_CLASSES].astype(np.int16)
     rest = np.exp(log_probabilities)
     np.put_along_axis(rest, named.astype(np.int64), 0, axis=1)

@@ -1,0 +1,77 @@
+"""Exact small cases of association."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.data import PointClusters
+from framework.mapping.association import count_overlaps, cover_another, match_one_to_one
+
+SHAPE = (4, 5)
+
+
+def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
+    """Point clusters under these (4, 5) masks; places in the world do not matter here."""
+    cluster, v, u = np.nonzero(np.array(masks))
+    return PointClusters(
+        points_world=np.zeros((len(u), 3), np.float32),
+        pixels=np.stack([u, v], axis=1).astype(np.int32),
+        cluster=cluster.astype(np.int32),
+        class_probabilities=np.full((len(masks), 2), 0.5, np.float32),
+        scores=np.array(scores, np.float32),
+        classes=("a", "b"),
+    )
+
+
+def columns(first: int, last: int) -> np.ndarray:
+    mask = np.zeros(SHAPE, np.bool_)
+    mask[:, first:last] = True
+    return mask
+
+
+def test_votes_are_pixels_shared() -> None:
+    seen = np.zeros(SHAPE, np.int32)
+    seen[:, :2] = 7
+    seen[:, 4] = 3
+    overlaps = count_overlaps(clusters_of([columns(0, 3), columns(3, 5), columns(2, 3)], [1, 1, 1]), seen)
+    assert overlaps.instance_ids.tolist() == [3, 7]
+    assert overlaps.visible.tolist() == [4, 8]
+    assert overlaps.sizes.tolist() == [12, 8, 4]
+    assert overlaps.votes.tolist() == [[0, 8], [4, 0], [0, 0]]
+    assert overlaps.over_smaller.tolist() == [[0, 1], [1, 0], [0, 0]]
+
+
+def test_nothing_seen_and_nothing_detected() -> None:
+    seen = np.zeros(SHAPE, np.int32)
+    assert count_overlaps(clusters_of([columns(0, 2)], [1]), seen).votes.shape == (1, 0)
+    empty = PointClusters(
+        np.zeros((0, 3), np.float32),
+        np.zeros((0, 2), np.int32),
+        np.zeros(0, np.int32),
+        np.zeros((0, 2), np.float32),
+        np.zeros(0, np.float32),
+        ("a", "b"),
+    )
+    assert count_overlaps(empty, seen).votes.shape == (0, 0)
+    assert len(match_one_to_one(count_overlaps(empty, seen + 1).over_smaller, 0.3)) == 0
+    assert len(cover_another(empty, SHAPE, 0.5)) == 0
+
+
+def test_the_best_overlap_goes_first_and_each_instance_goes_once() -> None:
+    overlap = np.array([[0.6, 0.9], [0.0, 0.8], [0.3, 0.2]])
+    assert match_one_to_one(overlap, 0.35).tolist() == [1, -1, -1]
+    assert match_one_to_one(overlap, 0.25).tolist() == [1, -1, 0]
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10_000))
+def test_the_order_of_detections_does_not_matter(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    overlap = rng.permutation(np.linspace(0, 1, 20)).reshape(5, 4)  # no ties
+    order = rng.permutation(5)
+    assert (match_one_to_one(overlap, 0.4)[order] == match_one_to_one(overlap[order], 0.4)).all()
+
+
+def test_a_second_detection_of_an_object_is_told_by_its_overlap() -> None:
+    clusters = clusters_of([columns(0, 3), columns(0, 2), columns(3, 5)], [0.5, 0.9, 0.4])
+    assert cover_another(clusters, SHAPE, 0.6).tolist() == [True, False, False]

@@ -1,0 +1,149 @@
+"""The compact Bayesian update against the two recursions written out over all labels."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.mapping.evidence import (
+    NEW_CLASSES,
+    SLOTS,
+    Evidence,
+    Measurement,
+    best_class,
+    best_instance,
+    list_points_by_pixel,
+    update_voxel,
+)
+from plugins.fusers.bayesian_tsdf import _class_gains
+
+FLOOR = 0.05
+
+
+def blank() -> Evidence:
+    return Evidence(
+        np.zeros((1, 512, SLOTS), np.int32),
+        np.zeros((1, 512, SLOTS), np.float32),
+        np.full((1, 512, SLOTS), -1, np.int16),
+        np.zeros((1, 512, SLOTS), np.float32),
+    )
+
+
+def measured(
+    ids: list[int], scores: list[float], distributions: np.ndarray, absence: float, last_id: int
+) -> Measurement:
+    """Every cluster covers the one pixel that there is."""
+    n = len(ids)
+    first, following = np.empty((1, 1), np.int32), np.empty(n, np.int32)
+    list_points_by_pixel(np.zeros((n, 2), np.int32), np.arange(n, dtype=np.int32), first, following)
+    matched = np.zeros(last_id + 1, np.bool_)
+    matched[ids] = True
+    gains, named = _class_gains(np.log(distributions))
+    return Measurement(
+        first,
+        following,
+        np.arange(n, dtype=np.int32),
+        np.array(ids, np.int32),
+        np.log(np.array(scores) / FLOOR).astype(np.float32),
+        np.float32(np.log(absence)),
+        matched,
+        gains,
+        named,
+    )
+
+
+def distribution(rng: np.random.Generator, classes: int) -> np.ndarray:
+    p = rng.dirichlet(np.full(classes, 0.3))
+    return 0.9 * p + 0.1 / classes
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), labels=st.integers(1, SLOTS))
+def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) -> None:
+    """With no more labels than slots, nothing is ever dropped, so posteriors are exact: eqs. [7] and [8]."""
+    rng = np.random.default_rng(seed)
+    classes = labels  # every class is named
+    evidence = blank()
+    instance_log = np.zeros(labels + 1)  # [0]: every other instance
+    class_log = np.zeros(classes)
+    for _ in range(20):
+        instance = int(rng.integers(1, labels + 1))
+        score = float(rng.uniform(0.2, 1))
+        p = distribution(rng, classes)
+        evicted = update_voxel(evidence, 0, 3, measured([instance], [score], p[None], 1.0, labels), np.int32(0))
+        assert evicted == 0
+        # P(O = instance) = score, P(O = any other) = FLOOR
+        instance_log += np.log(FLOOR)
+        instance_log[instance] += np.log(score / FLOOR)
+        class_log += np.log(p)
+    found = {
+        int(i): float(v) for i, v in zip(evidence.instance_ids[0, 3], evidence.instance_log[0, 3], strict=True) if i
+    }
+    for i, log in found.items():
+        assert abs(log - (instance_log[i] - instance_log[0])) < 1e-3
+    assert best_instance(evidence, 0, 3) == 1 + np.argmax(instance_log[1:])
+    order = evidence.class_ids[0, 3][: min(classes, SLOTS)]
+    ours = evidence.class_log[0, 3][: len(order)]
+    exact = class_log[order]
+    assert np.allclose(ours - ours[0], exact - exact[0], atol=2e-3)
+    assert best_class(evidence, 0, 3) == np.argmax(class_log)
+
+
+def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
+    """More classes than slots: the argmax still agrees nearly always, and evictions are counted."""
+    rng = np.random.default_rng(0)
+    agree = 0
+    evictions = 0
+    voxels = 300
+    for _ in range(voxels):
+        evidence = blank()
+        log = np.zeros(80)
+        true = int(rng.integers(80))
+        for _ in range(12):
+            logits = rng.normal(0, 1, 80)
+            logits[true] += 2.5
+            p = np.exp(logits) / np.exp(logits).sum()
+            p = 0.9 * p + 0.1 / 80
+            log += np.log(p)
+            evictions += update_voxel(evidence, 0, 0, measured([1], [0.9], p[None], 1.0, 1), np.int32(0))
+        agree += best_class(evidence, 0, 0) == np.argmax(log)
+    assert agree >= 0.97 * voxels
+    assert evictions > 0
+
+
+def test_a_voxel_under_two_masks_hears_both() -> None:
+    evidence = blank()
+    p = np.full((2, 3), 1 / 3)
+    update_voxel(evidence, 0, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), np.int32(0))
+    found = dict(zip(evidence.instance_ids[0, 0].tolist(), evidence.instance_log[0, 0].tolist(), strict=True))
+    assert found[1] == np.float32(np.log(0.9 / FLOOR))
+    assert found[2] == np.float32(np.log(0.5 / FLOOR))
+
+
+def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
+    evidence = blank()
+    one = np.full((1, 3), 1 / 3)
+    update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(0))
+    before = float(evidence.instance_log[0, 0, 0])
+    update_voxel(evidence, 0, 0, measured([2], [0.9], one, 0.5, 2), np.int32(-1))  # instance 2 found, not here
+    assert float(evidence.instance_log[0, 0, 0]) == before
+    update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))  # instance 1 found, not here
+    assert float(evidence.instance_log[0, 0, 0]) == np.float32(before + np.log(0.5))
+    for _ in range(10):
+        update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))
+    assert best_instance(evidence, 0, 0) == 0, "the rest has become more likely"
+
+
+def test_a_cluster_without_instance_says_nothing() -> None:
+    evidence = blank()
+    update_voxel(evidence, 0, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), np.int32(0))
+    assert (evidence.instance_ids == 0).all()
+    assert (evidence.class_ids == -1).all()
+
+
+def test_class_gains_are_relative_to_the_classes_not_named() -> None:
+    p = np.array([[0.5, 0.2, 0.1, 0.1, 0.04, 0.03, 0.03]])
+    gains, named = _class_gains(np.log(p))
+    assert named.tolist() == [[0, 1, 2, 3]]
+    assert NEW_CLASSES == 4
+    rest = (0.04 + 0.03 + 0.03) / 3
+    assert np.allclose(gains, np.log(p / rest), atol=1e-5)

@@ -1,0 +1,125 @@
+"""Mesh, instances, saving and loading of a small map with two objects."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, Frame, Pose
+from framework.errors import DataError
+from framework.geometry import lift
+from framework.mapping.instance_map import InstanceMap
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from tests.analytic_scene import Scene, room, walk
+
+CLASSES = ("chair", "bed")
+
+
+def true_detections(frame: Frame) -> Detections:
+    """One exact mask for each visible instance of the analytic scene."""
+    assert frame.truth is not None
+    ids = [i for i in frame.truth.class_names if (frame.truth.instance_ids == i).any()]
+    masks = np.array([frame.truth.instance_ids == i for i in ids]).reshape(len(ids), *frame.depth.shape)
+    boxes = np.zeros((len(ids), 4), np.float32)
+    probabilities = np.tile(np.array([0.8, 0.2], np.float32), (len(ids), 1))
+    return Detections(masks, boxes, np.full(len(ids), 0.9, np.float32), probabilities, CLASSES)
+
+
+def mapped(scene: Scene, frames: int = 12) -> BayesianTsdf:
+    fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    for k, T in enumerate(walk(frames)):
+        frame = scene.frame(T, k)
+        fuser.fuse(frame, Pose(T), lift(true_detections(frame), frame, Pose(T)))
+    return fuser
+
+
+@pytest.fixture(scope="module")
+def scene_map() -> InstanceMap:
+    return mapped(room()).scene
+
+
+def test_the_mesh_lies_on_the_true_surface(scene_map: InstanceMap) -> None:
+    mesh = scene_map.mesh()
+    distance = room().distance(mesh.vertices.astype(np.float64))
+    assert np.median(distance) < 0.1 * scene_map.voxel_size
+    assert np.quantile(distance, 0.95) < 0.5 * scene_map.voxel_size
+
+
+def test_triangles_face_the_camera(scene_map: InstanceMap) -> None:
+    mesh = scene_map.mesh()
+    a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
+    normal = np.cross(b - a, c - a)
+    towards = np.einsum("ij,ij->i", normal, -a)  # the camera stayed near the origin
+    assert (towards > 0).mean() > 0.99
+
+
+def test_each_sphere_is_one_instance_of_its_size(scene_map: InstanceMap) -> None:
+    instances = scene_map.instances()
+    mesh = scene_map.mesh()
+    assert len(instances) == len(room().spheres)
+    for instance in instances.values():
+        points = mesh.vertices[instance.vertices].astype(np.float64)
+        distance = [np.abs(np.linalg.norm(points - center, axis=1) - radius) for center, radius in room().spheres]
+        best = int(np.argmin([np.median(d) for d in distance]))
+        assert np.quantile(distance[best], 0.95) < 2 * scene_map.voxel_size
+        assert instance.class_probabilities.argmax() == 0
+        assert instance.observations == 12
+        assert instance.confidence == pytest.approx(0.9, abs=0.01)
+        low, high = instance.aabb.center - instance.aabb.extent / 2, instance.aabb.center + instance.aabb.extent / 2
+        assert (points >= low - 1e-6).all()
+        assert (points <= high + 1e-6).all()
+        inside = np.abs((points - instance.obb.center) @ instance.obb.rotation)
+        assert (inside <= instance.obb.extent / 2 + 1e-3).all()
+    planes = mesh.instance_ids[np.abs(mesh.vertices[:, 2] - 2.5) < 0.01]
+    assert (planes > 0).mean() < 0.05
+
+
+def test_views_show_the_instances(scene_map: InstanceMap) -> None:
+    T = walk(12)[6]
+    frame = room().frame(T)
+    assert frame.truth is not None
+    view = scene_map.render(frame.camera, T)
+    for i in frame.truth.class_names:
+        ids = view.instance_ids[(frame.truth.instance_ids == i) & (view.depth > 0)]
+        assert np.bincount(ids).max() > 0.9 * len(ids)
+
+
+def test_save_and_load_round_trip(scene_map: InstanceMap, tmp_path: Path) -> None:
+    scene_map.save(tmp_path / "map.npz")
+    loaded = InstanceMap.load(tmp_path / "map.npz")
+    ours, theirs = scene_map.mesh(), loaded.mesh()
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name))
+    assert loaded.classes == CLASSES
+    assert {k: (v.confidence, v.observations) for k, v in scene_map.instances().items()} == {
+        k: (v.confidence, v.observations) for k, v in loaded.instances().items()
+    }
+    T = walk(12)[3]
+    camera = room().frame(T).camera
+    assert np.array_equal(scene_map.render(camera, T).instance_ids, loaded.render(camera, T).instance_ids)
+
+
+def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    scene_map.save(path)
+    whole = path.read_bytes()
+    rng = np.random.default_rng(0)
+    for place in rng.integers(200, len(whole) // 2, 20):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0xFF
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"map\.npz"):
+            InstanceMap.load(path)
+    path.write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"map\.npz"):
+        InstanceMap.load(path)
+    with pytest.raises(DataError, match="absent"):
+        InstanceMap.load(tmp_path / "absent.npz")
+
+
+def test_an_empty_map_has_an_empty_mesh(tmp_path: Path) -> None:
+    scene = BayesianTsdf().scene
+    assert len(scene.mesh().vertices) == 0
+    assert len(scene.instances()) == 0
+    scene.save(tmp_path / "map.npz")
+    assert InstanceMap.load(tmp_path / "map.npz").voxel_count == 0

@@ -1,0 +1,137 @@
+"""The TSDF against a slow reference and against exact surfaces."""
+
+import numba
+import numpy as np
+import pytest
+
+from framework.data import Frame
+from framework.geometry import inverse
+from framework.mapping.integration import GOLDEN, Integrator
+from framework.mapping.sensor import Sensor
+from framework.mapping.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
+from tests.analytic_scene import CAMERA, pose, room, walk
+
+SENSOR = Sensor(*map(np.float32, (0.08, 0.01, 0.2, 4.0, 100.0, 1.5)))
+VOXEL = 0.02
+
+
+def new_integrator() -> Integrator:
+    return Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), SENSOR)
+
+
+def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
+    """Every voxel of the active blocks, in double precision and plain numpy."""
+    frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
+    integrator = new_integrator()
+    active = integrator.integrate(frame, frame.T_world_camera)
+    grid = integrator.voxels.grid
+    i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
+    offsets = np.stack([i, j, k], axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
+    points = (grid.block_coords[active][:, None] * 8 + offsets) * VOXEL
+    T_camera_world = inverse(frame.T_world_camera)
+    p = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    u = CAMERA.fx * p[..., 0] / p[..., 2] + CAMERA.cx
+    v = CAMERA.fy * p[..., 1] / p[..., 2] + CAMERA.cy
+    column, row = np.floor(u + 0.5).astype(int), np.floor(v + 0.5).astype(int)
+    inside = (p[..., 2] > SENSOR.min_depth) & (column >= 0) & (row >= 0)
+    inside &= (column < CAMERA.width) & (row < CAMERA.height)
+    d = np.where(inside, frame.depth[row.clip(0, CAMERA.height - 1), column.clip(0, CAMERA.width - 1)], 0)
+    band = SENSOR.truncation + SENSOR.truncation_slope * d
+    seen = inside & (d > SENSOR.min_depth) & (d < SENSOR.max_depth) & (d - p[..., 2] >= -band)
+    distance = np.minimum(d - p[..., 2], band)
+    # a voxel on the border between two pixels or at the edge of the band may fall to either side in float32
+    clear = (np.abs(u + 0.5 - np.round(u + 0.5)) > 1e-3) & (np.abs(v + 0.5 - np.round(v + 0.5)) > 1e-3)
+    clear &= (np.abs(d - p[..., 2] + band) > 1e-4) & inside
+    stored = grid.tsdf[active]
+    assert ((stored != UNSEEN) == seen)[clear].all()
+    both = clear & seen
+    assert both.sum() > 20_000
+    unit = SENSOR.max_truncation / TSDF_MAX
+    assert np.abs(stored * unit - distance)[both].max() < 2e-5
+    expected_weight = np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
+    assert np.abs(grid.weight[active] - expected_weight)[both].max() <= 1
+
+
+def test_every_voxel_near_the_surface_is_seen() -> None:
+    """Blocks are allocated for the whole band, not only where a ray happens to pass."""
+    frame = room().frame(pose())
+    integrator = new_integrator()
+    integrator.integrate(frame, frame.T_world_camera)
+    v, u = np.nonzero(frame.depth)
+    d = frame.depth[v, u]
+    surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
+    blocks = {tuple(c) for c in integrator.voxels.grid.block_coords[: integrator.voxels.block_count]}
+    wanted = {tuple(c) for c in np.floor(surface / (8 * VOXEL)).astype(int)}
+    assert len(wanted - blocks) <= 0.02 * len(wanted), (
+        "only corners that less than a stride of pixels sees may be missed"
+    )
+
+
+def test_averages_have_no_rounding_bias() -> None:
+    """A constant that is no multiple of the stored unit is met on average, though values are stored as integers."""
+    rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
+    assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
+
+
+def test_noise_averages_out() -> None:
+    """40 frames with 10 mm noise leave about 10 / sqrt(40) mm in the voxels at the surface."""
+    frame = room().frame(pose())
+    integrator = new_integrator()
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        noisy = (frame.depth + rng.normal(0, 0.01, frame.depth.shape)).astype(np.float32)
+        integrator.integrate(Frame(0, 0.0, frame.color, noisy, CAMERA), np.eye(4))
+    clean = new_integrator()
+    clean.integrate(frame, np.eye(4))
+    n = min(integrator.voxels.block_count, clean.voxels.block_count)
+    ours = {tuple(c): b for b, c in enumerate(integrator.voxels.grid.block_coords[: integrator.voxels.block_count])}
+    unit = SENSOR.max_truncation / TSDF_MAX
+    errors = []
+    for block in range(n):
+        other = ours.get(tuple(clean.voxels.grid.block_coords[block]))
+        near = np.abs(clean.voxels.grid.tsdf[block] * unit) < 0.02
+        if other is not None:
+            difference = integrator.voxels.grid.tsdf[other].astype(float) - clean.voxels.grid.tsdf[block]
+            errors.append(difference[near] * unit)
+    assert np.std(np.concatenate(errors)) == pytest.approx(0.01 / np.sqrt(40), rel=0.15)
+
+
+def test_carving_removes_what_is_seen_through() -> None:
+    """A sphere that is taken away disappears from the map once the wall behind it has been seen often enough."""
+    scene, empty = room(), room()
+    empty.spheres = []
+    integrator = new_integrator()
+    integrator.integrate(scene.frame(pose()), np.eye(4))
+    grid = integrator.voxels.grid
+    before = int(
+        ((grid.tsdf[: integrator.voxels.block_count] < 0) & (grid.weight[: integrator.voxels.block_count] > 0)).sum()
+    )
+    for _ in range(10):
+        integrator.integrate(empty.frame(pose()), np.eye(4))
+    bare = new_integrator()
+    bare.integrate(empty.frame(pose()), np.eye(4))
+    center = np.array([-0.5, 0.6, 1.62])  # on the first sphere's front
+    block = {tuple(c): b for b, c in enumerate(grid.block_coords[: integrator.voxels.block_count])}
+    voxel = np.round(center / VOXEL).astype(int)
+    b = block[tuple(voxel >> 3)]
+    x, y, z = voxel & 7
+    assert integrator.voxels.grid.tsdf[b, (z * 8 + y) * 8 + x] > 0
+    assert before > 0
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_the_map_does_not_depend_on_the_number_of_threads(threads: int) -> None:
+    default = numba.get_num_threads()
+    if default < 2:
+        pytest.skip("this machine has one core")
+    results = []
+    for count in (default, threads):
+        numba.set_num_threads(count)
+        integrator = new_integrator()
+        for k, T in enumerate(walk(4)):
+            integrator.integrate(room().frame(T, k), T)
+        n = integrator.voxels.block_count
+        grid = integrator.voxels.grid
+        results.append([a[:n].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color)])
+    numba.set_num_threads(default)
+    assert results[0] == results[1]

@@ -1,0 +1,67 @@
+"""Views of the map against closed-form depth, normals and colour."""
+
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.mapping.evidence import EvidenceRows
+from framework.mapping.integration import Integrator
+from framework.mapping.raycasting import render
+from framework.mapping.sensor import Sensor
+from framework.mapping.voxel_grid import VoxelGrid
+from tests.analytic_scene import Scene, pose, room, walk
+
+VOXEL = 0.02
+SENSOR = Sensor(*map(np.float32, (4 * VOXEL, 0.0, 0.2, 4.0, 100.0, 10.0)))
+CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
+
+
+def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
+    integrator = Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), SENSOR)
+    for k, T in enumerate(poses):
+        integrator.integrate(scene.frame(T, k, CAMERA), T)
+    return integrator.voxels
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.4, 0.8, 1.1])
+def test_depth_of_a_slanted_plane_is_unbiased(slant: float) -> None:
+    """Half-pixel and half-voxel faults show as a bias that changes sign with the slant."""
+    n = np.array([np.sin(slant), 0.3, -np.cos(slant)]) / np.linalg.norm([np.sin(slant), 0.3, -np.cos(slant)])
+    scene = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.8]))])
+    voxels = mapped(scene, walk(20))
+    T = pose(0.05, 0.02, 0.03, (0.02, 0.03, 0.0))
+    view = render(voxels, EvidenceRows(voxels).evidence, SENSOR, CAMERA, T)
+    exact, _, _ = scene.render(CAMERA, T)
+    both = (view.depth > 0) & (exact > 0)
+    assert both.mean() > 0.5 * (exact[exact < 3.5] > 0).mean() * (exact < 3.5).mean()
+    error = (view.depth - exact)[both]
+    assert np.median(np.abs(error)) < 0.1 * VOXEL
+    assert abs(np.median(error)) < 0.05 * VOXEL
+    assert np.median(view.normals_world[both] @ n) > 0.999
+
+
+def test_depth_of_spheres_and_coverage() -> None:
+    scene = room()
+    voxels = mapped(scene, walk(30))
+    T = walk(30)[15]
+    view = render(voxels, EvidenceRows(voxels).evidence, SENSOR, CAMERA, T)
+    exact, color, surface = scene.render(CAMERA, T)
+    on_sphere = surface > len(scene.planes)
+    both = (view.depth > 0) & on_sphere
+    assert both.sum() > 0.9 * on_sphere.sum(), "the map has no holes where the camera has looked"
+    assert np.median(np.abs(view.depth - exact)[both]) < 0.1 * VOXEL
+    assert np.median(np.abs(view.color.astype(float) - color)[both]) < 6
+    assert (view.instance_ids == 0).all()
+    assert (view.class_ids == -1).all()
+
+
+def test_views_from_outside_and_of_an_empty_map() -> None:
+    voxels = mapped(room(), [pose()])
+    evidence = EvidenceRows(voxels).evidence
+    away = render(voxels, evidence, SENSOR, CAMERA, pose(rotvec=(0, np.pi, 0)))
+    assert (away.depth == 0).all()
+    behind = render(voxels, evidence, SENSOR, CAMERA, pose(z=5.0, rotvec=(0, np.pi, 0)))
+    assert (behind.depth == 0).mean() > 0.95, "the back of a surface is not a surface"
+    empty = VoxelGrid(VOXEL, SENSOR.max_truncation, 10)
+    nothing = render(empty, EvidenceRows(empty).evidence, SENSOR, CAMERA, pose())
+    assert (nothing.depth == 0).all()

@@ -1,0 +1,89 @@
+"""The tracker on a scene whose motion is known exactly."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from framework.data import Frame, PointClusters, Pose
+from framework.geometry import inverse, rotation_angle
+from framework.interfaces import SceneMap
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
+from tests.analytic_scene import Scene, room, walk
+
+NOTHING = PointClusters(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 2), np.int32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 1), np.float32),
+    np.zeros(0, np.float32),
+    ("chair",),
+)
+
+
+def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:
+    fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    poses = []
+    for frame in frames:
+        pose = tracker.track(frame, fuser.scene)
+        if not pose.lost:
+            fuser.fuse(frame, pose, NOTHING)
+        poses.append(pose)
+    return poses, fuser.scene
+
+
+def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
+    """(m, rad) between the estimate and the truth."""
+    assert frame.T_world_camera is not None
+    error = inverse(frame.T_world_camera) @ pose.T_world_camera
+    return float(np.linalg.norm(error[:3, 3])), rotation_angle(error[:3, :3])
+
+
+@pytest.mark.parametrize("color_weight", [0.0, 0.1])
+def test_a_known_motion_is_recovered(color_weight: float) -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(40))]
+    poses, _ = run(VoxelHashingIcp(finest=1.0, color_weight=color_weight), frames)
+    assert not any(pose.lost for pose in poses)
+    worst = max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True))
+    assert worst[0] < 0.004, "a fifth of a voxel"
+    assert drift(poses[-1], frames[-1])[1] < 0.003
+
+
+def test_colour_holds_what_geometry_does_not() -> None:
+    """Facing one textured wall, geometry alone cannot see sideways motion; with colour it is seen."""
+    wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
+    frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
+    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    assert not any(pose.lost for pose in poses)
+    assert drift(poses[-1], frames[-1])[0] < 0.01
+    alone, _ = run(VoxelHashingIcp(finest=1.0, color_weight=0.0), frames)
+    assert any(pose.lost for pose in alone), "and alone it says that the motion is not determined"
+
+
+def test_lost_frames_are_told_and_tracking_resumes() -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
+    covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
+    poses, _ = run(VoxelHashingIcp(finest=1.0), frames[:10] + covered + frames[14:])
+    assert [pose.lost for pose in poses] == [False] * 10 + [True] * 4 + [False] * 16
+    assert "no depth" in poses[10].reason
+    assert drift(poses[-1], frames[-1])[0] < 0.006
+
+
+def test_a_jump_is_lost_and_not_integrated() -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
+    away = walk(1)[0].copy()
+    away[:3, 3] += (0.0, 0.0, -1.2)
+    tracker = VoxelHashingIcp(finest=1.0)
+    poses, scene = run(tracker, [*frames, room().frame(away, 20)])
+    assert poses[-1].lost
+    assert np.array_equal(poses[-1].T_world_camera, poses[-2].T_world_camera)
+    assert np.median(room().distance(scene.mesh().vertices.astype(float))) < 0.004
+
+
+def test_garbage_is_lost() -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(5))]
+    rng = np.random.default_rng(0)
+    garbage = dataclasses.replace(frames[-1], depth=rng.uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32))
+    poses, _ = run(VoxelHashingIcp(finest=1.0), [*frames[:4], garbage])
+    assert poses[-1].lost
