@@ -21,8 +21,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32
-from framework.mapping.sensor import Pinhole
-from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, VoxelGrid, grown
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, grown
 
 SLOTS = 4  # instances and classes that a voxel can tell apart
 NEW_CLASSES = 4  # a detection can bring its best so many classes into a voxel's slots
@@ -153,54 +152,27 @@ def list_points_by_pixel(pixels, cluster, first_point, next_point):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _visit(grid, active, depth, camera, band, evidence, measurement, wants_row, update, evicted):
-    """Visits every voxel of the active blocks within `band` of the surface that `camera` (T_camera_world) measured.
-
-    update False: notes in wants_row (A,) which blocks without a row have a voxel under some cluster.
-    update True: updates the voxels of the blocks that have a row; evicted (A,) counts.
-    """
-    height, width = depth.shape
-    half = np.float32(0.5)
-    one = np.float32(1.0)
-    right = np.float32(width) - half
-    bottom = np.float32(height) - half
+def _find_blocks_under_clusters(grid, active, near_pixel, first_point, wants_row):
+    """Notes in wants_row (A,) the blocks without a row that have a voxel under some cluster."""
     for a in prange(active.shape[0]):
-        block = active[a]
-        label_row = grid.label_row[block]
         wants_row[a] = False
+        if grid.label_row[active[a]] < 0:
+            for n in range(BLOCK_VOXELS):
+                if near_pixel[a, n] >= 0 and first_point[near_pixel[a, n]] >= 0:
+                    wants_row[a] = True
+                    break
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _update(grid, active, near_pixel, evidence, measurement, first_point, evicted):
+    """Updates the near voxels of the active blocks that have a row; evicted (A,) counts slots given away."""
+    for a in prange(active.shape[0]):
         evicted[a] = 0
-        if (label_row >= 0) != update:
-            continue
-        x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE) * grid.voxel_size
-        y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE) * grid.voxel_size
-        z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE) * grid.voxel_size
-        for n in range(BLOCK_VOXELS):
-            x = x0 + np.float32(n & 7) * grid.voxel_size
-            y = y0 + np.float32((n >> 3) & 7) * grid.voxel_size
-            z = z0 + np.float32(n >> 6) * grid.voxel_size
-            qz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
-            if qz <= np.float32(0.0):
-                continue
-            w = one / qz
-            qx = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
-            u = camera.fx * qx * w + camera.cx
-            if not (u > -half and u < right):
-                continue
-            qy = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
-            v = camera.fy * qy * w + camera.cy
-            if not (v > -half and v < bottom):
-                continue
-            column = np.int32(u + half)
-            line = np.int32(v + half)
-            d = depth[line, column]
-            if d <= np.float32(0.0) or abs(d - qz) > band:
-                continue
-            point = measurement.first_point[line, column]
-            if update:
-                evicted[a] += update_voxel(evidence, label_row, n, measurement, point)
-            elif point >= 0:
-                wants_row[a] = True
-                break
+        row = grid.label_row[active[a]]
+        if row >= 0:
+            for n in range(BLOCK_VOXELS):
+                if near_pixel[a, n] >= 0:
+                    evicted[a] += update_voxel(evidence, row, n, measurement, first_point[near_pixel[a, n]])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -240,17 +212,14 @@ class EvidenceRows:
     def byte_count(self) -> int:
         return sum(array.nbytes for array in self.evidence)
 
-    def update(self, active: Int32, depth: Float32, camera: Pinhole, band: float, measurement: Measurement) -> None:
-        """Updates the voxels of the `active` blocks within `band` m of the surface `depth` (H, W) m, seen by `camera`.
-
-        `camera` holds T_camera_world.
-        """
-        wants_row = np.zeros(len(active), np.bool_)
-        evicted = np.zeros(len(active), np.int32)
-        arguments = (depth, camera, np.float32(band))
-        _visit(self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, False, evicted)
+    def update(self, active: Int32, near_pixel: Int32, measurement: Measurement) -> None:
+        """Updates the voxels near the measured surface: `active` (A,) and `near_pixel` (A, 512) of Integrator.integrate."""
+        first_point = measurement.first_point.ravel()
+        wants_row = np.empty(len(active), np.bool_)
+        evicted = np.empty(len(active), np.int32)
+        _find_blocks_under_clusters(self.voxels.grid, active, near_pixel, first_point, wants_row)
         self._add_rows(active[wants_row])
-        _visit(self.voxels.grid, active, *arguments, self.evidence, measurement, wants_row, True, evicted)
+        _update(self.voxels.grid, active, near_pixel, self.evidence, measurement, first_point, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:

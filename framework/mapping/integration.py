@@ -18,7 +18,7 @@ from numba import njit, prange
 from framework.data import Float64, Frame, Int32
 from framework.geometry import inverse
 from framework.mapping.sensor import Sensor, pinhole
-from framework.mapping.voxel_grid import BLOCK_SIDE, REGION_SIDE, WEIGHT_ONE, VoxelGrid, find_block, grown
+from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, REGION_SIDE, WEIGHT_ONE, VoxelGrid, find_block, grown
 from framework.mapping.voxel_walk import inverses, leave_cell
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
@@ -144,18 +144,22 @@ def _number_blocks(grid, coords, stamp, frame, active):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _integrate(grid, active, depth, color, camera, sensor, rounding):
+def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_pixel):
     """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
 
-    `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers.
+    `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers. near_pixel (A, 512)
+    gets the number of the pixel that sees each voxel within near_band m of the measured surface, -1 for the others.
+
+    A block is done in passes over its 512 voxels that hold no branches, so that the compiler vectorises them.
     """
     height, width = depth.shape
+    depth = depth.ravel()
+    color = color.reshape(-1, 3)
     to_units = np.float32(1.0) / grid.tsdf_unit
     one = np.float32(1.0)
     half = np.float32(0.5)
-    step_x = camera.R[0, 0] * grid.voxel_size
-    step_y = camera.R[1, 0] * grid.voxel_size
-    step_z = camera.R[2, 0] * grid.voxel_size
+    zero = np.float32(0.0)
+    voxel = grid.voxel_size
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
@@ -166,49 +170,51 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding):
         tsdf = grid.tsdf[block]
         weight = grid.weight[block]
         rgb = grid.color[block]
-        x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE) * grid.voxel_size
-        y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE) * grid.voxel_size
-        z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE) * grid.voxel_size
-        for row in range(BLOCK_SIDE * BLOCK_SIDE):
-            y = y0 + np.float32(row & 7) * grid.voxel_size
-            z = z0 + np.float32(row >> 3) * grid.voxel_size
-            px = camera.R[0, 0] * x0 + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
-            py = camera.R[1, 0] * x0 + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
-            pz = camera.R[2, 0] * x0 + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
-            for i in range(BLOCK_SIDE):
-                qx = px + np.float32(i) * step_x
-                qy = py + np.float32(i) * step_y
-                qz = pz + np.float32(i) * step_z
-                if qz < sensor.min_depth:
-                    continue
-                w = one / qz
-                u = camera.fx * qx * w + camera.cx
-                v = camera.fy * qy * w + camera.cy
-                if not (u > -half and v > -half and u < right and v < bottom):
-                    continue
-                column = np.int32(u + half)
-                line = np.int32(v + half)
-                d = depth[line, column]
-                if d < sensor.min_depth or d > sensor.max_depth:
-                    continue
-                band = sensor.truncation + sensor.truncation_slope * d
-                distance = d - qz
-                if distance < -band:
-                    continue
-                n = row * BLOCK_SIDE + i
-                w_new = weight_one * min(one, full2 / (d * d))
-                w_old = np.float32(weight[n])
-                share = w_new / (w_old + w_new)
-                new = min(distance, band) * to_units
-                if w_old > np.float32(0.0):
-                    new = np.float32(tsdf[n]) + share * (new - np.float32(tsdf[n]))
-                tsdf[n] = np.int16(np.floor(new + rounding))
-                weight[n] = np.uint16(min(w_old + w_new, max_weight))
-                if distance < band:
-                    for c in range(3):
-                        old_c = np.float32(rgb[n, c])
-                        new_c = old_c + share * (np.float32(color[line, column, c]) - old_c)
-                        rgb[n, c] = np.uint8(new_c + rounding)
+        near = near_pixel[a]
+        pixel = np.empty(BLOCK_VOXELS, np.int32)
+        distance = np.empty(BLOCK_VOXELS, np.float32)
+        share = np.empty(BLOCK_VOXELS, np.float32)
+        x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE) * voxel
+        y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE) * voxel
+        z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE) * voxel
+        for n in range(BLOCK_VOXELS):
+            m = np.int32(n)
+            x = x0 + np.float32(m & 7) * voxel
+            y = y0 + np.float32((m >> 3) & 7) * voxel
+            z = z0 + np.float32(m >> 6) * voxel
+            px = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
+            py = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
+            pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
+            w = one / max(pz, sensor.min_depth)
+            u = camera.fx * px * w + camera.cx
+            v = camera.fy * py * w + camera.cy
+            inside = (pz > sensor.min_depth) & (u > -half) & (v > -half) & (u < right) & (v < bottom)
+            # outside the image the pixel is 0, whose reading then must not count: the share is 0
+            column = np.int32(u + half) if inside else np.int32(0)
+            line = np.int32(v + half) if inside else np.int32(0)
+            pixel[n] = line * np.int32(width) + column
+            distance[n] = pz
+            share[n] = one if inside else zero
+        for n in range(BLOCK_VOXELS):
+            d = depth[np.uint32(pixel[n])]
+            band = sensor.truncation + sensor.truncation_slope * d
+            sdf = d - distance[n]
+            seen = (share[n] > zero) & (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
+            w_new = weight_one * min(one, full2 / max(d * d, np.float32(1e-6)))
+            w_old = np.float32(weight[n])
+            portion = w_new / (w_old + w_new) if seen else zero
+            stored = np.float32(tsdf[n])
+            target = min(sdf, band) * to_units
+            value = stored + portion * (target - stored) if w_old > zero else target
+            tsdf[n] = np.int16(np.floor(value + rounding)) if seen else tsdf[n]
+            weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
+            near[n] = pixel[n] if seen & (abs(sdf) <= near_band) else np.int32(-1)
+            share[n] = portion if sdf < band else zero  # colour belongs to the surface, not to the air before it
+        for n in range(BLOCK_VOXELS):
+            if share[n] > zero:
+                for c in range(3):
+                    old = np.float32(rgb[n, c])
+                    rgb[n, c] = np.uint8(old + share[n] * (np.float32(color[pixel[n], c]) - old) + rounding)
 
 
 class Integrator:
@@ -219,10 +225,14 @@ class Integrator:
         self.sensor = sensor
         self.frames = 0
         self._stamp = np.zeros(0, np.int32)  # (B,) the last frame, counted from 1, in which a block was active
+        self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
         self._found = np.empty((CHUNKS, 4096, 3), np.int32)
 
-    def integrate(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """Integrates one frame. Returns the numbers of the blocks it saw, (A,).
+    def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> tuple[Int32, Int32]:
+        """Integrates one frame.
+
+        Returns the numbers of the blocks it saw, (A,), and for each of their voxels within near_band m of the measured
+        surface the number v * width + u of the pixel that sees it, -1 for the others, (A, 512); valid until the next call.
 
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
@@ -230,8 +240,21 @@ class Integrator:
         active = self._find_blocks(frame, T_world_camera)
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
-        _integrate(self.voxels.grid, active, frame.depth, frame.color, view, self.sensor, rounding)
-        return active
+        if len(self._near_pixel) < len(active):
+            self._near_pixel = np.empty((2 * len(active), BLOCK_VOXELS), np.int32)
+        near_pixel = self._near_pixel[: len(active)]
+        _integrate(
+            self.voxels.grid,
+            active,
+            frame.depth,
+            frame.color,
+            view,
+            self.sensor,
+            rounding,
+            np.float32(near_band),
+            near_pixel,
+        )
+        return active, near_pixel
 
     def _find_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
         """The blocks around the surface that the frame sees (allocated here) and those that it sees through."""
@@ -259,4 +282,5 @@ class Integrator:
             kernel(*arguments, self._found, counts)
             if counts.max() <= self._found.shape[1]:
                 return np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])
-            self._found = np.empty((CHUNKS, 2 * int(counts.max()), 3), np.int32)
+            self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
+        self._found = np.empty((CHUNKS, 2 * int(counts.max()), 3), np.int32)

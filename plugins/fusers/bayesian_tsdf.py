@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 from framework.data import Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import ConfigError, DataError
-from framework.geometry import inverse
 from framework.interfaces import MapFuser
 from framework.mapping.association import (
     Overlaps,
@@ -94,8 +93,9 @@ class BayesianTsdf(MapFuser):
         overlaps = self._look_up(frame, pose, clusters)
         instance_ids = self._associate(overlaps, clusters, frame)
         self._observe(overlaps, clusters, instance_ids, frame)
-        active = self._integrator.integrate(frame, pose.T_world_camera)
-        self._update_evidence(active, frame, pose, clusters, instance_ids)
+        band = self.label_band * self.voxel_size
+        active, near_pixel = self._integrator.integrate(frame, pose.T_world_camera, band)
+        self.scene.labels.update(active, near_pixel, self._measurement(frame, clusters, instance_ids))
         self._merge_instances(overlaps, instance_ids)
         self.scene.changed()
 
@@ -146,35 +146,25 @@ class BayesianTsdf(MapFuser):
         p = clusters.class_probabilities.astype(np.float64)
         return np.asarray(np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)))
 
-    def _update_evidence(
-        self, active: Int32, frame: Frame, pose: Pose, clusters: PointClusters, instance_ids: Int32
-    ) -> None:
-        """Both recursions for the voxels around the measured surface."""
+    def _measurement(self, frame: Frame, clusters: PointClusters, instance_ids: Int32) -> Measurement:
+        """P(O_u | I_t) of this frame's clusters, as the recursions take it."""
         first_point = np.empty(frame.depth.shape, np.int32)
         next_point = np.empty(len(clusters.cluster), np.int32)
         list_points_by_pixel(clusters.pixels, clusters.cluster, first_point, next_point)
         matched = np.zeros(self.scene.table.last_id + 1, np.bool_)
         matched[instance_ids] = True
+        scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
         class_gain, named_classes = _class_gains(self._log_probabilities(clusters))
-        measurement = Measurement(
+        return Measurement(
             first_point=first_point,
             next_point=next_point,
             cluster=clusters.cluster,
             instance_id=instance_ids,
-            instance_gain=np.log(np.maximum(clusters.scores, 2 * self.instance_floor) / self.instance_floor).astype(
-                np.float32
-            ),
+            instance_gain=np.log(scores / self.instance_floor).astype(np.float32),
             absence_loss=np.float32(np.log(self.absence)),
             matched=matched,
             class_gain=class_gain,
             named_classes=named_classes,
-        )
-        self.scene.labels.update(
-            active,
-            frame.depth,
-            pinhole(frame.camera, inverse(pose.T_world_camera)),
-            self.label_band * self.voxel_size,
-            measurement,
         )
 
     def _merge_instances(self, overlaps: Overlaps, instance_ids: Int32) -> None:

@@ -23,7 +23,7 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     """Every voxel of the active blocks, in double precision and plain numpy."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
-    active = integrator.integrate(frame, frame.T_world_camera)
+    active, _ = integrator.integrate(frame, frame.T_world_camera, VOXEL)
     grid = integrator.voxels.grid
     i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
     offsets = np.stack([i, j, k], axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
@@ -56,7 +56,7 @@ def test_every_voxel_near_the_surface_is_seen() -> None:
     """Blocks are allocated for the whole band, not only where a ray happens to pass."""
     frame = room().frame(pose())
     integrator = new_integrator()
-    integrator.integrate(frame, frame.T_world_camera)
+    integrator.integrate(frame, frame.T_world_camera, VOXEL)
     v, u = np.nonzero(frame.depth)
     d = frame.depth[v, u]
     surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
@@ -80,9 +80,9 @@ def test_noise_averages_out() -> None:
     rng = np.random.default_rng(0)
     for _ in range(40):
         noisy = (frame.depth + rng.normal(0, 0.01, frame.depth.shape)).astype(np.float32)
-        integrator.integrate(Frame(0, 0.0, frame.color, noisy, CAMERA), np.eye(4))
+        integrator.integrate(Frame(0, 0.0, frame.color, noisy, CAMERA), np.eye(4), VOXEL)
     clean = new_integrator()
-    clean.integrate(frame, np.eye(4))
+    clean.integrate(frame, np.eye(4), VOXEL)
     n = min(integrator.voxels.block_count, clean.voxels.block_count)
     ours = {tuple(c): b for b, c in enumerate(integrator.voxels.grid.block_coords[: integrator.voxels.block_count])}
     unit = SENSOR.max_truncation / TSDF_MAX
@@ -101,15 +101,15 @@ def test_carving_removes_what_is_seen_through() -> None:
     scene, empty = room(), room()
     empty.spheres = []
     integrator = new_integrator()
-    integrator.integrate(scene.frame(pose()), np.eye(4))
+    integrator.integrate(scene.frame(pose()), np.eye(4), VOXEL)
     grid = integrator.voxels.grid
     before = int(
         ((grid.tsdf[: integrator.voxels.block_count] < 0) & (grid.weight[: integrator.voxels.block_count] > 0)).sum()
     )
     for _ in range(10):
-        integrator.integrate(empty.frame(pose()), np.eye(4))
+        integrator.integrate(empty.frame(pose()), np.eye(4), VOXEL)
     bare = new_integrator()
-    bare.integrate(empty.frame(pose()), np.eye(4))
+    bare.integrate(empty.frame(pose()), np.eye(4), VOXEL)
     center = np.array([-0.5, 0.6, 1.62])  # on the first sphere's front
     block = {tuple(c): b for b, c in enumerate(grid.block_coords[: integrator.voxels.block_count])}
     voxel = np.round(center / VOXEL).astype(int)
@@ -129,7 +129,7 @@ def test_the_map_does_not_depend_on_the_number_of_threads(threads: int) -> None:
         numba.set_num_threads(count)
         integrator = new_integrator()
         for k, T in enumerate(walk(4)):
-            integrator.integrate(room().frame(T, k), T)
+            integrator.integrate(room().frame(T, k), T, VOXEL)
         n = integrator.voxels.block_count
         grid = integrator.voxels.grid
         results.append([a[:n].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color)])

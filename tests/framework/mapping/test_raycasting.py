@@ -19,7 +19,7 @@ CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
 def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
     integrator = Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), SENSOR)
     for k, T in enumerate(poses):
-        integrator.integrate(scene.frame(T, k, CAMERA), T)
+        integrator.integrate(scene.frame(T, k, CAMERA), T, VOXEL)
     return integrator.voxels
 
 
