@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numba import njit
 
@@ -29,7 +31,7 @@ def tight_boxes(masks: Bool) -> Float32:
 def mask_overlaps(masks: Bool) -> Float64:
     """The (N, N) numbers of pixels that masks (N, H, W) share; on the diagonal their areas."""
     n = len(masks)
-    bits = np.packbits(masks.reshape(n, -1), axis=1)
+    bits = np.packbits(masks.reshape(n, math.prod(masks.shape[1:])), axis=1)
     words = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)
     shared = [np.bitwise_count(words[i] & words).sum(axis=1, dtype=np.float64) for i in range(n)]
     return np.array(shared, np.float64).reshape(n, n)

@@ -63,19 +63,18 @@ class SimulatedDetector(Detector):
     In this order: touching neighbours come back under one mask (`merge_rate`); objects are missed, the more so the
     smaller (`small_side`) or when cut by the image's border; objects come back in two halves (`split_rate`); masks
     are shifted, bleed over the border, wobble smoothly along it and pass through a coarse grid; the class becomes a
-    distribution around a confusion kernel of lookalikes, partly the same in every frame (`confusion_consistency`),
-    because real errors do not average out over a video; the score follows the mask's quality and the class's
-    certainty; false detections appear. Every number is drawn from (seed, frame, instance, purpose): the order of calls
-    does not matter, and changing one error does not change what the others do. Raises DataError without ground truth.
+    distribution around a confusion kernel of lookalikes, the same one in many of an object's frames
+    (`confusion_consistency`), because real errors do not average out over a video; the score follows the
+    mask's quality and the class's certainty; false detections appear. Every number is drawn from (seed, purpose, frame,
+    instance): the order of calls does not matter, and changing one error leaves the draws of the others alone. Raises
+    DataError without ground truth.
     """
 
     seed: int = 0  # >= 0
     min_pixels: int = 64  # px >= 1, smaller instances are never detected
     merge_rate: float = 0.1  # in [0, 1], probability that a touching pair comes back as one
     miss_rate: float = 0.1  # in [0, 1], probability to miss a large, whole object
-    small_side: float = (
-        24.0  # px >= 0, an object of this side is missed in a share 1/e of the frames; 0 = size is no matter
-    )
+    small_side: float = 24.0  # px >= 0, at this side 1/e of the objects are missed; 0 = size is no matter
     truncated_miss_rate: float = 0.15  # in [0, 1], more for an object at the image's border
     split_rate: float = 0.05  # in [0, 1], probability that an object comes back in two halves
     shift: float = 1.5  # px >= 0, standard deviation along x and y
@@ -84,10 +83,8 @@ class SimulatedDetector(Detector):
     boundary_scale: float = 12.0  # px >= 2, how far along the border a wobble reaches
     mask_grid: int = 28  # cells a side >= 4 of the network's mask, 0 = full resolution
     confusion: float = 0.25  # in [0, 1), mean probability that goes to wrong classes
-    confusion_concentration: float = (
-        4.0  # > 0, of the Dirichlet: small = confident, often wrong; large = always the mean
-    )
-    confusion_consistency: float = 0.5  # in [0, 1], share of the class error that an object keeps through all frames
+    confusion_concentration: float = 3.0  # > 0, of the Dirichlet: small = confident, often wrong
+    confusion_consistency: float = 0.5  # in [0, 1], share of frames that give an object one and the same distribution
     score_concentration: float = 20.0  # >= 0, of the Beta around quality x certainty; 0 = no noise
     score_threshold: float = 0.1  # in [0, 1), detections below are dropped
     false_positives: float = 0.5  # >= 0, mean number an image
@@ -242,10 +239,10 @@ class SimulatedDetector(Detector):
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
         """(C,) a distribution whose mean over frames and objects is the true class's row of the confusion kernel."""
         mean = self._kernel[candidate.class_id]
-        alpha = mean * self.confusion_concentration
-        of_object = _dirichlet(self._random(Draw.CLASS_OF_OBJECT, candidate.instance), alpha)
-        of_frame = _dirichlet(self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part), alpha)
-        drawn = self.confusion_consistency * of_object + (1 - self.confusion_consistency) * of_frame
+        random = self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part)
+        if random.random() < self.confusion_consistency:
+            random = self._random(Draw.CLASS_OF_OBJECT, candidate.instance)
+        drawn = _dirichlet(random, mean * self.confusion_concentration)
         return np.asarray((1 - EVEN_SHARE) * drawn + EVEN_SHARE * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
