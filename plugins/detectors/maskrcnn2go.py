@@ -86,7 +86,7 @@ class MaskRCNN2Go(Detector):
         graph, tensors = _read_network(_find_weights(self.weights))
         tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
         self._anchors: Float32 = tensors.pop("anchor").cpu().numpy()
-        first = graph[2]["inputs"][1]
+        first = next(operator for operator in graph if operator["type"] == "Int8ConvRelu")["inputs"][1]
         tensors[first] = tensors[first].flip(1)  # trained on BGR; frames are RGB
         self._backbone = Network(
             graph, tensors, ("data_int8",), ("xif3_6_int8", "rpn_cls_logits_int8", "rpn_bbox_pred_int8")
