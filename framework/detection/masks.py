@@ -33,8 +33,10 @@ def mask_overlaps(masks: Bool) -> Float64:
     n = len(masks)
     bits = np.packbits(masks.reshape(n, math.prod(masks.shape[1:])), axis=1)
     words = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)
-    shared = [np.bitwise_count(words[i] & words).sum(axis=1, dtype=np.float64) for i in range(n)]
-    return np.array(shared, np.float64).reshape(n, n)
+    shared = np.zeros((n, n))
+    for i in range(n):
+        shared[i, i:] = np.bitwise_count(words[i] & words[i:]).sum(axis=1, dtype=np.int64)
+    return np.maximum(shared, shared.T)
 
 
 def suppress_duplicates(masks: Bool, iou: float) -> Int32:

@@ -12,7 +12,7 @@ from framework.data import Camera, Frame
 from framework.detection.masks import mask_overlaps, tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.label_spaces import COCO
-from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, Network, _dequantised
+from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, Network, _dequantised, _read_network
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 WEIGHTS = SHARED / "weights" / "maskrcnn2go_int8"
@@ -160,6 +160,18 @@ def test_the_mask_of_the_true_bed_sits_on_it(detector):
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
     assert len(ious) >= 3
     assert np.median(ious) > 0.8  # its pillows carry labels of their own
+
+
+@needs_weights
+def test_mask_grids_are_the_channels_that_the_whole_graph_computes(detector):
+    """The shortcut upsamples one class a detection; the graph upsamples all 81."""
+    graph, tensors = _read_network(WEIGHTS)
+    whole = Network(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
+    pooled = torch.from_numpy(np.random.default_rng(10).normal(0, 0.3, (4, 128, 6, 6)).astype(np.float32))
+    label = np.array([1, 80, 57, 57], np.int32)
+    with torch.inference_mode():
+        expected = torch.sigmoid(whole(pooled)[0])[torch.arange(4), torch.from_numpy(label).long()]
+        np.testing.assert_allclose(detector._mask_grids(pooled, label), expected.numpy(), atol=1e-5)
 
 
 @needs_weights
