@@ -1,0 +1,1 @@
+"""The numerical pieces that detectors share: box arithmetic, non-maximum suppression, RoIAlign and masks."""

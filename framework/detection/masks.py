@@ -1,0 +1,112 @@
+"""Masks of objects: from a network's small grid to the image, and the boxes around them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+from framework.data import Bool, Float32, Float64, Int32
+
+
+def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
+    """The masks (N, H, W) of an image of `shape` (height, width) where bilinearly resized grids exceed `threshold`.
+
+    grids (N, G, G) probabilities over each box; borders (N, 4) x1 y1 x2 y2 of the boxes in px with pixel centres at
+    integers. Around a grid there is a ring of zero cells, as in Detectron, so that an object that fills its box ends at
+    the box, and not at the centre of the last cell.
+    """
+    ringed = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
+    masks = np.zeros((len(grids), *shape), np.bool_)
+    _paste(ringed, np.ascontiguousarray(borders, np.float64), np.float32(threshold), masks)
+    return masks
+
+
+def tight_boxes(masks: Bool) -> Float32:
+    """The (N, 4) boxes x1 y1 x2 y2 px of masks (N, H, W): first and last column and row inside; 0 for an empty mask."""
+    return np.asarray(_bounds(masks), np.float32)
+
+
+def mask_overlaps(masks: Bool) -> Float64:
+    """The (N, N) numbers of pixels that masks (N, H, W) share; on the diagonal their areas."""
+    n = len(masks)
+    bits = np.packbits(masks.reshape(n, math.prod(masks.shape[1:])), axis=1)
+    words = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)
+    shared = np.zeros((n, n))
+    for i in range(n):
+        shared[i, i:] = np.bitwise_count(words[i] & words[i:]).sum(axis=1, dtype=np.int64)
+    return np.maximum(shared, shared.T)
+
+
+def suppress_duplicates(masks: Bool, iou: float) -> Int32:
+    """The indices of the masks (N, H, W), best first, that are not empty and overlap no better survivor by `iou`."""
+    overlaps = mask_overlaps(masks)
+    areas = overlaps.diagonal()
+    covered = overlaps > iou * (areas[:, None] + areas - overlaps)
+    survives = areas > 0
+    for i in range(1, len(masks)):
+        survives[i] &= not (covered[i, :i] & survives[:i]).any()
+    return np.flatnonzero(survives).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _bounds(masks):  # type: ignore[no-untyped-def]
+    """From both ends of each row, so that a mask's inside is never read."""
+    n, height, width = masks.shape
+    bounds = np.zeros((n, 4), np.int64)
+    for i in range(n):
+        x1, y1, x2, y2 = width, height, -1, -1
+        for v in range(height):
+            u = 0
+            while u < width and not masks[i, v, u]:
+                u += 1
+            if u == width:
+                continue
+            x1, y1, y2 = min(x1, u), min(y1, v), v
+            u = width - 1
+            while not masks[i, v, u]:
+                u -= 1
+            x2 = max(x2, u)
+        if x2 >= 0:
+            bounds[i] = x1, y1, x2, y2
+    return bounds
+
+
+@njit(cache=True, nogil=True)
+def _axis_cells(start, end, cells, pixels):  # type: ignore[no-untyped-def]
+    """Where pixels along one axis fall in a ringed grid: first pixel, then the lower cell and the weight of the upper.
+
+    `cells` is without the ring. Only pixels within half a cell of the box or inside it can see it.
+    """
+    cell = (end - start) / cells  # px
+    first = max(0, int(np.ceil(start - 0.5 * cell)))
+    last = min(pixels - 1, int(np.floor(end + 0.5 * cell)))
+    n = max(0, last - first + 1)
+    lower = np.empty(n, np.int64)
+    weight = np.empty(n, np.float32)
+    for i in range(n):
+        place = (first + i - start) / cell + 0.5  # 0 is the centre of the ring's first cell, cells + 1 of its last
+        place = min(max(place, 0.0), cells + 1.0)
+        lower[i] = min(int(place), cells)
+        weight[i] = place - lower[i]
+    return first, lower, weight
+
+
+@njit(cache=True, nogil=True)
+def _paste(ringed, borders, threshold, masks):  # type: ignore[no-untyped-def]
+    """Rows first: one blended row of the grid serves a whole row of pixels."""
+    n, height, width = masks.shape
+    cells = ringed.shape[1] - 2
+    row = np.empty(cells + 2, np.float32)
+    for i in range(n):
+        x1, y1, x2, y2 = borders[i]
+        if not (x2 > x1 and y2 > y1):
+            continue
+        u0, left, u_weight = _axis_cells(x1, x2, cells, width)
+        v0, above, v_weight = _axis_cells(y1, y2, cells, height)
+        for j in range(len(above)):
+            row[:] = ringed[i, above[j]] + v_weight[j] * (ringed[i, above[j] + 1] - ringed[i, above[j]])
+            for k in range(len(left)):
+                value = row[left[k]] + u_weight[k] * (row[left[k] + 1] - row[left[k]])
+                masks[i, v0 + j, u0 + k] = value > threshold

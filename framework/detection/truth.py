@@ -1,0 +1,53 @@
+"""The true instances of a frame, as detectors would return them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Bool, Frame, Int32
+from framework.errors import DataError
+
+
+@dataclass(frozen=True)
+class TrueInstances:
+    """The N instances of known class that are visible in a frame, largest first, equal ones by id."""
+
+    ids: Int32  # (N,)
+    class_ids: Int32  # (N,) index into the detector's classes
+    masks: Bool  # (N, H, W)
+    areas: Int32  # (N,) px
+
+    def __len__(self) -> int:
+        return len(self.ids)
+
+
+def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) -> TrueInstances:
+    """The instances of `frame` whose class is known and that are at least `min_pixels` large.
+
+    Raises DataError when the sequence has no instance ground truth, or names a class that is not in `classes`.
+    """
+    if frame.truth is None:
+        raise DataError(
+            f"frame {frame.index} has no instance ground truth, which this detector needs:"
+            " choose a dataset that has it, or another detector"
+        )
+    index = {name: k for k, name in enumerate(classes)}
+    names = {i: name for i, name in frame.truth.class_names.items() if i != 0 and name is not None}
+    unknown = sorted({name for name in names.values() if name not in index})
+    if unknown:
+        raise DataError(f"the ground truth names classes that the detector does not have: {', '.join(unknown)}")
+
+    found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
+    chosen = np.array([i in names for i in found.tolist()], np.bool_) & (areas >= min_pixels)
+    found, areas = found[chosen], areas[chosen]
+    order = np.argsort(-areas, kind="stable")
+    found, areas = found[order], areas[order]
+    return TrueInstances(
+        ids=found.astype(np.int32),
+        class_ids=np.array([index[names[i]] for i in found.tolist()], np.int32),
+        masks=frame.truth.instance_ids == found[:, None, None],
+        areas=areas.astype(np.int32),
+    )

@@ -1,0 +1,38 @@
+"""The upper bound: what a detector without any error would return."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Detections, Frame
+from framework.detection.masks import tight_boxes
+from framework.detection.truth import true_instances
+from framework.interfaces import Detector
+from framework.label_spaces import COCO
+from framework.parameters import require
+
+
+@dataclass
+class GroundTruthDetector(Detector):
+    """One detection for each visible instance of known class: its exact mask, score 1, all probability on its class.
+
+    Raises DataError on a sequence without instance ground truth.
+    """
+
+    min_pixels: int = 64  # px >= 1, smaller instances are not detected: about what a real detector can still see
+
+    def __post_init__(self) -> None:
+        require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")
+        self.classes = COCO
+
+    def detect(self, frame: Frame) -> Detections:
+        truth = true_instances(frame, self.classes, self.min_pixels)
+        return Detections(
+            masks=truth.masks,
+            boxes=tight_boxes(truth.masks),
+            scores=np.ones(len(truth), np.float32),
+            class_probabilities=np.eye(len(self.classes), dtype=np.float32)[truth.class_ids],
+            classes=self.classes,
+        )

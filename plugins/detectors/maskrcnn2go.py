@@ -1,0 +1,256 @@
+"""Mask R-CNN 2Go: a real Mask R-CNN with COCO weights, small enough for a video on a laptop's CPU."""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from framework.data import Detections, Float32, Frame, Int32
+from framework.detection.boxes import anchor_grid, clip, decode, to_original_image
+from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
+from framework.detection.nms import suppress_boxes
+from framework.detection.roi_align import roi_align
+from framework.errors import ConfigError, DataError
+from framework.interfaces import Detector
+from framework.label_spaces import COCO
+from framework.parameters import require
+
+PROJECT_ROOT = Path(__file__).resolve().parents[2]  # holds conf/
+SHA256 = {
+    "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
+    "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
+}
+STRIDE = 16  # px of the resized image per cell of the feature map
+BINS = 6  # of RoIAlign, a side
+PRE_NMS_PROPOSALS = 3000  # best anchors that are decoded; this and the next are the graph's own
+PROPOSAL_NMS = 0.7  # IoU
+DELTA_WEIGHTS = np.array([10, 10, 5, 5], np.float32)  # the box head's deltas are scaled by these
+
+Tensors = dict[str, Tensor]
+Graph = list[dict[str, Any]]
+
+
+@dataclass
+class MaskRCNN2Go(Detector):
+    """Mask R-CNN 2Go (Facebook, Apache-2.0; COCO 2014 minival mask AP 20.9 as published), on the CPU or with CUDA.
+
+    The published int8 network run in float: weights are dequantised once, activations are not requantised. Each
+    detection carries the box head's softmax over its 80 object classes, renormalised without the background; its score
+    is the probability of its own class with the background counted. Non-maximum suppression within a class is the
+    network's own; `agnostic_nms` then lets a mask fall to a better one of whatever class, so that an object that could
+    be a chair or a couch comes back once, with both in its distribution, and does not start two map instances.
+    """
+
+    weights: Path = Path("../shared/weights/maskrcnn2go_int8")  # folder; relative: to the working, then project folder
+    score_threshold: float = 0.1  # in [0, 1): low, for weak detections may still update instances that exist
+    nms: float = 0.3  # IoU in (0, 1] above which a box falls to a better one of its class
+    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
+    proposals: int = 120  # >= 1, regions that the box head looks at; the network was trained with 100 to 120
+    max_detections: int = 100  # >= 1, an image
+    short_side: int = 320  # px >= 32, to which images are resized; the network was trained at 320
+    long_side: int = 640  # px >= short_side, bound on the other side
+    mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
+    device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
+
+    def __post_init__(self) -> None:
+        require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
+        require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
+        require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
+        require(self.proposals >= 1, "detector.proposals", self.proposals, "at least 1")
+        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        require(self.short_side >= 32, "detector.short_side", self.short_side, "at least 32 px")
+        require(
+            self.long_side >= self.short_side, "detector.long_side", self.long_side, f"at least {self.short_side} px"
+        )
+        require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
+        require(self.device in ("auto", "cpu", "cuda"), "detector.device", self.device, "auto, cpu or cuda")
+        require(
+            self.device != "cuda" or torch.cuda.is_available(),
+            "detector.device",
+            self.device,
+            "cpu or auto without a GPU",
+        )
+        self.classes = COCO
+        self._device = torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
+        graph, tensors = _read_network(_find_weights(self.weights))
+        tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
+        self._anchors: Float32 = tensors.pop("anchor").cpu().numpy()
+        first = next(operator for operator in graph if operator["type"] == "Int8ConvRelu")["inputs"][1]
+        tensors[first] = tensors[first].flip(1)  # trained on BGR; frames are RGB
+        self._backbone = Network(
+            graph, tensors, ("data_int8",), ("xif3_6_int8", "rpn_cls_logits_int8", "rpn_bbox_pred_int8")
+        )
+        self._box_head = Network(graph, tensors, ("roi_features_int8",), ("cls_score_int8", "bbox_pred_int8"))
+        self._mask_head = Network(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_int8",))
+        self._mask_upsampling = tensors["mask_fcn_logits_up_w_int8"], tensors["mask_fcn_logits_up_b_int8"]
+
+    @torch.inference_mode()
+    def detect(self, frame: Frame) -> Detections:
+        image = self._resize(frame)
+        shape = (image.shape[2], image.shape[3])
+        features, objectness, deltas = self._backbone(image)
+        proposals = self._propose(objectness, deltas, shape)
+        logits, deltas = self._box_head(self._pool(features, proposals))
+        probabilities = torch.softmax(logits, dim=1).cpu().numpy()
+        boxes, proposal, label = self._select(proposals, probabilities, deltas.cpu().numpy(), shape)
+        if len(boxes) == 0:
+            return Detections.none(frame.camera.shape, self.classes)
+
+        grids = self._mask_grids(self._pool(features, boxes), label)
+        masks = paste_masks(
+            grids, to_original_image(boxes, shape, frame.camera.shape), frame.camera.shape, self.mask_threshold
+        )
+        kept = suppress_duplicates(masks, self.agnostic_nms)
+        masks, proposal, label = masks[kept], proposal[kept], label[kept]
+        objects = probabilities[proposal, 1:]
+        return Detections(
+            masks=masks,
+            boxes=tight_boxes(masks),
+            scores=probabilities[proposal, label],
+            class_probabilities=objects / objects.sum(axis=1, keepdims=True),
+            classes=self.classes,
+        )
+
+    def _resize(self, frame: Frame) -> Tensor:
+        """The network's input (1, 3, H, W), RGB, 0..255."""
+        height, width = frame.camera.shape
+        scale = min(self.short_side / min(height, width), self.long_side / max(height, width))
+        size = max(1, round(width * scale)), max(1, round(height * scale))
+        resized = cv2.resize(frame.color, size, interpolation=cv2.INTER_LINEAR)
+        return torch.from_numpy(resized).to(self._device).permute(2, 0, 1)[None].float()
+
+    def _propose(self, objectness: Tensor, deltas: Tensor, shape: tuple[int, int]) -> Float32:
+        """The boxes (P, 4), px of the resized image, in which the network expects objects."""
+        rows, columns = objectness.shape[2:]
+        # No sigmoid: it would keep the order.
+        scores = objectness.permute(0, 2, 3, 1).reshape(-1).cpu().numpy()
+        best = np.argsort(-scores, kind="stable")[:PRE_NMS_PROPOSALS]
+        anchors = anchor_grid(self._anchors, rows, columns, STRIDE)[best]
+        boxes = decode(anchors, deltas.permute(0, 2, 3, 1).reshape(-1, 4).cpu().numpy()[best])
+        boxes = clip(boxes, shape)
+        return boxes[suppress_boxes(boxes, scores[best], PROPOSAL_NMS, limit=self.proposals)]
+
+    def _pool(self, features: Tensor, boxes: Float32) -> Tensor:
+        return roi_align(features, torch.from_numpy(boxes).to(self._device), BINS, 1 / STRIDE)
+
+    def _select(
+        self, proposals: Float32, probabilities: Float32, deltas: Float32, shape: tuple[int, int]
+    ) -> tuple[Float32, Int32, Int32]:
+        """The surviving boxes (N, 4) in the resized image, best first, their proposals (N,) and labels (N,) 1 to 80."""
+        proposal, label = np.nonzero(probabilities[:, 1:] > self.score_threshold)
+        label += 1
+        own_deltas = deltas.reshape(len(deltas), -1, 4)[proposal, label] / DELTA_WEIGHTS
+        boxes = clip(decode(proposals[proposal], own_deltas), shape)
+        scores = probabilities[proposal, label]
+        kept = suppress_boxes(boxes, scores, self.nms, label.astype(np.int32), limit=self.max_detections)
+        return boxes[kept], np.asarray(proposal[kept], np.int32), np.asarray(label[kept], np.int32)
+
+    def _mask_grids(self, pooled: Tensor, label: Int32) -> Float32:
+        """Probabilities (N, 24, 24) of being inside the object, over its box.
+
+        The graph upsamples the logits of all 81 classes, channel by channel; only each detection's own is needed.
+        """
+        (logits,) = self._mask_head(pooled)
+        own = torch.from_numpy(label).long().to(self._device)
+        kernel, bias = self._mask_upsampling
+        logits = logits[torch.arange(len(own), device=self._device), own][None]
+        kernel = kernel[own, own][:, None]
+        logits = functional.conv_transpose2d(logits, kernel, bias[own], stride=2, padding=1, groups=len(own))
+        return np.asarray(torch.sigmoid(logits[0]).cpu().numpy(), np.float32)
+
+
+class Network:
+    """The part of a Caffe2 int8 graph that computes the blobs `outputs` from the blobs `inputs`, in float."""
+
+    def __init__(self, graph: Graph, tensors: Tensors, inputs: tuple[str, ...], outputs: tuple[str, ...]) -> None:
+        self.inputs, self.outputs = inputs, outputs
+        needed, parts = set(outputs), []
+        for operator in reversed(graph):
+            name = operator["outputs"][0]
+            if name not in needed or name in inputs:
+                continue
+            blobs = tuple(blob for blob in operator["inputs"] if blob not in tensors)
+            needed.update(blobs)
+            parts.append((_as_torch(operator, tensors), blobs, name))
+        self._steps = parts[::-1]
+
+    def __call__(self, *values: Tensor) -> tuple[Tensor, ...]:
+        blobs = dict(zip(self.inputs, values, strict=True))
+        for run, inputs, output in self._steps:
+            blobs[output] = run(*(blobs[name] for name in inputs))
+        return tuple(blobs[name] for name in self.outputs)
+
+
+def _as_torch(operator: Mapping[str, Any], tensors: Tensors) -> Callable[..., Tensor]:
+    """One operator of the graph as a function of its activations (N, C, H, W)."""
+    kind, args = operator["type"], operator["args"]
+    if kind in ("Int8Conv", "Int8ConvRelu"):
+        weight, bias = (tensors[name] for name in operator["inputs"][1:])
+        stride, pad, group = args["stride"], args["pad"], args.get("group", 1)
+        if kind == "Int8Conv":
+            return lambda x: functional.conv2d(x, weight, bias, stride, pad, 1, group)
+        return lambda x: functional.conv2d(x, weight, bias, stride, pad, 1, group).relu_()
+    if kind == "Int8ConvTranspose":
+        weight, bias = (tensors[name] for name in operator["inputs"][1:])
+        return lambda x: functional.conv_transpose2d(x, weight, bias, args["stride"], args["pad"])
+    if kind == "Int8FC":
+        weight, bias = (tensors[name] for name in operator["inputs"][1:])
+        return lambda x: functional.linear(x.flatten(1), weight, bias)
+    if kind == "Int8AveragePool":
+        return lambda x: functional.avg_pool2d(x, args["kernel"], args["stride"])
+    if kind == "Int8Sum":
+        return torch.add
+    if kind == "Int8Relu":
+        return torch.relu
+    raise DataError(f"graph.json: the operator {kind} is not known")
+
+
+def _find_weights(folder: Path) -> Path:
+    """The folder of the network. A relative path is tried from the working folder, then from the project's."""
+    places = [folder] if folder.is_absolute() else [Path.cwd() / folder, PROJECT_ROOT / folder]
+    for place in places:
+        if place.is_dir():
+            return place
+    looked = " and ".join(str(place.resolve()) for place in dict.fromkeys(places))
+    raise ConfigError(f"detector.weights: there is no folder {looked}; put {' and '.join(SHA256)} there")
+
+
+def _read_network(folder: Path) -> tuple[Graph, Tensors]:
+    """The operators in order, and every tensor in float."""
+    content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
+    description = json.loads(content["graph.json"])
+    quantisation: Mapping[str, tuple[float, int]] = description["quant"]
+    arrays = np.load(io.BytesIO(content["maskrcnn2go_coco_int8.npz"]), allow_pickle=False)
+    tensors = {name: _dequantised(arrays[name], quantisation.get(name)) for name in arrays.files}
+    return description["ops"], tensors
+
+
+def _read_checked(path: Path, sha256: str) -> bytes:
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
+    found = hashlib.sha256(content).hexdigest()
+    if found != sha256:
+        raise DataError(f"detector.weights: {path} is damaged: sha256 {found[:12]}..., expected {sha256[:12]}...")
+    return content
+
+
+def _dequantised(values: np.ndarray[Any, Any], scale_zero: tuple[float, int] | None) -> Tensor:
+    """scale * (q - zero point) as float32, kernels from (out, h, w, in) or, transposed, (in, h, w, out) to torch's."""
+    if scale_zero is None:
+        return torch.from_numpy(values)
+    scale, zero_point = scale_zero
+    tensor = torch.from_numpy(((values.astype(np.float64) - zero_point) * scale).astype(np.float32))
+    return tensor.permute(0, 3, 1, 2) if tensor.ndim == 4 else tensor  # a permuted view is channels last already

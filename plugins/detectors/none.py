@@ -1,0 +1,20 @@
+"""No detections: reconstruction without instances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from framework.data import Detections, Frame
+from framework.interfaces import Detector
+from framework.label_spaces import COCO
+
+
+@dataclass
+class NoDetections(Detector):
+    """Finds nothing: the map is geometry only, and the cost of everything but the instances can be measured."""
+
+    def __post_init__(self) -> None:
+        self.classes = COCO
+
+    def detect(self, frame: Frame) -> Detections:
+        return Detections.none(frame.camera.shape, self.classes)

@@ -1,0 +1,281 @@
+"""Mask R-CNN 2Go: the operators against their definition, and the real network on real pictures."""
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from framework.data import Camera, Frame
+from framework.detection.masks import mask_overlaps, tight_boxes
+from framework.errors import ConfigError, DataError
+from framework.label_spaces import COCO
+from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, Network, _dequantised, _read_network
+
+SHARED = Path(__file__).resolve().parents[4] / "shared"
+WEIGHTS = SHARED / "weights" / "maskrcnn2go_int8"
+needs_weights = pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"{WEIGHTS} is absent")
+
+
+def picture(color):
+    height, width = color.shape[:2]
+    camera = Camera(width, height, 500.0, 500.0, width / 2, height / 2)
+    return Frame(0, 0.0, color, np.ones((height, width), np.float32), camera)
+
+
+def shared_picture(scene, index):
+    path = SHARED / "data" / scene / "color" / f"{index:06d}.jpg"
+    if not path.exists():
+        pytest.skip(f"{path} is absent")
+    return picture(cv2.imread(str(path))[..., ::-1].copy())
+
+
+@pytest.fixture(scope="module")
+def detector():
+    return MaskRCNN2Go(device="cpu")
+
+
+def best_scores(detections):
+    best = {}
+    for score, row in zip(detections.scores, detections.class_probabilities, strict=True):
+        name = detections.classes[row.argmax()]
+        best[name] = max(best.get(name, 0.0), float(score))
+    return best
+
+
+# The operators
+
+
+def quantised(rng, shape, zero_point=120):
+    return rng.integers(0, 256, shape).astype(np.uint8), (0.01, zero_point)
+
+
+def real(values, scale_zero):
+    return (values.astype(np.float64) - scale_zero[1]) * scale_zero[0]
+
+
+def run_one(kind, args, x_nhwc, tensors):
+    """One operator through the graph interpreter, from and to NHWC as in the graph's own definition."""
+    operator = {"type": kind, "inputs": ["x", *tensors], "outputs": ["y"], "args": args}
+    network = Network([operator], tensors, ("x",), ("y",))
+    (y,) = network(torch.from_numpy(x_nhwc.astype(np.float32)).permute(0, 3, 1, 2))
+    return y.permute(0, 2, 3, 1).numpy() if y.ndim == 4 else y.numpy()
+
+
+@pytest.mark.parametrize(("stride", "pad", "group"), [(1, 1, 1), (2, 1, 1), (1, 1, 6), (2, 0, 3)])
+@pytest.mark.parametrize("relu", [False, True])
+def test_convolution_is_the_sum_over_the_window_of_dequantised_weights(stride, pad, group, relu):
+    rng = np.random.default_rng(7)
+    x = rng.normal(0, 1, (1, 7, 8, 6))
+    weight, weight_scale = quantised(rng, (6, 3, 3, 6 // group))
+    bias, bias_scale = rng.integers(-200, 200, 6).astype(np.int32), (0.002, 0)
+    tensors = {"w": _dequantised(weight, weight_scale), "b": _dequantised(bias, bias_scale)}
+    args = {"kernel": 3, "stride": stride, "pad": pad, "group": group}
+    y = run_one("Int8ConvRelu" if relu else "Int8Conv", args, x, tensors)
+
+    padded, w = np.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0))), real(weight, weight_scale)
+    for i, j, out in np.ndindex(*y.shape[1:]):
+        first = out // (6 // group) * (6 // group)
+        window = padded[0, i * stride : i * stride + 3, j * stride : j * stride + 3, first : first + 6 // group]
+        expected = (window * w[out]).sum() + bias[out] * 0.002
+        assert y[0, i, j, out] == pytest.approx(max(expected, 0) if relu else expected, abs=1e-4)
+
+
+@pytest.mark.parametrize(("kernel", "pad"), [(2, 0), (4, 1)])
+def test_transposed_convolution_adds_each_input_times_the_kernel(kernel, pad):
+    rng = np.random.default_rng(8)
+    x = rng.normal(0, 1, (1, 5, 6, 3))
+    weight, scale = quantised(rng, (3, kernel, kernel, 4))
+    tensors = {"w": _dequantised(weight, scale), "b": torch.zeros(4)}
+    y = run_one("Int8ConvTranspose", {"kernel": kernel, "stride": 2, "pad": pad}, x, tensors)
+
+    expected, w = np.zeros((2 * 5 + kernel, 2 * 6 + kernel, 4)), real(weight, scale)
+    for i, j, ky, kx in np.ndindex(5, 6, kernel, kernel):
+        expected[2 * i + ky, 2 * j + kx] += x[0, i, j] @ w[:, ky, kx]
+    assert y.shape == (1, 10, 12, 4)
+    np.testing.assert_allclose(y[0], expected[pad : pad + 10, pad : pad + 12], atol=1e-4)
+
+
+def test_fully_connected_mean_sum_and_relu():
+    rng = np.random.default_rng(9)
+    x = rng.normal(0, 1, (2, 3, 3, 5))
+    mean = run_one("Int8AveragePool", {"kernel": 3, "stride": 1}, x, {})
+    np.testing.assert_allclose(mean[:, 0, 0], x.mean(axis=(1, 2)), atol=1e-6)
+    weight, scale = quantised(rng, (4, 5))
+    tensors = {"w": _dequantised(weight, scale), "b": torch.ones(4)}
+    np.testing.assert_allclose(
+        run_one("Int8FC", {}, mean, tensors), mean[:, 0, 0] @ real(weight, scale).T + 1, atol=1e-5
+    )
+    np.testing.assert_allclose(run_one("Int8Relu", {}, x, {}), np.maximum(x, 0), atol=1e-6)
+
+
+def test_a_network_runs_only_what_its_outputs_need():
+    tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
+    conv = {"type": "Int8Conv", "args": {"kernel": 1, "stride": 1, "pad": 0}}
+    graph = [
+        {**conv, "inputs": ["x", "w", "b"], "outputs": ["y"]},
+        {"type": "Unknown", "inputs": ["y"], "outputs": ["elsewhere"], "args": {}},
+        {"type": "Int8Sum", "inputs": ["x", "y"], "outputs": ["z"], "args": {}},
+    ]
+    (z,) = Network(graph, tensors, ("x",), ("z",))(torch.full((1, 1, 2, 2), 3.0))
+    assert (z == 6).all()
+    with pytest.raises(DataError, match="the operator Unknown is not known"):
+        Network(graph, tensors, ("x",), ("elsewhere",))
+
+
+# The network
+
+
+@needs_weights
+@pytest.mark.parametrize(
+    ("scene", "index", "expected"),
+    [
+        ("redkitchen", 0, {"chair": 0.9, "dining table": 0.9, "cup": 0.4, "book": 0.4}),
+        ("redkitchen", 290, {"chair": 0.9, "dining table": 0.9, "cup": 0.9, "tv": 0.8, "book": 0.7}),
+        ("mit76", 0, {"chair": 0.9, "couch": 0.75, "potted plant": 0.75}),
+        ("mit76", 3, {"couch": 0.9, "chair": 0.8}),
+    ],
+)
+def test_expected_objects_are_found(detector, scene, index, expected):
+    found = best_scores(detector.detect(shared_picture(scene, index)))
+    missing = {name: score for name, score in expected.items() if found.get(name, 0) < score}
+    assert not missing, f"found only {found}"
+
+
+@needs_weights
+def test_the_mask_of_the_true_bed_sits_on_it(detector):
+    """Replica's rendering has instance ground truth: the detection that is sure of a bed covers the labelled bed."""
+    root = SHARED / "data" / "replica_floor2"
+    if not root.is_dir():
+        pytest.skip(f"{root} is absent")
+    beds = [int(i) for i, about in json.loads((root / "instances.json").read_text()).items() if about["class"] == "bed"]
+    ious = []
+    for index in range(0, 123, 8):
+        detections = detector.detect(shared_picture("replica_floor2", index))
+        ids = cv2.imread(str(root / "instance" / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED)
+        for mask, score, row in zip(detections.masks, detections.scores, detections.class_probabilities, strict=True):
+            if score > 0.9 and COCO[row.argmax()] == "bed":
+                ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
+    assert len(ious) >= 3
+    assert np.median(ious) > 0.8  # its pillows carry labels of their own
+
+
+@needs_weights
+def test_mask_grids_are_the_channels_that_the_whole_graph_computes(detector):
+    """The shortcut upsamples one class a detection; the graph upsamples all 81."""
+    graph, tensors = _read_network(WEIGHTS)
+    whole = Network(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
+    pooled = torch.from_numpy(np.random.default_rng(10).normal(0, 0.3, (4, 128, 6, 6)).astype(np.float32))
+    label = np.array([1, 80, 57, 57], np.int32)
+    with torch.inference_mode():
+        expected = torch.sigmoid(whole(pooled)[0])[torch.arange(4), torch.from_numpy(label).long()]
+        np.testing.assert_allclose(detector._mask_grids(pooled, label), expected.numpy(), atol=1e-5)
+
+
+@needs_weights
+def test_detections_keep_the_contract(detector):
+    frame = shared_picture("redkitchen", 290)
+    detections = detector.detect(frame)
+    assert detections.classes == detector.classes == COCO
+    assert detections.masks.shape == (len(detections), *frame.camera.shape)
+    assert len(detections) > 5
+    np.testing.assert_allclose(detections.class_probabilities.sum(axis=1), 1, atol=1e-5)
+    assert (np.diff(detections.scores) <= 0).all()
+    assert detections.scores.min() > 0.1
+    np.testing.assert_array_equal(detections.boxes, tight_boxes(detections.masks))
+    assert detections.masks.any(axis=(1, 2)).all()
+
+
+@needs_weights
+def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
+    frame = shared_picture("mit76", 0)
+    before = frame.color.copy()
+    first = detector.detect(frame)
+    detector.detect(shared_picture("mit76", 4))
+    second = detector.detect(frame)
+    np.testing.assert_array_equal(frame.color, before)
+    for name in ("masks", "boxes", "scores", "class_probabilities"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+@needs_weights
+def test_no_two_masks_of_one_object(detector):
+    frame = shared_picture("redkitchen", 0)
+    overlaps = mask_overlaps(detector.detect(frame).masks)
+    areas = overlaps.diagonal()
+    iou = overlaps / (areas[:, None] + areas - overlaps)
+    np.fill_diagonal(iou, 0)
+    assert iou.max() <= detector.agnostic_nms
+    assert len(MaskRCNN2Go(device="cpu", agnostic_nms=1.0).detect(frame)) > len(overlaps)
+
+
+@needs_weights
+@pytest.mark.parametrize("shape", [(480, 640), (33, 57), (240, 1280), (1, 1), (5, 2000)])
+def test_blank_images_of_any_size_are_fine(detector, shape):
+    for value in (0, 255):
+        detections = detector.detect(picture(np.full((*shape, 3), value, np.uint8)))
+        assert detections.masks.shape == (len(detections), *shape)
+
+
+@needs_weights
+def test_another_size_shows_the_same_objects(detector):
+    frame = shared_picture("redkitchen", 290)
+    small = picture(cv2.resize(frame.color, (400, 300), interpolation=cv2.INTER_AREA))
+    found = best_scores(detector.detect(small))
+    assert found["dining table"] > 0.9
+    assert found["chair"] > 0.8
+
+
+@needs_weights
+def test_a_relative_path_works_from_any_folder(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert MaskRCNN2Go(device="cpu").classes == COCO
+
+
+# Faults
+
+
+def test_absent_weights_are_one_line_that_says_where_they_were_looked_for(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError) as caught:
+        MaskRCNN2Go(weights=Path("no/such/folder"), device="cpu")
+    message = str(caught.value)
+    assert message.startswith("detector.weights: there is no folder")
+    assert str(tmp_path / "no/such/folder") in message
+    assert all(name in message for name in SHA256)
+    assert "\n" not in message
+    with pytest.raises(DataError, match=r"graph\.json could not be read"):
+        MaskRCNN2Go(weights=tmp_path, device="cpu")
+
+
+@needs_weights
+def test_damaged_weights_are_refused(tmp_path):
+    for name in SHA256:
+        (tmp_path / name).write_bytes((WEIGHTS / name).read_bytes())
+    damaged = tmp_path / "maskrcnn2go_coco_int8.npz"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    with pytest.raises(DataError, match=r"maskrcnn2go_coco_int8\.npz is damaged"):
+        MaskRCNN2Go(weights=tmp_path, device="cpu")
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"score_threshold": 1.0},
+        {"score_threshold": float("nan")},
+        {"nms": 0.0},
+        {"agnostic_nms": 1.5},
+        {"proposals": 0},
+        {"max_detections": 0},
+        {"short_side": 8},
+        {"long_side": 100},
+        {"mask_threshold": 1.0},
+        {"device": "tpu"},
+    ],
+)
+def test_a_wrong_parameter_is_named(parameters):
+    (name,) = parameters
+    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+        MaskRCNN2Go(**parameters)

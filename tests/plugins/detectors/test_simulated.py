@@ -1,0 +1,265 @@
+"""The simulated detector: without errors it is the ground truth, and each error has the statistics that it promises."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Frame, FrameTruth
+from framework.detection.masks import tight_boxes
+from framework.errors import ConfigError, DataError
+from framework.label_spaces import COCO
+from plugins.detectors.ground_truth import GroundTruthDetector
+from plugins.detectors.simulated import (
+    LOOKALIKES,
+    SimulatedDetector,
+    confusion_kernel,
+    signed_distance,
+    smooth_field,
+    touching_pairs,
+)
+
+PERFECT = SimulatedDetector(
+    merge_rate=0,
+    miss_rate=0,
+    small_side=0,
+    truncated_miss_rate=0,
+    split_rate=0,
+    shift=0,
+    bleed=0,
+    boundary_noise=0,
+    mask_grid=0,
+    confusion=0,
+    score_concentration=0,
+    score_threshold=0,
+    false_positives=0,
+)
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+IDS = np.zeros((120, 160), np.int32)
+IDS[20:60, 20:60] = 5  # a chair in the open
+IDS[20:60, 60:100] = 6  # a couch that touches it
+IDS[70:90, 40:60] = 9  # a small cup
+IDS[80:120, 100:160] = 12  # a bed that the image's corner cuts
+IDS[0:10, 0:10] = 30  # of no known class
+TRUTH = FrameTruth(IDS, {5: "chair", 6: "couch", 9: "cup", 12: "bed", 30: None})
+
+
+def frame(index=0, depth=1.0):
+    return Frame(
+        index, 0.0, np.zeros((120, 160, 3), np.uint8), np.full((120, 160), depth, np.float32), CAMERA, truth=TRUTH
+    )
+
+
+def same(a, b):
+    return all(
+        np.array_equal(getattr(a, name), getattr(b, name))
+        for name in ("masks", "boxes", "scores", "class_probabilities")
+    )
+
+
+def count_of(detector, mask, frames=400):
+    """In how many frames a detection's centre pixel lies in `mask`."""
+    return sum(bool((d.masks & mask).any()) for d in (detector.detect(frame(k)) for k in range(frames)))
+
+
+def test_without_errors_it_is_the_ground_truth():
+    for index in range(3):
+        assert same(PERFECT.detect(frame(index)), GroundTruthDetector().detect(frame(index)))
+
+
+def test_everything_at_its_default_keeps_the_contract():
+    detector = SimulatedDetector(false_positives=3)
+    for index in range(30):
+        detections = detector.detect(frame(index))
+        np.testing.assert_allclose(detections.class_probabilities.sum(axis=1), 1, atol=1e-5)
+        assert detections.class_probabilities.size == 0 or detections.class_probabilities.min() > 0
+        assert (np.diff(detections.scores) <= 0).all()
+        assert (detections.scores >= detector.score_threshold).all()
+        assert detections.masks.any(axis=(1, 2)).all()
+        np.testing.assert_array_equal(detections.boxes, tight_boxes(detections.masks))
+
+
+def test_results_depend_on_seed_and_frame_and_not_on_the_order_of_calls():
+    detector = SimulatedDetector(seed=3)
+    forward = [detector.detect(frame(k)) for k in range(6)]
+    backward = [SimulatedDetector(seed=3).detect(frame(k)) for k in reversed(range(6))][::-1]
+    assert all(same(a, b) for a, b in zip(forward, backward, strict=True))
+    assert not same(forward[0], forward[1])
+    assert not same(forward[0], SimulatedDetector(seed=4).detect(frame(0)))
+
+
+def test_changing_one_error_leaves_the_draws_of_the_others_alone():
+    """More misses take detections away; those that stay are the same, to the pixel."""
+    few = SimulatedDetector(miss_rate=0.0, false_positives=0, merge_rate=0)
+    many = replace(few, miss_rate=0.5)
+    for index in range(20):
+        a, b = few.detect(frame(index)), many.detect(frame(index))
+        assert {m.tobytes() for m in b.masks} <= {m.tobytes() for m in a.masks}
+
+
+def test_miss_rates():
+    chair, cup, bed = IDS == 5, IDS == 9, IDS == 12
+    assert count_of(replace(PERFECT, miss_rate=0.3), chair) == pytest.approx(400 * 0.7, abs=30)  # 3 sigma
+    smaller = replace(PERFECT, small_side=20.0)
+    assert count_of(smaller, cup) == pytest.approx(400 * (1 - np.exp(-1)), abs=30)
+    assert count_of(smaller, chair) == pytest.approx(400 * (1 - np.exp(-2)), abs=22)
+    truncated = replace(PERFECT, truncated_miss_rate=0.4)
+    assert count_of(truncated, chair) == 400
+    assert count_of(truncated, bed) == pytest.approx(400 * 0.6, abs=30)
+
+
+def test_split_objects_come_back_as_two_halves_of_the_whole():
+    detections = replace(PERFECT, split_rate=1.0).detect(frame())
+    assert len(detections) == 8
+    assert (detections.masks.sum(axis=0) == np.isin(IDS, (5, 6, 9, 12))).all()
+    assert detections.scores.max() < 0.7  # about half of the object each
+    rate = np.mean([len(replace(PERFECT, split_rate=0.25).detect(frame(k))) - 4 for k in range(200)]) / 4
+    assert rate == pytest.approx(0.25, abs=0.05)
+
+
+def test_touching_neighbours_merge_and_others_do_not():
+    detections = replace(PERFECT, merge_rate=1.0).detect(frame())
+    assert len(detections) == 3
+    assert sum((mask == np.isin(IDS, (5, 6))).all() for mask in detections.masks) == 1
+    rate = np.mean([4 - len(replace(PERFECT, merge_rate=0.3).detect(frame(k))) for k in range(300)])
+    assert rate == pytest.approx(0.3, abs=0.08)
+
+
+def test_a_step_in_depth_is_no_contact():
+    flat = frame()
+    assert touching_pairs(flat).tolist() == [[5, 6]]
+    depth = np.where(IDS == 6, 2.0, 1.0).astype(np.float32)
+    assert touching_pairs(replace(flat, depth=depth)).shape == (0, 2)
+
+
+def test_bleeding_grows_a_mask_by_exactly_that_many_pixels():
+    for bleed, side in ((3.0, 46), (-4.0, 32)):
+        detections = replace(PERFECT, bleed=bleed).detect(frame())
+        (box,) = [b for b, m in zip(detections.boxes, detections.masks, strict=True) if m[40, 40] and not m[40, 90]]
+        assert box.tolist() == [40 - side / 2, 40 - side / 2, 39 + side / 2, 39 + side / 2]
+    bed = max(replace(PERFECT, bleed=-4.0).detect(frame()).masks, key=lambda m: m[110, 150])
+    assert bed[119, 159], "a mask must not shrink away from the image's border"
+
+
+def test_shift_and_wobble_have_their_standard_deviations():
+    detector = replace(PERFECT, shift=2.0)
+    centers = []
+    for k in range(200):
+        detections = detector.detect(frame(k))
+        (box,) = [b for b, m in zip(detections.boxes, detections.masks, strict=True) if m[40, 40] and not m[40, 90]]
+        centers.append((box[:2] + box[2:]) / 2)
+    assert np.std(centers, axis=0) == pytest.approx(2.0, rel=0.2)
+    assert np.mean(centers, axis=0) == pytest.approx(39.5, abs=0.5)
+
+    fields = np.stack([smooth_field(np.random.default_rng(k), (90, 70), 12.0) for k in range(200)])
+    assert fields.mean() == pytest.approx(0, abs=0.05)
+    assert fields.std(axis=0) == pytest.approx(1, abs=0.3)
+    assert fields.std() == pytest.approx(1, abs=0.05)
+    # Blurring with sigma = scale gives a correlation of exp(-d^2 / (4 scale^2)) at distance d.
+    for distance in (1, 12, 24):
+        correlation = np.mean(fields[:, :, distance:] * fields[:, :, :-distance]) / fields.var()
+        assert correlation == pytest.approx(np.exp(-((distance / 24) ** 2)), abs=0.08)
+
+
+def test_signed_distance_of_a_half_plane():
+    mask = np.zeros((5, 10), np.uint8)
+    mask[:, 4:] = 1
+    np.testing.assert_allclose(signed_distance(mask)[2], np.arange(10) - 3.5)
+
+
+def test_a_coarse_grid_keeps_a_square_and_blurs_a_comb():
+    fine, coarse = PERFECT.detect(frame()), replace(PERFECT, mask_grid=28).detect(frame())
+    assert (fine.masks ^ coarse.masks).mean() < 1e-3
+    comb = np.zeros((120, 160), np.int32)
+    comb[10:110, 10:150:2] = 5
+    detail = replace(frame(), truth=FrameTruth(comb, {5: "chair"}))
+    (mask,) = replace(PERFECT, mask_grid=8, score_threshold=0.0).detect(detail).masks
+    assert np.mean(mask != (comb == 5)) > 0.2
+
+
+def test_the_confusion_kernel_is_a_distribution_that_prefers_lookalikes():
+    kernel = confusion_kernel(COCO, 0.25)
+    np.testing.assert_allclose(kernel.sum(axis=1), 1)
+    np.testing.assert_allclose(np.diag(kernel), 0.75)
+    chair, couch, cup = (COCO.index(name) for name in ("chair", "couch", "cup"))
+    assert kernel[chair, couch] > 10 * kernel[chair, cup] > 0
+    assert all(name in COCO for group in LOOKALIKES for name in group)
+    np.testing.assert_array_equal(confusion_kernel(COCO, 0.0), np.eye(80))
+
+
+def distributions(detector, frames):
+    """The rows of the couch, found by its place."""
+    rows = []
+    for k in range(frames):
+        detections = detector.detect(frame(k))
+        (row,) = [p for p, m in zip(detections.class_probabilities, detections.masks, strict=True) if m[40, 80]]
+        rows.append(row)
+    return np.array(rows)
+
+
+def test_confused_classes_have_the_kernel_as_their_mean_and_the_truth_not_always_on_top():
+    couch = COCO.index("couch")
+    detector = replace(PERFECT, confusion=0.3, confusion_concentration=3.0, confusion_consistency=0.0)
+    rows = distributions(detector, 600)
+    assert rows.mean(axis=0) == pytest.approx(confusion_kernel(COCO, 0.3)[couch], abs=0.04)
+    wrong = np.mean(rows.argmax(axis=1) != couch)
+    assert 0.05 < wrong < 0.4
+    steady = distributions(replace(detector, confusion_concentration=1e6), 20)
+    assert steady == pytest.approx(np.tile(confusion_kernel(COCO, 0.3)[couch], (20, 1)), abs=0.01)
+
+
+def test_a_consistent_detector_errs_the_same_way_in_every_frame():
+    detector = replace(PERFECT, confusion=0.3, confusion_consistency=1.0)
+    assert np.ptp(distributions(detector, 10), axis=0).max() == 0
+    half = distributions(replace(detector, confusion_consistency=0.5), 300)
+    _, counts = np.unique(half.round(5), axis=0, return_counts=True)
+    assert counts.max() / 300 == pytest.approx(0.5, abs=0.09)
+
+
+def test_scores_follow_quality():
+    detector = replace(PERFECT, score_concentration=20.0, boundary_noise=6.0, bleed=4.0, confusion=0.2)
+    scores, quality = [], []
+    for k in range(150):
+        detections = detector.detect(frame(k))
+        for mask, score, row in zip(detections.masks, detections.scores, detections.class_probabilities, strict=True):
+            true = max((5, 6, 9, 12), key=lambda i, m=mask: (m & (i == IDS)).sum()) == IDS
+            scores.append(score)
+            quality.append((mask & true).sum() / (mask | true).sum() * row.max())
+    assert np.corrcoef(scores, quality)[0, 1] > 0.6
+    assert np.mean(scores) == pytest.approx(np.mean(quality), abs=0.02)
+
+
+def test_false_positives():
+    detector = replace(PERFECT, false_positives=1.5, score_concentration=20.0)
+    empty = replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {}))
+    found = [detector.detect(replace(empty, index=k)) for k in range(200)]
+    assert np.mean([len(d) for d in found]) == pytest.approx(1.5, abs=0.3)
+    assert np.mean(np.concatenate([d.scores for d in found])) == pytest.approx(0.25, abs=0.04)
+
+
+def test_no_truth_is_an_error_and_no_objects_are_none():
+    with pytest.raises(DataError, match="no instance ground truth"):
+        SimulatedDetector().detect(replace(frame(), truth=None))
+    assert len(PERFECT.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))) == 0
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"seed": -1},
+        {"min_pixels": 0},
+        {"miss_rate": 1.1},
+        {"small_side": -1.0},
+        {"bleed": float("nan")},
+        {"boundary_scale": 1.0},
+        {"mask_grid": 3},
+        {"confusion": 1.0},
+        {"confusion_concentration": 0.0},
+        {"false_positives": -1.0},
+        {"false_positive_score": 1.0},
+    ],
+)
+def test_a_wrong_parameter_is_named(parameters):
+    (name,) = parameters
+    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+        SimulatedDetector(**parameters)
