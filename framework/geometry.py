@@ -75,13 +75,18 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
     Overlapping masks give overlapping clusters. A mask without any reading gives an empty cluster, so that cluster k
     always is detection k.
     """
-    cluster, v, u = np.nonzero(detections.masks & (frame.depth > 0))
+    height, width = frame.depth.shape
+    found = np.flatnonzero(
+        detections.masks & (frame.depth > 0)
+    )  # several times faster than nonzero in three dimensions
+    cluster, pixel = np.divmod(found.astype(np.int32), np.int32(height * width))
+    v, u = np.divmod(pixel, np.int32(width))
     pixels = np.stack([u, v], axis=1).astype(np.int32)
     points_camera = back_project(frame.camera, pixels, frame.depth[v, u])
     return PointClusters(
         points_world=np.asarray(transform(pose.T_world_camera, points_camera), np.float32),
         pixels=pixels,
-        cluster=cluster.astype(np.int32),
+        cluster=cluster,
         class_probabilities=detections.class_probabilities,
         scores=detections.scores,
         classes=detections.classes,

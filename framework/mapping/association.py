@@ -8,6 +8,7 @@ an object still finds the whole.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -33,6 +34,30 @@ class Overlaps:
     def over_smaller(self) -> npt.NDArray[np.float64]:
         """(N, M) shared pixels over the smaller of cluster and visible instance, in [0, 1]."""
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), 1)
+
+
+class PixelLists(NamedTuple):
+    """The cluster points of each pixel as linked lists: a pixel under overlapping masks has several."""
+
+    first: Int32  # (H, W) the first point, -1 = under no cluster
+    next: Int32  # (P,) the next point of the same pixel, -1 = last
+
+
+@njit(cache=True, nogil=True)
+def _link_points(pixels, cluster, first, following):
+    first[:] = -1
+    for p in range(pixels.shape[0] - 1, -1, -1):
+        if cluster[p] >= 0:
+            u, v = pixels[p, 0], pixels[p, 1]
+            following[p] = first[v, u]
+            first[v, u] = p
+
+
+def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
+    """The points of `clusters` by the pixel of the (height, width) image that they were seen at, in order."""
+    lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
+    _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next)
+    return lists
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -102,17 +127,27 @@ def match_one_to_one(overlap: npt.NDArray[np.float64], threshold: float) -> Int3
     return match
 
 
-def cover_another(clusters: PointClusters, shape: tuple[int, int], threshold: float) -> Bool:
+@njit(cache=True, nogil=True)
+def _count_shared(first_point, next_point, cluster, shared):
+    """Adds to shared (N, N) the pixels that each two clusters have in common, itself on the diagonal."""
+    for pixel in range(first_point.size):
+        p = first_point.flat[pixel]
+        while p >= 0:
+            q = first_point.flat[pixel]
+            while q >= 0:
+                shared[cluster[p], cluster[q]] += 1
+                q = next_point[q]
+            p = next_point[p]
+
+
+def cover_another(clusters: PointClusters, points: PixelLists, threshold: float) -> Bool:
     """(N,) clusters that share more than `threshold` of the smaller one's pixels with a cluster of a better score.
 
     Such a cluster is most likely the same object found twice and must not become an instance of its own.
     """
     n = len(clusters)
-    members = clusters.cluster >= 0
-    u, v = clusters.pixels[members].T.astype(np.int64)
-    masks = np.zeros((n, shape[0] * shape[1]), np.float32)
-    masks[clusters.cluster[members], v * shape[1] + u] = 1
-    shared = masks @ masks.T
+    shared = np.zeros((n, n), np.int32)
+    _count_shared(points.first, points.next, clusters.cluster, shared)
     sizes = shared.diagonal()
     over_smaller = shared / np.maximum(np.minimum(sizes[:, None], sizes[None, :]), 1)
     rank = np.lexsort((np.arange(n), -clusters.scores)).argsort()

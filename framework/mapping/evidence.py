@@ -140,17 +140,6 @@ def update_voxel(evidence, row, n, measurement, point):
     return evicted
 
 
-@njit(cache=True, nogil=True)
-def list_points_by_pixel(pixels, cluster, first_point, next_point):
-    """Links the points of each pixel into a list: a pixel under overlapping masks has several."""
-    first_point[:] = -1
-    for p in range(pixels.shape[0] - 1, -1, -1):
-        if cluster[p] >= 0:
-            u, v = pixels[p, 0], pixels[p, 1]
-            next_point[p] = first_point[v, u]
-            first_point[v, u] = p
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def _find_blocks_under_clusters(grid, active, near_pixel, first_point, wants_row):
     """Notes in wants_row (A,) the blocks without a row that have a voxel under some cluster."""
@@ -213,7 +202,9 @@ class EvidenceRows:
         return sum(array.nbytes for array in self.evidence)
 
     def update(self, active: Int32, near_pixel: Int32, measurement: Measurement) -> None:
-        """Updates the voxels near the measured surface: `active` (A,) and `near_pixel` (A, 512) of Integrator.integrate."""
+        """Updates the voxels near the measured surface: `active` (A,) and `near_pixel` (A, 512) of
+        Integrator.integrate.
+        """
         first_point = measurement.first_point.ravel()
         wants_row = np.empty(len(active), np.bool_)
         evicted = np.empty(len(active), np.int32)

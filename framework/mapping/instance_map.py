@@ -114,7 +114,8 @@ class InstanceMap(SceneMap):
             "last_id": self.table.last_id,
             "evicted": self.labels.evicted,
             "instances": [
-                {**asdict(record), "class_log": record.class_log.tolist()} for record in self.table.records.values()
+                {**asdict(record), "class_log": record.class_log.tolist(), "observed_in": sorted(record.observed_in)}
+                for record in self.table.records.values()
             ],
         }
         arrays: dict[str, npt.NDArray[Any]] = {
@@ -149,7 +150,8 @@ class InstanceMap(SceneMap):
         scene.labels.evicted = header["evicted"]
         scene.table.last_id = header["last_id"]
         for entry in header["instances"]:
-            record = InstanceRecord(**{**entry, "class_log": np.array(entry["class_log"])})
+            class_log, observed_in = np.array(entry.pop("class_log")), set(entry.pop("observed_in"))
+            record = InstanceRecord(class_log=class_log, observed_in=observed_in, **entry)
             scene.table.records[record.id] = record
         return scene
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -15,11 +15,16 @@ class InstanceRecord:
 
     id: int
     class_log: Float64
-    observations: int = 0  # frames in which it was detected
-    visible: int = 0  # frames in which it was in view
-    score_sum: float = 0.0
     first_frame: int = -1
-    last_frame: int = -1
+    observed_in: set[int] = field(default_factory=set)  # frames in which it was detected
+    visible: int = 0  # frames in which it was in view
+    score_sum: float = 0.0  # over its detections
+    detections: int = 0
+
+    @property
+    def observations(self) -> int:
+        """Frames in which it was detected; a merged instance may have had two detections in one."""
+        return len(self.observed_in)
 
     @property
     def class_probabilities(self) -> Float32:
@@ -30,9 +35,8 @@ class InstanceRecord:
     @property
     def confidence(self) -> float:
         """Mean score of its detections times the share of frames in view in which it was detected, in [0, 1]."""
-        if self.observations == 0:
-            return 0.0
-        return min(1.0, self.score_sum / self.observations * self.observations / max(self.visible, self.observations))
+        mean_score = self.score_sum / max(self.detections, 1)
+        return mean_score * self.observations / max(self.visible, self.observations, 1)
 
 
 class InstanceTable:
@@ -53,16 +57,16 @@ class InstanceTable:
         """Counts one detection with log P(O = c | I_t) (C,)."""
         record = self.records[instance_id]
         record.class_log += log_probabilities
-        record.observations += 1
+        record.observed_in.add(frame_index)
         record.score_sum += score
-        record.last_frame = frame_index
+        record.detections += 1
 
     def merge(self, kept: int, dropped: int) -> None:
         """Adds the history of `dropped` to `kept` and forgets it."""
         a, b = self.records[kept], self.records.pop(dropped)
         a.class_log += b.class_log
-        a.observations += b.observations
+        a.observed_in |= b.observed_in
         a.visible = max(a.visible, b.visible)  # the two were in view together, or they would not cover each other
         a.score_sum += b.score_sum
+        a.detections += b.detections
         a.first_frame = min(a.first_frame, b.first_frame)
-        a.last_frame = max(a.last_frame, b.last_frame)

@@ -147,8 +147,9 @@ def _number_blocks(grid, coords, stamp, frame, active):
 def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_pixel):
     """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
 
-    `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers. near_pixel (A, 512)
-    gets the number of the pixel that sees each voxel within near_band m of the measured surface, -1 for the others.
+    `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers. near_pixel
+    (A, 512) gets the number of the pixel that sees each voxel within near_band m of the measured surface, -1 for the
+    others.
 
     A block is done in passes over its 512 voxels that hold no branches, so that the compiler vectorises them.
     """
@@ -232,7 +233,8 @@ class Integrator:
         """Integrates one frame.
 
         Returns the numbers of the blocks it saw, (A,), and for each of their voxels within near_band m of the measured
-        surface the number v * width + u of the pixel that sees it, -1 for the others, (A, 512); valid until the next call.
+        surface the number v * width + u of the pixel that sees it, -1 for the others, (A, 512); valid until the next
+        call.
 
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
@@ -282,5 +284,4 @@ class Integrator:
             kernel(*arguments, self._found, counts)
             if counts.max() <= self._found.shape[1]:
                 return np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])
-            self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
-        self._found = np.empty((CHUNKS, 2 * int(counts.max()), 3), np.int32)
+            self._found = np.empty((CHUNKS, 2 * int(counts.max()), 3), np.int32)

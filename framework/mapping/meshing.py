@@ -17,9 +17,10 @@ from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid,
 from framework.mapping.voxel_walk import voxel_number
 
 NO_VERTEX = -1
-MAX_JUMP = (
-    3.0  # voxels of distance across one voxel; true surfaces stay below 1 / cos, silhouettes seen from one side do not
-)
+# A cell whose corners differ by more voxels of distance than this lies on a silhouette seen from one side, between a
+# truncated free voxel and a truncated hidden one. Surfaces reach 1 / cos of the slant at which they were seen, so the
+# bound is wide.
+MAX_JUMP = 8.0
 
 
 @njit(cache=True, nogil=True, forceinline=True)

@@ -13,12 +13,14 @@ from framework.errors import ConfigError, DataError
 from framework.interfaces import MapFuser
 from framework.mapping.association import (
     Overlaps,
+    PixelLists,
     count_overlaps,
     cover_another,
+    list_points_by_pixel,
     look_up_instances,
     match_one_to_one,
 )
-from framework.mapping.evidence import NEW_CLASSES, Measurement, list_points_by_pixel
+from framework.mapping.evidence import NEW_CLASSES, Measurement
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.integration import Integrator
 from framework.mapping.sensor import Sensor, pinhole
@@ -90,12 +92,13 @@ class BayesianTsdf(MapFuser):
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self._agree_on_classes(clusters.classes)
+        points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self._look_up(frame, pose, clusters)
-        instance_ids = self._associate(overlaps, clusters, frame)
+        instance_ids = self._associate(overlaps, clusters, points, frame)
         self._observe(overlaps, clusters, instance_ids, frame)
         band = self.label_band * self.voxel_size
         active, near_pixel = self._integrator.integrate(frame, pose.T_world_camera, band)
-        self.scene.labels.update(active, near_pixel, self._measurement(frame, clusters, instance_ids))
+        self.scene.labels.update(active, near_pixel, self._measurement(clusters, points, instance_ids))
         self._merge_instances(overlaps, instance_ids)
         self.scene.changed()
 
@@ -116,7 +119,7 @@ class BayesianTsdf(MapFuser):
         look_up_instances(self.scene.voxels.grid, self.scene.labels.evidence, frame.depth, view, instance_ids)
         return count_overlaps(clusters, instance_ids)
 
-    def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Int32:
+    def _associate(self, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame: Frame) -> Int32:
         """(N,) the instance of each cluster, an old or a new one; 0 = none."""
         match = match_one_to_one(overlaps.over_smaller, self.overlap)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
@@ -124,7 +127,7 @@ class BayesianTsdf(MapFuser):
             (instance_ids == 0)
             & (clusters.scores >= self.create_score)
             & (overlaps.sizes >= self.create_points)
-            & ~cover_another(clusters, frame.depth.shape, self.duplicate_overlap)
+            & ~cover_another(clusters, points, self.duplicate_overlap)
         )
         for k in np.flatnonzero(may_create):
             instance_ids[k] = self.scene.table.create(len(clusters.classes), frame.index).id
@@ -146,18 +149,15 @@ class BayesianTsdf(MapFuser):
         p = clusters.class_probabilities.astype(np.float64)
         return np.asarray(np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)))
 
-    def _measurement(self, frame: Frame, clusters: PointClusters, instance_ids: Int32) -> Measurement:
+    def _measurement(self, clusters: PointClusters, points: PixelLists, instance_ids: Int32) -> Measurement:
         """P(O_u | I_t) of this frame's clusters, as the recursions take it."""
-        first_point = np.empty(frame.depth.shape, np.int32)
-        next_point = np.empty(len(clusters.cluster), np.int32)
-        list_points_by_pixel(clusters.pixels, clusters.cluster, first_point, next_point)
         matched = np.zeros(self.scene.table.last_id + 1, np.bool_)
         matched[instance_ids] = True
         scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
         class_gain, named_classes = _class_gains(self._log_probabilities(clusters))
         return Measurement(
-            first_point=first_point,
-            next_point=next_point,
+            first_point=points.first,
+            next_point=points.next,
             cluster=clusters.cluster,
             instance_id=instance_ids,
             instance_gain=np.log(scores / self.instance_floor).astype(np.float32),

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.data import PointClusters
-from framework.mapping.association import count_overlaps, cover_another, match_one_to_one
+from framework.mapping.association import count_overlaps, cover_another, list_points_by_pixel, match_one_to_one
 
 SHAPE = (4, 5)
 
@@ -54,7 +54,7 @@ def test_nothing_seen_and_nothing_detected() -> None:
     )
     assert count_overlaps(empty, seen).votes.shape == (0, 0)
     assert len(match_one_to_one(count_overlaps(empty, seen + 1).over_smaller, 0.3)) == 0
-    assert len(cover_another(empty, SHAPE, 0.5)) == 0
+    assert len(cover_another(empty, list_points_by_pixel(empty, SHAPE), 0.5)) == 0
 
 
 def test_the_best_overlap_goes_first_and_each_instance_goes_once() -> None:
@@ -74,4 +74,4 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 
 def test_a_second_detection_of_an_object_is_told_by_its_overlap() -> None:
     clusters = clusters_of([columns(0, 3), columns(0, 2), columns(3, 5)], [0.5, 0.9, 0.4])
-    assert cover_another(clusters, SHAPE, 0.6).tolist() == [True, False, False]
+    assert cover_another(clusters, list_points_by_pixel(clusters, SHAPE), 0.6).tolist() == [True, False, False]

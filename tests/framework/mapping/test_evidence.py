@@ -11,7 +11,6 @@ from framework.mapping.evidence import (
     Measurement,
     best_class,
     best_instance,
-    list_points_by_pixel,
     update_voxel,
 )
 from plugins.fusers.bayesian_tsdf import _class_gains
@@ -33,8 +32,7 @@ def measured(
 ) -> Measurement:
     """Every cluster covers the one pixel that there is."""
     n = len(ids)
-    first, following = np.empty((1, 1), np.int32), np.empty(n, np.int32)
-    list_points_by_pixel(np.zeros((n, 2), np.int32), np.arange(n, dtype=np.int32), first, following)
+    first, following = np.zeros((1, 1), np.int32), np.append(np.arange(1, n), -1).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
     gains, named = _class_gains(np.log(distributions))
