@@ -69,8 +69,6 @@ class Synthetic(RGBDSequence):
         small = Camera(80, 60, FOCAL_LENGTH * 80, FOCAL_LENGTH * 80, 39.5, 29.5)
         self.path = plan_path(
             self.room.layout,
-            self.room.width,
-            self.room.depth,
             self.frames,
             lambda T_world_camera: self._renderer.depth_and_ids(small, T_world_camera)[1],
             wanted,

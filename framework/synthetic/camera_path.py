@@ -13,11 +13,11 @@ from framework.synthetic.layout import CELL, Layout
 
 FRAME_RATE = 30.0  # Hz
 MAX_SPEED = 0.45  # m/s
-MAX_TURN = np.deg2rad(27.0)  # rad/s
+MAX_TURN = np.deg2rad(28.0)  # rad/s
 DISTANCE = 0.5  # m, kept from furniture and walls
 RADII = np.arange(0.30, 1.06, 0.15)  # m, of the ellipses tried
 EYE_HEIGHT = (1.38, 1.58)  # m, the range of a walk's mean height
-PITCH = np.deg2rad(17.0)  # how far down the camera looks on average
+PITCH = np.deg2rad(14.0)  # how far down the camera looks on average
 PHASES = 48  # places of the ellipse from which the view is judged
 
 
@@ -49,8 +49,8 @@ class CameraPath:
         position[:, 1] = self.center[1] + self.radii[1] * np.sin(phase)
         position[:, 2] = self.height + 0.055 * np.sin(2 * phase + a) + 0.018 * np.sin(7 * phase + b)
         across = self.center - position[:, :2]
-        yaw = np.arctan2(across[:, 1], across[:, 0]) + np.deg2rad(4.0) * np.sin(2 * phase + c)
-        yaw += np.deg2rad(0.6) * np.sin(9 * phase + a)
+        yaw = np.arctan2(across[:, 1], across[:, 0]) + np.deg2rad(2.5) * np.sin(2 * phase + c)
+        yaw += np.deg2rad(0.4) * np.sin(9 * phase + a)
         pitch = -PITCH + np.deg2rad(4.5) * np.sin(3 * phase + d) + np.deg2rad(0.5) * np.sin(8 * phase + c)
         roll = np.deg2rad(1.6) * np.sin(4 * phase + b)
         return position, yaw, pitch, roll
@@ -64,15 +64,13 @@ class LabelView(Protocol):
 
 def plan_path(
     layout: Layout,
-    width: float,
-    depth: float,
     frames: int,
     labels: LabelView,
     wanted: set[int],
     rng: np.random.Generator,
 ) -> CameraPath:
     """The walk whose `frames` frames see most of the `wanted` instances. Raises DataError without room to walk."""
-    center, radii = _widest_ellipse(layout.free, width, depth)
+    center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
     path = CameraPath(center, radii, float(rng.uniform(*EYE_HEIGHT)), 0.0, turn, rng.uniform(0, 2 * np.pi, 4))
     speed = _allowed_phase_speed(path)
@@ -80,9 +78,10 @@ def plan_path(
     return CameraPath(center, radii, path.height, start, turn, path.sway, speed)
 
 
-def _widest_ellipse(free: Float64, width: float, depth: float) -> tuple[Float64, Float64]:
+def _widest_ellipse(layout: Layout) -> tuple[Float64, Float64]:
     """Centre and radii of the longest ellipse (of the RADII) that keeps its DISTANCE."""
     angle = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+    free, width, depth = layout.free, layout.width, layout.depth
     rows, columns = free.shape
     y, x = np.meshgrid(np.arange(1, rows - 1, 2), np.arange(1, columns - 1, 2), indexing="ij")
     best: tuple[float, float, Float64, Float64] | None = None

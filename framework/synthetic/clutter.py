@@ -6,8 +6,8 @@ import numpy as np
 
 from framework.data import Float64
 from framework.synthetic import palette
-from framework.synthetic.furniture import Furniture, Rng, corners
-from framework.synthetic.solids import Section, cushion, cylinder, leg, loft, panel, rounded_box, tube
+from framework.synthetic.piece import Furniture, Rng, corners
+from framework.synthetic.solids import Section, Solid, cushion, cylinder, leg, loft, panel, rounded_box, tube
 from framework.synthetic.textures import Material, Texture
 
 LAMP_GLOW = 2.2  # emission of a lit lampshade, relative to a white wall in the room's mean light
@@ -100,7 +100,7 @@ def floor_lamp(rng: Rng) -> Furniture:
     height = rng.uniform(1.5, 1.7)
     piece.add(cylinder(0.15, 0.02, 0.14, 28), stem)
     piece.add(cylinder(0.012, height - 0.15).moved(z=0.02), stem)
-    piece.add(_shade(rng, 0.20, 0.14, 0.26).moved(z=height - 0.22), _glowing(rng))
+    piece.add(_shade(0.20, 0.14, 0.26).moved(z=height - 0.22), _glowing(rng))
     return piece
 
 
@@ -114,11 +114,11 @@ def table_lamp(rng: Rng) -> Furniture:
     ]
     piece.add(loft(foot, 20, 0.03), palette.paint(rng, palette.vivid(rng)))
     piece.add(cylinder(0.008, 0.10).moved(z=0.15), palette.metal(rng))
-    piece.add(_shade(rng, 0.12, 0.08, 0.16).moved(z=0.22), _glowing(rng))
+    piece.add(_shade(0.12, 0.08, 0.16).moved(z=0.22), _glowing(rng))
     return piece
 
 
-def _shade(rng: Rng, low: float, high: float, height: float):  # type: ignore[no-untyped-def]
+def _shade(low: float, high: float, height: float) -> Solid:
     return loft([Section(0.0, low, low), Section(height, high, high)], 26)
 
 
@@ -286,9 +286,9 @@ def partition(rng: Rng) -> Furniture:
     """A tiled half-height wall that screens a toilet."""
     piece = Furniture("partition", None)
     tile = Material(Texture.TILES, (0.72, 0.82, 0.84), (0.55, 0.56, 0.56), 0.15, seed=int(rng.integers(4096)))
-    block = rounded_box(0.09, 0.85, 1.05, 0.004).flat(1, 2)
-    piece.add(block.moved(z=0.525), tile)
-    piece.add(rounded_box(0.12, 0.88, 0.03, 0.006).moved(z=1.065), palette.wood(rng))
+    block = rounded_box(0.09, 0.62, 0.95, 0.004).flat(1, 2)
+    piece.add(block.moved(z=0.475), tile)
+    piece.add(rounded_box(0.12, 0.65, 0.03, 0.006).moved(z=0.965), palette.wood(rng))
     return piece
 
 

@@ -15,7 +15,7 @@ from framework.data import Float32, Float64, Int32
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
-GATHER_DIRECTIONS = 64  # rays a vertex for light from other surfaces
+GATHER_DIRECTIONS = 48  # rays a vertex for light from other surfaces
 BOUNCES = 3
 LIFT = 4e-3  # m, rays start this far above the surface
 CHUNK = 8192  # vertices at a time, bounds the memory for rays

@@ -67,7 +67,7 @@ def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale:
 
 
 def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
-    return Material(Texture.METAL, color, shade(color, 0.82), seed=_seed(rng))
+    return Material(Texture.METAL, color, shade(color, 0.91), seed=_seed(rng))
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:

@@ -8,11 +8,12 @@ from enum import StrEnum
 import numpy as np
 
 from framework.data import Float64
-from framework.synthetic import clutter, furniture, layout, palette
-from framework.synthetic.furniture import Furniture, Rng
-from framework.synthetic.layout import Group, Layout, single
+from framework.synthetic import clutter, fixtures, groups, palette, seating
+from framework.synthetic.groups import Group, single
+from framework.synthetic.layout import Layout, arrange, place_on_wall
 from framework.synthetic.lights import Lamp, globe, rectangle
-from framework.synthetic.solids import Solid, panel
+from framework.synthetic.piece import Furniture, Rng
+from framework.synthetic.solids import panel, rounded_box
 from framework.synthetic.surfaces import Surfaces, assemble
 from framework.synthetic.textures import Material, Texture
 
@@ -30,37 +31,39 @@ class RoomKind(StrEnum):
     OFFICE = "office"
 
 
+SMALLEST = {  # m, width and depth of the smallest room tried
+    RoomKind.STUDIO: (5.6, 4.8),
+    RoomKind.LIVING_ROOM: (4.6, 4.2),
+    RoomKind.BEDROOM: (4.2, 3.8),
+    RoomKind.KITCHEN: (4.0, 3.6),
+    RoomKind.OFFICE: (4.4, 3.8),
+}
+
+
 @dataclass(frozen=True)
 class Room:
     """One room, complete."""
 
     kind: RoomKind
-    width: float  # m along x
-    depth: float  # m along y
+    layout: Layout
     objects: tuple[tuple[int, Furniture], ...]  # (instance id, piece); 0 = shell
     lamps: tuple[Lamp, ...]
-    layout: Layout
-    surfaces: Surfaces  # the exact triangles of all that
+    surfaces: Surfaces  # the exact triangles of all objects
 
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
     """A room of this kind, drawn at random."""
-    groups = _groups(kind, rng)
-    lengths = {RoomKind.STUDIO: (6.4, 5.6), RoomKind.LIVING_ROOM: (5.4, 4.8), RoomKind.BEDROOM: (4.9, 4.3)}
-    width, depth = (side + rng.uniform(-0.15, 0.25) for side in lengths.get(kind, (4.9, 4.5)))
-    plan = layout.arrange(groups, width, depth, rng)
-    pieces = [piece for group in plan.groups for piece in group.pieces]
-    bulb = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
-    pieces.append(bulb)
-    objects = [(0, piece) for piece in _shell(width, depth, rng)]
-    objects += list(enumerate(pieces, start=1))
-    return Room(kind, width, depth, tuple(objects), tuple(_lamps(pieces)), plan, assemble(objects))
+    layout = arrange(_groups(kind, rng), *SMALLEST[kind], rng)
+    globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
+    pieces = [*layout.pieces, globe_lamp]
+    objects = ((0, _shell(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))
+    return Room(kind, layout, objects, tuple(_lamps(pieces)), assemble(objects))
 
 
 def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
     """What the room holds, largest first: the first ones find a place most easily."""
     door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
-    bag = single("backpack", furniture.backpack(rng))
+    bag = single("backpack", fixtures.backpack(rng))
     extras = [
         single("plant", clutter.plant(rng)),
         single("lamp", clutter.floor_lamp(rng)),
@@ -71,59 +74,39 @@ def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
     cupboard = single("cupboard", clutter.cupboard(rng))
     main: list[Group]
     if kind is RoomKind.STUDIO:
-        main = [layout.bed_group(rng), layout.couch_group(rng), layout.tv_group(rng), layout.dining_group(rng)]
-        main += [layout.kitchen_group(rng), layout.toilet_group(rng), door, window, bag, *extras]
+        main = [groups.bed_group(rng), groups.couch_group(rng), groups.tv_group(rng), groups.dining_group(rng)]
+        main += [groups.kitchen_group(rng), groups.toilet_group(rng), door, window, bag, *extras]
     elif kind is RoomKind.LIVING_ROOM:
-        main = [layout.couch_group(rng), layout.tv_group(rng), layout.dining_group(rng), door, window, cupboard, bag]
+        main = [groups.couch_group(rng), groups.tv_group(rng), groups.dining_group(rng), door, window, cupboard, bag]
         main += [single("pouf", clutter.pouf(rng)), *extras]
     elif kind is RoomKind.BEDROOM:
-        main = [layout.bed_group(rng), layout.desk_group(rng), door, window, cupboard, bag, *extras]
+        main = [groups.bed_group(rng), groups.desk_group(rng), door, window, cupboard, bag, *extras]
     elif kind is RoomKind.KITCHEN:
-        main = [layout.dining_group(rng), layout.kitchen_group(rng), door, window, bag, cupboard, *extras]
+        main = [groups.dining_group(rng), groups.kitchen_group(rng), door, window, bag, cupboard, *extras]
     else:
-        second = replace(layout.desk_group(rng), name="desk 2")
-        main = [layout.desk_group(rng), second, single("couch", furniture.couch(rng)), door, window, cupboard, bag]
+        second = replace(groups.desk_group(rng), name="desk 2")
+        main = [groups.desk_group(rng), second, single("couch", seating.couch(rng)), door, window, cupboard, bag]
         main += extras
     return main
 
 
-def _shell(width: float, depth: float, rng: Rng) -> list[Furniture]:
-    """Floor, ceiling and four walls with skirting boards."""
+def _shell(width: float, depth: float, rng: Rng) -> Furniture:
+    """Floor, ceiling and four walls with skirting boards, one of them papered."""
     shell = Furniture("shell", None)
-    floor_panel = panel(width, depth).turned("x", -np.pi / 2).turned("z", np.pi)
-    floor_material = _floor(rng)
-    shell.add(_upwards(width, depth), floor_material)
-    ceiling = palette.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12)
-    shell.add(
-        floor_panel.moved(y=-depth / 2).turned("x", np.pi).moved(z=HEIGHT) if False else _downwards(width, depth),
-        ceiling,
-    )
+    shell.add(panel(width, depth).turned("x", np.pi / 2).moved(y=depth / 2), _floor(rng))
+    ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
+    shell.add(ceiling, palette.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12))
     color = palette.pick(rng, palette.WALLS)
-    papered, plain = int(rng.integers(4)), palette.paint(rng, color, 0.88, 0.10)
-    paper = Material(
-        Texture.WALLPAPER, color, palette.shade(color, 0.78), rng.uniform(0.13, 0.2), seed=int(rng.integers(4096))
-    )
-    skirting = palette.wood(rng)
-    from framework.synthetic.solids import rounded_box
-
+    plain, pattern = palette.paint(rng, color, 0.88), int(rng.integers(4096))
+    paper = Material(Texture.WALLPAPER, color, palette.shade(color, 0.78), rng.uniform(0.13, 0.2), seed=pattern)
+    papered, skirting = int(rng.integers(4)), palette.wood(rng)
     for wall in range(4):
         length = width if wall % 2 == 0 else depth
-        x, y, angle = layout._on_wall(wall, 0.0, width, depth)
-        face = panel(length, HEIGHT)
-        shell.add(face.turned("z", angle).moved(x, y), paper if wall == papered else plain)
+        x, y, angle = place_on_wall(wall, 0.0, width, depth)
+        shell.add(panel(length, HEIGHT).turned("z", angle).moved(x, y), paper if wall == papered else plain)
         board = rounded_box(length, 0.012, 0.08, 0.004).moved(y=0.006, z=0.04)
         shell.add(board.turned("z", angle).moved(x, y), skirting)
-    return [shell]
-
-
-def _upwards(width: float, depth: float) -> Solid:
-    """The floor: faces +z, texture (x, y) in metres."""
-    return panel(width, depth).turned("x", np.pi / 2).moved(y=depth / 2)
-
-
-def _downwards(width: float, depth: float) -> Solid:
-    """The ceiling: faces -z."""
-    return panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
+    return shell
 
 
 def _floor(rng: Rng) -> Material:

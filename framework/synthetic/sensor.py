@@ -24,8 +24,8 @@ FOCAL_KINECT = 580.0  # px, of the depth camera at 640 px width; quantisation do
 MIN_RANGE = 0.4  # m
 LATERAL_SIGMA = 0.8  # px at 640 px width: the constant term of Nguyen et al.
 EDGE_JUMP = 0.05  # relative step of depth that the sensor's correlation window cannot follow
-EDGE_DROP = 0.6  # probability of no reading beside such a step
-GRAZING_START, GRAZING_END = np.deg2rad(70.0), np.deg2rad(84.0)  # from all readings to none
+EDGE_DROP = 0.5  # probability of no reading beside such a step
+GRAZING_START, GRAZING_END = np.deg2rad(76.0), np.deg2rad(87.0)  # from all readings to none
 COLOR_SIGMA = 1.5  # grey levels of 255
 
 

@@ -28,12 +28,12 @@ class Solid:
     texture: Float64  # (V, 3) m, where to look the texture up
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
-        return replace(self, vertices=self.vertices + (x, y, z))
+        return replace(self, vertices=self.vertices + np.array([x, y, z]))
 
     def turned(self, axis: str, angle: float) -> Solid:
         """Rotated by `angle` rad about the coordinate axis x, y or z through the origin."""
         R = axis_rotation(axis, angle)
-        return replace(self, vertices=self.vertices @ R.T, normals=self.normals @ R.T)
+        return replace(self, vertices=_turn(R, self.vertices), normals=_turn(R, self.normals))
 
     def deformed(self, shape: Callable[[Float64], Float64]) -> Solid:
         """With `shape` applied to the (V, 3) vertices, and normals to match."""
@@ -41,9 +41,12 @@ class Solid:
         return replace(self, vertices=vertices, normals=smooth_normals(vertices, self.triangles))
 
     def flat(self, along: int, up: int) -> Solid:
-        """With texture coordinates (s, t, 0) in metres from the corner, for textures that are pictures."""
-        s = self.texture[:, along] - self.texture[:, along].min()
-        t = self.texture[:, up] - self.texture[:, up].min()
+        """With texture coordinates (s, t, 0) in metres from the corner, for textures that are pictures.
+
+        s runs along one coordinate axis of the vertices, t along another.
+        """
+        s = self.vertices[:, along] - self.vertices[:, along].min()
+        t = self.vertices[:, up] - self.vertices[:, up].min()
         return replace(self, texture=np.stack([s, t, np.zeros_like(s)], axis=1))
 
 
@@ -55,6 +58,11 @@ def axis_rotation(axis: str, angle: float) -> Float64:
     R = np.eye(3)
     R[j, j], R[j, k], R[k, j], R[k, k] = c, -s, s, c
     return R
+
+
+def _turn(R: Float64, vectors: Float64) -> Float64:
+    """R applied to vectors (V, 3), without BLAS: its rounding may depend on the number of threads."""
+    return np.asarray(np.einsum("ck,vk->vc", R, vectors))
 
 
 def smooth_normals(vertices: Float64, triangles: Int32) -> Float64:
@@ -89,7 +97,7 @@ def rounded_box(
         for sign in (-1.0, 1.0):
             face = np.empty((*s.shape, 3))
             face[..., axis], face[..., j], face[..., k] = sign * half[axis], s, t
-            triangles.append(_grid_triangles(*s.shape, flip=sign < 0) + count)
+            triangles.append(_grid_triangles(s.shape[0], s.shape[1], flip=sign < 0) + count)
             pieces.append(face.reshape(-1, 3))
             count += s.size
     cube = np.concatenate(pieces)
@@ -158,9 +166,9 @@ def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACI
         center = ring[:-1].mean(axis=0)
         inner = center + 0.5 * (ring - center)
         cap = np.concatenate([center[None], inner, ring])
-        i = np.arange(segments)
-        fan = np.stack([np.zeros_like(i), 1 + i, 2 + i], axis=1)
-        first, second = 1 + i, 2 + segments + i
+        k = np.arange(segments)
+        fan = np.stack([np.zeros_like(k), 1 + k, 2 + k], axis=1)
+        first, second = 1 + k, 2 + segments + k
         band = np.concatenate(
             [np.stack([first, second, second + 1], axis=1), np.stack([first, second + 1, first + 1], axis=1)]
         )

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from framework.data import Float32, Int32
-from framework.synthetic.furniture import Furniture
+from framework.data import Float32, Float64, Int32
+from framework.synthetic.piece import Furniture
 from framework.synthetic.textures import Material, material_table
 
 
@@ -29,7 +30,13 @@ class Surfaces:
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
     """All parts of the (instance id, object) pairs, which stand where they belong."""
-    vertices, normals, texture, triangles, ids, materials, parts = [], [], [], [], [], [], []
+    vertices: list[Float64] = []
+    normals: list[Float64] = []
+    texture: list[Float64] = []
+    triangles: list[Int32] = []
+    ids: list[npt.NDArray[np.int64]] = []
+    materials: list[npt.NDArray[np.int64]] = []
+    parts: list[npt.NDArray[np.int64]] = []
     rows: dict[Material, int] = {}
     class_names: dict[int, str | None] = {}
     count = 0

@@ -34,6 +34,11 @@ class Texture(IntEnum):
     PAGES = 15
 
 
+# Odd 64-bit constants that scatter lattice coordinates and seeds over all bits.
+STEP_X, STEP_Y = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
+STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
+
+
 @dataclass(frozen=True)
 class Material:
     """How a surface looks. Colours are sRGB in [0, 1]."""
@@ -63,32 +68,35 @@ def material_table(materials: list[Material]) -> Float32:
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _lattice(i: int, j: int, k: int, seed: int) -> float:
-    """A number in [0, 1) for each lattice point."""
-    h = (
-        np.uint64(i) * np.uint64(0x9E3779B97F4A7C15)
-        ^ np.uint64(j) * np.uint64(0xC2B2AE3D27D4EB4F)
-        ^ np.uint64(k) * np.uint64(0x165667B19E3779F9)
-        ^ np.uint64(seed) * np.uint64(0x27D4EB2F165667C5)
-    )
+def _mixed(h: np.uint64) -> float:
+    """A number in [0, 1) that depends on every bit of `h`."""
     h ^= h >> np.uint64(32)
     h *= np.uint64(0xD6E8FEB86659FD93)
     h ^= h >> np.uint64(29)
-    return np.float64(h >> np.uint64(40)) * (1.0 / 16777216.0)
+    return float(h >> np.uint64(40)) * (1.0 / 16777216.0)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _lattice(i: int, j: int, k: int, seed: int) -> float:
+    """A number in [0, 1) for each lattice point."""
+    h = np.uint64(i) * STEP_X ^ np.uint64(j) * STEP_Y ^ np.uint64(k) * STEP_Z ^ np.uint64(seed) * STEP_SEED
+    return float(_mixed(h))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _noise(x: float, y: float, z: float, seed: int) -> float:
-    """Smooth value noise in [0, 1] with lattice spacing 1 (Perlin's fade curve of 1985)."""
-    i, j, k = np.floor(x), np.floor(y), np.floor(z)
+    """Smooth value noise in [0, 1] with lattice spacing 1, with Perlin's fade curve of 1985."""
+    i, j, k = float(np.floor(x)), float(np.floor(y)), float(np.floor(z))
     fx, fy, fz = x - i, y - j, z - k
     fx, fy, fz = fx * fx * (3 - 2 * fx), fy * fy * (3 - 2 * fy), fz * fz * (3 - 2 * fz)
-    a, b, c = np.int64(i), np.int64(j), np.int64(k)
-    x00 = _lattice(a, b, c, seed) * (1 - fx) + _lattice(a + 1, b, c, seed) * fx
-    x10 = _lattice(a, b + 1, c, seed) * (1 - fx) + _lattice(a + 1, b + 1, c, seed) * fx
-    x01 = _lattice(a, b, c + 1, seed) * (1 - fx) + _lattice(a + 1, b, c + 1, seed) * fx
-    x11 = _lattice(a, b + 1, c + 1, seed) * (1 - fx) + _lattice(a + 1, b + 1, c + 1, seed) * fx
-    return (x00 * (1 - fy) + x10 * fy) * (1 - fz) + (x01 * (1 - fy) + x11 * fy) * fz
+    x0, y0, z0 = np.uint64(np.int64(i)) * STEP_X, np.uint64(np.int64(j)) * STEP_Y, np.uint64(np.int64(k)) * STEP_Z
+    x1, y1, z1 = x0 + STEP_X, y0 + STEP_Y, z0 + STEP_Z
+    s = np.uint64(seed) * STEP_SEED
+    x00 = _mixed(x0 ^ y0 ^ z0 ^ s) * (1 - fx) + _mixed(x1 ^ y0 ^ z0 ^ s) * fx
+    x10 = _mixed(x0 ^ y1 ^ z0 ^ s) * (1 - fx) + _mixed(x1 ^ y1 ^ z0 ^ s) * fx
+    x01 = _mixed(x0 ^ y0 ^ z1 ^ s) * (1 - fx) + _mixed(x1 ^ y0 ^ z1 ^ s) * fx
+    x11 = _mixed(x0 ^ y1 ^ z1 ^ s) * (1 - fx) + _mixed(x1 ^ y1 ^ z1 ^ s) * fx
+    return float((x00 * (1 - fy) + x10 * fy) * (1 - fz) + (x01 * (1 - fy) + x11 * fy) * fz)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -122,24 +130,30 @@ def _step(low: float, high: float, x: float) -> float:
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _line(x: float, width: float, footprint: float) -> float:
     """1 on the lines at whole x, 0 between; x in periods, width and footprint in periods too."""
-    d = abs(x - np.floor(x + 0.5))
+    d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
     return (1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _within(x: float, low: float, high: float, soft: float) -> float:
+    """1 where x lies between the two, with borders `soft` wide."""
+    soft = max(soft, 1e-4)
+    return _step(low - 0.5 * soft, low + 0.5 * soft, x) * (1.0 - _step(high - 0.5 * soft, high + 0.5 * soft, x))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
     """Grain along x: growth rings bent by noise, and fibres."""
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
-    rings = 0.5 + 0.5 * np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend))
-    fibre = _noise(5 * x, 260 * y, 260 * z, seed + 7) - 0.5
-    broad = _noise(2.5 * x, 45 * y, 45 * z, seed + 9) - 0.5
-    return (
-        0.45 * rings * _visible(scale, footprint)
-        + 0.3
-        + 0.8 * broad * _visible(0.02, footprint)
-        + 0.5 * fibre * (_visible(0.004, footprint))
-    )
+    rings = 0.5 + 0.5 * float(np.sin(2 * np.pi * (0.7 * (y + 0.6 * z) / scale + bend)))
+    mix = 0.3 + 0.45 * rings * _visible(scale, footprint)
+    broad, fine = _visible(0.02, footprint), _visible(0.004, footprint)
+    if broad > 0:
+        mix += 0.8 * broad * (_noise(2.5 * x, 45 * y, 45 * z, seed + 9) - 0.5)
+    if fine > 0:
+        mix += 0.5 * fine * (_noise(5 * x, 260 * y, 260 * z, seed + 7) - 0.5)
+    return mix
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -212,12 +226,11 @@ def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) 
         gain = 1.0 + 0.06 * _fractal(x, y, z, 0.3, 3, footprint, seed + 2)
     elif kind == 10:  # book cover: a frame, a title, an emblem
         u, v = x / width, y / height
-        frame = 1.0 if (u > 0.07 and u < 0.93 and v > 0.05 and v < 0.95) else 0.0
-        inner = 1.0 if (u > 0.10 and u < 0.90 and v > 0.07 and v < 0.93) else 0.0
-        lines = 0.0
-        if v > 0.62 and v < 0.86 and u > 0.18 and u < 0.82:
-            lines = 1.0 if (v * 12.5 - np.floor(v * 12.5)) < 0.5 else 0.0
-        emblem = 1.0 if (u - 0.5) ** 2 + (1.4 * (v - 0.34)) ** 2 < 0.03 else 0.0
+        soft = footprint / width
+        frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
+        inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
+        lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
+        emblem = _within(np.sqrt((u - 0.5) ** 2 + (1.4 * (v - 0.34)) ** 2), -1.0, 0.17, soft)
         mix = min(1.0, frame - inner + lines + emblem)
         gain = 1.0 + 0.15 * _fractal(x, y, z, 0.02, 2, footprint, seed)
     elif kind == 11:  # sky behind a window, trees below
@@ -245,9 +258,7 @@ def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) 
     elif kind == 13:  # leaves
         mix = 0.5 + 0.8 * _fractal(x, y, z, 0.05, 4, footprint, seed)
     elif kind == 14:  # checked cloth
-        s, t = 0.5 + 0.5 * np.sign(np.sin(2 * np.pi * x / scale)), 0.5 + 0.5 * np.sign(np.sin(2 * np.pi * y / scale))
-        shown = _visible(0.5 * scale, footprint)
-        mix = 0.5 * (s + t) * shown + 0.5 * (1 - shown)
+        mix = 0.5 * (_line(x / scale, 0.5, footprint / scale) + _line(y / scale, 0.5, footprint / scale))
         gain = 1.0 + 0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed)
     else:  # pages of a closed book
         mix = 0.5 + 0.5 * _visible(0.004, footprint) * np.sin(2 * np.pi * z / 0.003)
