@@ -55,6 +55,7 @@ class Synthetic(RGBDSequence):
             raise ConfigError(f"dataset.max_depth must be positive metres, found {self.max_depth}")
         if not self.truth_voxel > 0:
             raise ConfigError(f"dataset.truth_voxel must be positive metres, found {self.truth_voxel}")
+        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride)
         self.name = self.scene
         focal = FOCAL_LENGTH * self.width
         self.camera = Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
@@ -64,7 +65,6 @@ class Synthetic(RGBDSequence):
         self.class_names = dict(self.room.surfaces.class_names)
         self._renderer = Renderer(self.room.surfaces, list(self.room.lamps))
         self._sensor = DepthSensor(self.noise, self.max_depth)
-        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride)
         wanted = {i for i, name in self.class_names.items() if name is not None}
         small = Camera(80, 60, FOCAL_LENGTH * 80, FOCAL_LENGTH * 80, 39.5, 29.5)
         self.path = plan_path(

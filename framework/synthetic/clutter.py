@@ -42,7 +42,7 @@ def low_board(rng: Rng) -> Furniture:
 
 def nightstand(rng: Rng) -> Furniture:
     piece = Furniture("nightstand", None)
-    _drawers(piece, rng, rng.uniform(0.40, 0.46), rng.uniform(0.36, 0.42), rng.uniform(0.48, 0.56), 1)
+    _drawers(piece, rng, rng.uniform(0.46, 0.52), rng.uniform(0.37, 0.42), rng.uniform(0.48, 0.56), 1)
     return piece
 
 
@@ -114,7 +114,7 @@ def table_lamp(rng: Rng) -> Furniture:
     ]
     piece.add(loft(foot, 20, 0.03), palette.paint(rng, palette.vivid(rng)))
     piece.add(cylinder(0.008, 0.10).moved(z=0.15), palette.metal(rng))
-    piece.add(_shade(0.12, 0.08, 0.16).moved(z=0.22), _glowing(rng))
+    piece.add(_shade(0.095, 0.07, 0.15).moved(z=0.22), _glowing(rng))
     return piece
 
 

@@ -68,10 +68,7 @@ def bed_group(rng: Rng) -> Group:
     side = 1 if rng.uniform() < 0.5 else -1
     stand = clutter.nightstand(rng)
     stand = group.add(stand, side * (half + size(stand)[0] / 2 + 0.06), against_wall(stand))
-    low, high = stand.bounds()
-    x, y = (low + high)[:2] / 2
-    group.add(clutter.table_lamp(rng), x - 0.07, y - 0.02, on_top(stand))
-    group.add(tables.book(rng), x + 0.10, y + 0.04, on_top(stand), np.pi + rng.uniform(-0.3, 0.3))
+    _set(group, stand, rng, [clutter.table_lamp(rng), tables.book(rng)][::side])
     return group
 
 

@@ -70,7 +70,7 @@ def chair(rng: Rng) -> Furniture:
     for x in (-1, 1):
         piece.add(leg(0.042, seat - 0.02).moved(x * (width / 2 - 0.03), depth / 2 - 0.03), frame)
         back_leg = [
-            (0.0, -0.04, 0.0),
+            (0.0, -0.04, 0.006),
             (0.0, 0.01, 0.5 * seat),
             (0.0, 0.0, seat),
             (0.0, -0.05, 0.6 * height + 0.2),

@@ -132,14 +132,15 @@ def _line(x: float, width: float, footprint: float) -> float:
     """1 on the lines at whole x, 0 between; x in periods, width and footprint in periods too."""
     d = abs(x - float(np.floor(x + 0.5)))
     blur = max(footprint, 0.25 * width)
-    return (1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur)
+    return float((1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur))
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _within(x: float, low: float, high: float, soft: float) -> float:
     """1 where x lies between the two, with borders `soft` wide."""
     soft = max(soft, 1e-4)
-    return _step(low - 0.5 * soft, low + 0.5 * soft, x) * (1.0 - _step(high - 0.5 * soft, high + 0.5 * soft, x))
+    inside = _step(low - 0.5 * soft, low + 0.5 * soft, x) * (1.0 - _step(high - 0.5 * soft, high + 0.5 * soft, x))
+    return float(inside)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -153,7 +154,7 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
         mix += 0.8 * broad * (_noise(2.5 * x, 45 * y, 45 * z, seed + 9) - 0.5)
     if fine > 0:
         mix += 0.5 * fine * (_noise(5 * x, 260 * y, 260 * z, seed + 7) - 0.5)
-    return mix
+    return float(mix)
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
@@ -212,7 +213,8 @@ def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) 
         gain = 1.0 + 0.35 * _fractal(x, y, z, 0.012, 2, footprint, seed)
         gain += 0.15 * _fractal(x, y, z, 0.25, 2, footprint, seed + 3)
     elif kind == 7:  # painting: hills under a sky
-        return _landscape(row, x / width, y / height, seed)
+        red, green, blue = _landscape(row, x / width, y / height, seed)
+        return red, green, blue
     elif kind == 8:  # a television that is on
         r, g, b = _landscape(row, x / width, y / height, seed)
         caption = 1.0 if (y < 0.16 * height and y > 0.07 * height and x > 0.06 * width and x < 0.55 * width) else 0.0
