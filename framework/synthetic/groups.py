@@ -60,14 +60,19 @@ def size(piece: Furniture) -> Float64:
     return high - low
 
 
+def beside(piece: Furniture, other: Furniture, side: int, gap: float) -> float:
+    """The x at which `piece` stands `gap` m to the right (side 1) or left (side -1) of `other`."""
+    (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
+    return float(other_high[0] + gap - low[0] if side > 0 else other_low[0] - gap - high[0])
+
+
 def bed_group(rng: Rng) -> Group:
     group = Group("bed")
     bed = seating.bed(rng)
     bed = group.add(bed, y=against_wall(bed))
-    half = size(bed)[0] / 2
     side = 1 if rng.uniform() < 0.5 else -1
     stand = clutter.nightstand(rng)
-    stand = group.add(stand, side * (half + size(stand)[0] / 2 + 0.06), against_wall(stand))
+    stand = group.add(stand, beside(stand, bed, side, 0.06), against_wall(stand))
     _set(group, stand, rng, [clutter.table_lamp(rng), tables.book(rng)][::side])
     return group
 
@@ -104,7 +109,7 @@ def tv_group(rng: Rng) -> Group:
     group.add(fixtures.tv(rng), 0.0, float(board.bounds()[:2][0][1] + board.bounds()[1][1]) / 2 - 0.03, on_top(board))
     if rng.uniform() < 0.6:
         plant = clutter.plant(rng)
-        group.add(plant, size(board)[0] / 2 + size(plant)[0] / 2 + 0.08, against_wall(plant))
+        group.add(plant, beside(plant, board, 1, 0.05), against_wall(plant))
     return group
 
 
@@ -150,7 +155,7 @@ def kitchen_group(rng: Rng) -> Group:
     fridge, row = fixtures.refrigerator(rng), clutter.counter(rng)
     side = 1 if rng.uniform() < 0.5 else -1
     row = group.add(row, y=against_wall(row))
-    group.add(fridge, side * (size(row)[0] / 2 + size(fridge)[0] / 2 + 0.03), against_wall(fridge))
+    group.add(fridge, beside(fridge, row, side, 0.02), against_wall(fridge))
     return group
 
 

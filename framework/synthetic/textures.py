@@ -34,6 +34,10 @@ class Texture(IntEnum):
     PAGES = 15
 
 
+# numba compares plain integers.
+PAINT, WOOD, FABRIC, STRIPES, PLANKS, TILES, RUG, PAINTING = (int(texture) for texture in list(Texture)[:8])
+SCREEN, METAL, BOOK, SKY, WALLPAPER, LEAF, CHECKS, PAGES = (int(texture) for texture in list(Texture)[8:])
+
 # Odd 64-bit constants that scatter lattice coordinates and seeds over all bits.
 STEP_X, STEP_Y = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
@@ -158,122 +162,6 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
 
 
 @njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) -> tuple[float, float, float]:
-    """The linear colour of material `row` (see material_table) at texture coordinates x, y, z (m).
-
-    `footprint` is the size of a pixel on the surface, m.
-    """
-    kind, scale, width, height, seed = int(row[0]), float(row[7]), float(row[8]), float(row[9]), int(row[10])
-    gain, mix = 1.0, 0.0
-    if kind == 0:  # paint: clouds, and a roughness of a few centimetres
-        mix = 0.5 + 0.5 * _fractal(x, y, z, 4 * scale, 5, footprint, seed)
-        gain = 1.0 + 0.10 * _fractal(x, y, z, 0.03, 2, footprint, seed + 11)
-    elif kind == 1:  # wood
-        mix = _wood(x, y, z, scale, footprint, seed)
-    elif kind == 2:  # fabric: weave and wear
-        mix = 0.5 + 0.6 * _fractal(x, y, z, scale, 3, footprint, seed)
-        gain = 1.0 + 0.35 * _fractal(x, y, z, 0.006, 2, footprint, seed + 5)
-        gain += 0.16 * _fractal(x, y, z, 0.025, 2, footprint, seed + 6)
-    elif kind == 3:  # striped cloth
-        t = y / scale
-        mix = max(_line(t, 0.42, footprint / scale), 0.7 * _line(t + 0.5, 0.10, footprint / scale))
-        gain = 1.0 + 0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed)
-    elif kind == 4:  # wooden floor: boards of width `scale`
-        board = np.floor(y / scale)
-        shift = _lattice(np.int64(board), 3, 5, seed)
-        length = 1.1
-        piece = np.floor(x / length + shift)
-        tone = _lattice(np.int64(board), np.int64(piece), 1, seed)
-        mix = _wood(x + 7 * tone, y + 3 * tone, tone * 5, 0.05, footprint, seed)
-        gain = 0.78 + 0.40 * tone
-        joint = max(
-            _line(y / scale, 0.004 / scale, footprint / scale),
-            _line(x / length + shift, 0.004 / length, footprint / length),
-        )
-        gain *= 1.0 - 0.6 * joint
-    elif kind == 5:  # tiles of side `scale`, grout in the second colour
-        i, j = np.floor(x / scale), np.floor(y / scale)
-        mix = max(
-            _line(x / scale, 0.006 / scale, footprint / scale), _line(y / scale, 0.006 / scale, footprint / scale)
-        )
-        gain = 0.88 + 0.18 * _lattice(np.int64(i), np.int64(j), 2, seed)
-        gain += 0.10 * _fractal(x, y, i + 3 * j, 0.12, 4, footprint, seed)
-    elif kind == 6:  # rug: border bands around diamonds
-        edge = min(min(x, width - x), min(y, height - y))
-        u, v = (x - 0.5 * width) / scale, (y - 0.5 * height) / scale
-        diamond = abs(u - np.floor(u) - 0.5) + abs(v - np.floor(v) - 0.5)
-        soft = footprint / scale + 0.03
-        mix = (
-            _step(0.36 - soft, 0.36 + soft, diamond)
-            - _step(0.20 - soft, 0.20 + soft, diamond)
-            + (1 - _step(0.10 - soft, 0.10 + soft, diamond))
-        )
-        if edge < 0.16:
-            mix = 0.5 + 0.5 * np.sin(2 * np.pi * edge / 0.08)
-        gain = 1.0 + 0.35 * _fractal(x, y, z, 0.012, 2, footprint, seed)
-        gain += 0.15 * _fractal(x, y, z, 0.25, 2, footprint, seed + 3)
-    elif kind == 7:  # painting: hills under a sky
-        red, green, blue = _landscape(row, x / width, y / height, seed)
-        return red, green, blue
-    elif kind == 8:  # a television that is on
-        r, g, b = _landscape(row, x / width, y / height, seed)
-        caption = 1.0 if (y < 0.16 * height and y > 0.07 * height and x > 0.06 * width and x < 0.55 * width) else 0.0
-        return (
-            r * (1 - caption) + 0.02 * caption,
-            g * (1 - caption) + 0.05 * caption,
-            b * (1 - caption) + 0.35 * caption,
-        )
-    elif kind == 9:  # brushed metal or enamel
-        mix = 0.5 + 0.5 * _fractal(0.15 * x, 3 * y, 3 * z, 0.05, 3, footprint, seed)
-        gain = 1.0 + 0.06 * _fractal(x, y, z, 0.3, 3, footprint, seed + 2)
-    elif kind == 10:  # book cover: a frame, a title, an emblem
-        u, v = x / width, y / height
-        soft = footprint / width
-        frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
-        inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
-        lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
-        emblem = _within(np.sqrt((u - 0.5) ** 2 + (1.4 * (v - 0.34)) ** 2), -1.0, 0.17, soft)
-        mix = min(1.0, frame - inner + lines + emblem)
-        gain = 1.0 + 0.15 * _fractal(x, y, z, 0.02, 2, footprint, seed)
-    elif kind == 11:  # sky behind a window, trees below
-        u, v = x / width, y / height
-        line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
-        tree = 1 - _step(line - 0.02, line + 0.02, v)
-        leaf = 0.45 + 0.4 * _noise(40 * u, 40 * v, 0.0, seed)
-        cloud = 0.35 * _step(0.45, 0.8, _noise(3 * u, 5 * v, 0.0, seed + 2))
-        return (
-            (0.62 + cloud) * (1 - tree) + 0.22 * leaf * tree,
-            (0.80 + 0.6 * cloud) * (1 - tree) + 0.36 * leaf * tree,
-            (1.0 + 0.2 * cloud) * (1 - tree) + 0.14 * leaf * tree,
-        )
-    elif kind == 12:  # wallpaper: stripes with leaves on every other one
-        u, v = x / scale, y / (1.6 * scale)
-        stripe = _step(-0.15, 0.15, np.sin(np.pi * u))
-        cell = np.floor(u)
-        du, dv = u - cell - 0.5, v + 0.5 * (cell % 2) - np.floor(v + 0.5 * (cell % 2)) - 0.5
-        petal = np.cos(5 * np.arctan2(dv, du)) * 0.12 + 0.22
-        motif = 1 - _step(petal - 0.05, petal + 0.05, np.sqrt(du * du + dv * dv))
-        shown = _visible(0.5 * scale, footprint)
-        mix = (0.35 * stripe + 0.65 * motif) * shown + 0.3 * (1 - shown)
-        gain = 1.0 + 0.10 * _fractal(x, y, z, 0.5, 4, footprint, seed)
-        gain += 0.06 * _fractal(x, y, z, 0.02, 2, footprint, seed + 4)
-    elif kind == 13:  # leaves
-        mix = 0.5 + 0.8 * _fractal(x, y, z, 0.05, 4, footprint, seed)
-    elif kind == 14:  # checked cloth
-        mix = 0.5 * (_line(x / scale, 0.5, footprint / scale) + _line(y / scale, 0.5, footprint / scale))
-        gain = 1.0 + 0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed)
-    else:  # pages of a closed book
-        mix = 0.5 + 0.5 * _visible(0.004, footprint) * np.sin(2 * np.pi * z / 0.003)
-        gain = 1.0 + 0.10 * _fractal(x, y, 8 * z, 0.03, 3, footprint, seed)
-    mix = min(1.0, max(0.0, mix))
-    return (
-        gain * (row[1] * (1 - mix) + row[4] * mix),
-        gain * (row[2] * (1 - mix) + row[5] * mix),
-        gain * (row[3] * (1 - mix) + row[6] * mix),
-    )
-
-
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
 def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
     """A sunset over three ranges of hills in the material's two colours."""
     sun_u, sun_v = 0.25 + 0.5 * _lattice(1, 2, 3, seed), 0.6 + 0.15 * _lattice(3, 2, 1, seed)
@@ -291,3 +179,153 @@ def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, floa
         g += inside * (shade * row[5] - g)
         b += inside * (shade * row[6] - b)
     return r, g, b
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _cloth(x: float, y: float, z: float, footprint: float, seed: int) -> float:
+    """The brightness of woven threads."""
+    return 1.0 + float(0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tuple[float, float]:
+    """A wooden floor, (mix, gain): boards of this width along x, each cut from another tree."""
+    length, gap = 1.1, 0.004
+    board = np.int64(np.floor(y / width))
+    shift = _lattice(board, 3, 5, seed)
+    tone = _lattice(board, np.int64(np.floor(x / length + shift)), 1, seed)
+    along = _line(x / length + shift, gap / length, footprint / length)
+    joint = max(_line(y / width, gap / width, footprint / width), along)
+    mix = _wood(x + 7 * tone, y + 3 * tone, tone * 5, 0.05, footprint, seed)
+    return mix, (0.78 + 0.40 * tone) * (1.0 - 0.6 * joint)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tuple[float, float]:
+    """Square tiles, (mix, gain); the grout is mix = 1."""
+    i, j = np.int64(np.floor(x / side)), np.int64(np.floor(y / side))
+    grout = 0.006 / side
+    mix = max(_line(x / side, grout, footprint / side), _line(y / side, grout, footprint / side))
+    clouds = _fractal(x, y, float(i + 3 * j), 0.12, 4, footprint, seed)
+    return mix, 0.88 + 0.18 * _lattice(i, j, 2, seed) + 0.10 * clouds
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _rug(x: float, y: float, scale: float, width: float, height: float, footprint: float) -> float:
+    """Diamonds within border bands."""
+    edge = min(min(x, width - x), min(y, height - y))
+    if edge < 0.16:
+        return float(0.5 + 0.5 * np.sin(2 * np.pi * edge / 0.08))
+    u, v = (x - 0.5 * width) / scale, (y - 0.5 * height) / scale
+    diamond = abs(u - np.floor(u) - 0.5) + abs(v - np.floor(v) - 0.5)
+    soft = footprint / scale + 0.06
+    return float(_within(diamond, 0.20, 0.36, soft) + 1.0 - _step(0.10 - 0.5 * soft, 0.10 + 0.5 * soft, diamond))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _book(u: float, v: float, soft: float) -> float:
+    """A cover over [0, 1]^2: a frame, a title of several lines, an emblem."""
+    frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
+    inner = _within(u, 0.10, 0.90, soft) * _within(v, 0.07, 0.93, soft)
+    lines = _within(u, 0.18, 0.82, soft) * _within(v, 0.62, 0.86, soft) * _line(v * 12.5, 0.5, 12.5 * soft)
+    emblem = _within(float(np.sqrt((u - 0.5) ** 2 + (1.4 * (v - 0.34)) ** 2)), -1.0, 0.17, soft)
+    return float(frame - inner + lines + emblem)
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
+    """Stripes with a flower in each, every other row shifted."""
+    u, v = x / scale, y / (1.6 * scale)
+    cell = np.floor(u)
+    v += 0.5 * (cell % 2)
+    du, dv = u - cell - 0.5, v - np.floor(v) - 0.5
+    petal = np.cos(5 * np.arctan2(dv, du)) * 0.12 + 0.22
+    flower = 1 - _step(petal - 0.05, petal + 0.05, np.sqrt(du * du + dv * dv))
+    stripe = _step(-0.15, 0.15, np.sin(np.pi * u))
+    shown = _visible(0.5 * scale, footprint)
+    return float((0.35 * stripe + 0.65 * flower) * shown + 0.3 * (1 - shown))
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
+    """What a window shows: clouds, and trees below."""
+    line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
+    tree = 1 - _step(line - 0.02, line + 0.02, v)
+    leaf = 0.45 + 0.4 * _noise(40 * u, 40 * v, 0.0, seed)
+    cloud = 0.35 * _step(0.45, 0.8, _noise(3 * u, 5 * v, 0.0, seed + 2))
+    return (
+        (0.62 + cloud) * (1 - tree) + 0.22 * leaf * tree,
+        (0.80 + 0.6 * cloud) * (1 - tree) + 0.36 * leaf * tree,
+        (1.0 + 0.2 * cloud) * (1 - tree) + 0.14 * leaf * tree,
+    )
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
+    """What a television shows: a landscape with a caption."""
+    r, g, b = _landscape(row, u, v, seed)
+    caption = 1.0 if (0.07 < v < 0.16 and 0.06 < u < 0.55) else 0.0
+    return r * (1 - caption) + 0.02 * caption, g * (1 - caption) + 0.05 * caption, b * (1 - caption) + 0.35 * caption
+
+
+@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) -> tuple[float, float, float]:
+    """The linear colour of material `row` (see material_table) at texture coordinates x, y, z (m).
+
+    `footprint` is the size of a pixel on the surface, m.
+    """
+    kind, scale, width, height, seed = int(row[0]), float(row[7]), float(row[8]), float(row[9]), int(row[10])
+    if kind == PAINTING:
+        red, green, blue = _landscape(row, x / width, y / height, seed)
+        return red, green, blue
+    if kind == SCREEN:
+        red, green, blue = _screen(row, x / width, y / height, seed)
+        return red, green, blue
+    if kind == SKY:
+        red, green, blue = _sky(x / width, y / height, seed)
+        return red, green, blue
+    mix, gain = 0.0, 1.0
+    if kind == PAINT:
+        mix = 0.5 + 0.5 * _fractal(x, y, z, 4 * scale, 5, footprint, seed)
+        gain = 1.0 + 0.10 * _fractal(x, y, z, 0.03, 2, footprint, seed + 11)
+    elif kind == WOOD:
+        mix = _wood(x, y, z, scale, footprint, seed)
+    elif kind == FABRIC:
+        mix = 0.5 + 0.6 * _fractal(x, y, z, scale, 3, footprint, seed)
+        gain = 1.0 + 0.35 * _fractal(x, y, z, 0.006, 2, footprint, seed + 5)
+        gain += 0.16 * _fractal(x, y, z, 0.025, 2, footprint, seed + 6)
+    elif kind == STRIPES:
+        t = y / scale
+        mix = max(_line(t, 0.42, footprint / scale), 0.7 * _line(t + 0.5, 0.10, footprint / scale))
+        gain = _cloth(x, y, z, footprint, seed)
+    elif kind == CHECKS:
+        mix = 0.5 * (_line(x / scale, 0.5, footprint / scale) + _line(y / scale, 0.5, footprint / scale))
+        gain = _cloth(x, y, z, footprint, seed)
+    elif kind == PLANKS:
+        mix, gain = _planks(x, y, scale, footprint, seed)
+    elif kind == TILES:
+        mix, gain = _tiles(x, y, scale, footprint, seed)
+    elif kind == RUG:
+        mix = _rug(x, y, scale, width, height, footprint)
+        gain = _cloth(x, y, z, footprint, seed) + 0.15 * _fractal(x, y, z, 0.25, 2, footprint, seed + 3)
+    elif kind == METAL:
+        mix = 0.5 + 0.5 * _fractal(0.15 * x, 3 * y, 3 * z, 0.05, 3, footprint, seed)
+        gain = 1.0 + 0.06 * _fractal(x, y, z, 0.3, 3, footprint, seed + 2)
+    elif kind == BOOK:
+        mix = _book(x / width, y / height, footprint / width)
+        gain = 1.0 + 0.15 * _fractal(x, y, z, 0.02, 2, footprint, seed)
+    elif kind == WALLPAPER:
+        mix = _wallpaper(x, y, scale, footprint)
+        gain = 1.0 + 0.10 * _fractal(x, y, z, 0.5, 4, footprint, seed)
+        gain += 0.06 * _fractal(x, y, z, 0.02, 2, footprint, seed + 4)
+    elif kind == LEAF:
+        mix = 0.5 + 0.8 * _fractal(x, y, z, 0.05, 4, footprint, seed)
+    else:  # PAGES
+        mix = 0.5 + 0.5 * _visible(0.004, footprint) * np.sin(2 * np.pi * z / 0.003)
+        gain = 1.0 + 0.10 * _fractal(x, y, 8 * z, 0.03, 3, footprint, seed)
+    mix = min(1.0, max(0.0, mix))
+    return (
+        gain * (row[1] * (1 - mix) + row[4] * mix),
+        gain * (row[2] * (1 - mix) + row[5] * mix),
+        gain * (row[3] * (1 - mix) + row[6] * mix),
+    )
