@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,7 @@ from framework.synthetic.textures import surface_color
 
 EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, a rotated grid
 EDGE_STEP = 0.04  # relative step of depth that counts as an edge
+SHADING_THREADS = 2
 WHITE = 2.2  # linear light that becomes full white: lamps and windows may burn out
 
 
@@ -35,6 +37,8 @@ class Renderer:
         self.surfaces = surfaces
         self.caster = RayCaster(surfaces.vertices, surfaces.triangles)
         self.irradiance = bake(surfaces, self.caster, lamps)
+        # Not numba's own threads: their simplest layer may not be entered from two threads at once.
+        self._threads = ThreadPoolExecutor(SHADING_THREADS, "shading")
 
     def render(self, camera: Camera, T_world_camera: Float64) -> Rendering:
         rays = image_rays(camera, T_world_camera)
@@ -58,21 +62,29 @@ class Renderer:
         return depth, np.where(met, self.surfaces.instance_ids[hits.triangle], 0).astype(np.int32)
 
     def _shade(self, triangle: Int32, uv: Float32, depth: Float32, incidence: Float32, camera: Camera) -> Float32:
+        """The light (N, 3) of N hits. Each hit is shaded by itself, so the split among threads changes nothing."""
         s = self.surfaces
-        return np.asarray(
+        light = np.empty((len(triangle), 3), np.float32)
+        bounds = np.linspace(0, len(triangle), SHADING_THREADS + 1).astype(int)
+
+        def shade(k: int) -> None:
+            part = slice(bounds[k], bounds[k + 1])
             _shade_hits(
-                triangle,
-                uv,
-                depth,
-                incidence,
+                triangle[part],
+                uv[part],
+                depth[part],
+                incidence[part],
                 1.0 / camera.fx,
                 s.triangles,
                 s.materials,
                 s.material_table,
                 s.texture,
                 self.irradiance,
+                light[part],
             )
-        )
+
+        list(self._threads.map(shade, range(SHADING_THREADS)))
+        return light
 
     def _smooth_edges(
         self, light: Float32, triangle: Int32, depth: Float32, camera: Camera, T_world_camera: Float64
@@ -112,12 +124,13 @@ def _shade_hits(
     table: Float32,
     texture: Float32,
     irradiance: Float32,
-) -> Float32:
-    """The linear light (N, 3) that leaves each hit towards the camera."""
-    out = np.zeros((len(triangle), 3), np.float32)
+    out: Float32,
+) -> None:
+    """Writes the linear light (N, 3) that leaves each hit towards the camera to `out`."""
     for n in range(len(triangle)):
         f = triangle[n]
         if f < 0:
+            out[n] = 0.0
             continue
         i, j, k = triangles[f, 0], triangles[f, 1], triangles[f, 2]
         b, c = uv[n, 0], uv[n, 1]
@@ -132,7 +145,6 @@ def _shade_hits(
         for channel in range(3):
             light = a * irradiance[i, channel] + b * irradiance[j, channel] + c * irradiance[k, channel]
             out[n, channel] = color[channel] * (light + row[11])
-    return out
 
 
 def to_srgb(light: Float32) -> UInt8:

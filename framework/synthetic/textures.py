@@ -286,7 +286,7 @@ def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) 
         return red, green, blue
     mix, gain = 0.0, 1.0
     if kind == PAINT:
-        mix = 0.5 + 0.5 * _fractal(x, y, z, 4 * scale, 5, footprint, seed)
+        mix = 0.5 + 0.5 * _fractal(x, y, z, 4 * scale, 4, footprint, seed)
         gain = 1.0 + 0.10 * _fractal(x, y, z, 0.03, 2, footprint, seed + 11)
     elif kind == WOOD:
         mix = _wood(x, y, z, scale, footprint, seed)
