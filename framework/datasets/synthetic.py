@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Camera, Float64, Frame, FrameTruth, Int32, SceneTruth
+from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
 from framework.errors import ConfigError
 from framework.evaluation.scene_truth import LabeledDepth, fuse_scene_truth
@@ -94,7 +94,7 @@ class Synthetic(RGBDSequence):
             truth=FrameTruth(picture.instance_ids, self.class_names),
         )
 
-    def exact_view(self, T_world_camera: Float64) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float32]], Int32]:
+    def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
         """Exact depth (H, W) m and instance ids (H, W) from any pose."""
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 

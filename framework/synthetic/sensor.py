@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Bool, Camera, Float32
+from framework.data import Bool, Camera, Float32, UInt8
 
 BASELINE = 0.075  # m, between projector and camera
 DISPARITY_STEPS = 8.0  # per px
@@ -83,12 +83,12 @@ class DepthSensor:
         return np.where(other & (neighbour > 0), neighbour, depth)
 
 
-def noisy_color(color: np.ndarray[tuple[int, ...], np.dtype[np.uint8]], noise: float, rng: np.random.Generator):  # type: ignore[no-untyped-def]
+def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
     """`color` with the grain of a camera indoors."""
     if noise == 0:
         return color
     grain = np.float32(noise * COLOR_SIGMA) * rng.standard_normal(color.shape, np.float32)
-    return np.clip(np.rint(color + grain), 0, 255).astype(np.uint8)
+    return np.asarray(np.clip(np.rint(color + grain), 0, 255), np.uint8)
 
 
 def _quantised(depth: Float32) -> Float32:
