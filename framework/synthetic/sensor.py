@@ -25,7 +25,7 @@ MIN_RANGE = 0.4  # m
 LATERAL_SIGMA = 0.8  # px at 640 px width: the constant term of Nguyen et al.
 EDGE_JUMP = 0.05  # relative step of depth that the sensor's correlation window cannot follow
 EDGE_DROP = 0.5  # probability of no reading beside such a step
-GRAZING_START, GRAZING_END = np.deg2rad(76.0), np.deg2rad(87.0)  # from all readings to none
+GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # from all readings to none
 COLOR_SIGMA = 1.5  # grey levels of 255
 
 
