@@ -1,0 +1,1 @@
+"""Sequences that feed the pipeline: one file per format."""

@@ -1,0 +1,1 @@
+"""How good a result is: instance average precision, trajectory error, agreement of labels."""

@@ -1,0 +1,139 @@
+"""Where furniture stands: groups against walls, nothing inside anything else, room left to walk.
+
+Groups are tried at random places along the walls. Of several complete layouts the one with most room to walk is kept;
+where none has enough, the room grows.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from framework.data import Float64
+from framework.errors import DataError
+from framework.synthetic.groups import Group, Place
+from framework.synthetic.piece import Furniture, Rng
+from framework.synthetic.solids import axis_rotation
+
+CLEARANCE = 0.06  # m, between groups
+MARGIN = 0.05  # m, between a group and the corner of the room
+LAYOUTS = 16  # complete layouts to choose from
+TRIES = 50  # places tried for each group
+GROWTH = (1.0, 1.06, 1.12, 1.2, 1.3, 1.4, 1.5)  # sides of the rooms tried, relative
+WALK_RADIUS = 1.3  # m, of the free circle that a walk needs
+HEAD_ROOM = 1.9  # m, what hangs higher does not bar the way
+CELL = 0.05  # m, of the grid on which free floor is measured
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where all groups of a room stand."""
+
+    width: float  # m, along x
+    depth: float  # m, along y
+    pieces: list[Furniture]  # in the room's coordinates: x and y along the walls, z up, origin amid the floor
+    free: Float64  # (rows along y, columns along x) m from each CELL of the floor to furniture or walls
+
+
+def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout:
+    """The groups in the smallest room, from `width` x `depth` m upwards, in which they leave room to walk.
+
+    Raises DataError when even a room half as long again is too small.
+    """
+    for factor in GROWTH:
+        plans = [_try_layout(groups, factor * width, factor * depth, rng) for _ in range(LAYOUTS)]
+        complete = [plan for plan in plans if plan is not None]
+        if not complete:
+            continue
+        free = [free_floor(np.concatenate(plan.solid), factor * width, factor * depth) for plan in complete]
+        best = int(np.argmax([distance.max() for distance in free]))
+        if free[best].max() >= WALK_RADIUS:
+            placed = [g.placed(*at) for g, at in zip(groups, complete[best].places, strict=True)]
+            pieces = [piece for group in placed for piece in group.pieces]
+            return Layout(factor * width, factor * depth, pieces, free[best])
+    raise DataError(f"synthetic room: {len(groups)} groups of furniture do not fit; choose another seed or scene")
+
+
+@dataclass
+class _Plan:
+    places: list[Place] = field(default_factory=list)
+    solid: list[Float64] = field(default_factory=list)  # (N, 2, 3) boxes that others must not enter, for each group
+
+
+def _try_layout(groups: list[Group], width: float, depth: float, rng: Rng) -> _Plan | None:
+    """One random layout, None when a group finds no place. Works on boxes alone: they turn by quarters exactly."""
+    plan = _Plan()
+    taken = np.zeros((0, 2, 3))
+    walls: dict[str, tuple[int, float]] = {}
+    for group in groups:
+        boxes, solid = group.boxes, group.solid
+        low, high = boxes[:, 0, 0].min(), boxes[:, 1, 0].max()
+        for _ in range(TRIES):
+            wall = int(rng.integers(4))
+            along = rng.uniform()
+            if group.opposite in walls:
+                other, where = walls[group.opposite]
+                wall = (other + 2) % 4
+            length = width if wall % 2 == 0 else depth
+            least, most = -length / 2 + MARGIN - low, length / 2 - MARGIN - high
+            if most < least:
+                continue
+            along = least + along * (most - least)
+            if group.opposite in walls:
+                along = float(np.clip(-where + rng.normal(0, 0.3), least, most))
+            place = place_on_wall(wall, along, width, depth)
+            turned = _turned_boxes(boxes, wall, place)
+            if not _inside(turned, width, depth) or _overlap(turned[solid], taken):
+                continue
+            plan.places.append(place)
+            plan.solid.append(turned[solid])
+            taken = np.concatenate([taken, turned[solid]])
+            walls[group.name] = (wall, along)
+            break
+        else:
+            return None
+    return plan
+
+
+def place_on_wall(wall: int, along: float, width: float, depth: float) -> Place:
+    """The place (x, y, angle) of a group `along` a wall: 0 at -y, 1 at +x, 2 at +y, 3 at -x."""
+    if wall == 0:
+        return along, -depth / 2, 0.0
+    if wall == 1:
+        return width / 2, along, np.pi / 2
+    if wall == 2:
+        return -along, depth / 2, np.pi
+    return -width / 2, -along, -np.pi / 2
+
+
+def _turned_boxes(boxes: Float64, quarters: int, place: Place) -> Float64:
+    """Boxes (N, 2, 3) turned by quarters of a circle, then moved."""
+    R = np.rint(axis_rotation("z", quarters * np.pi / 2))
+    corners = boxes @ R.T + np.array([place[0], place[1], 0.0])
+    return np.stack([corners.min(axis=1), corners.max(axis=1)], axis=1)
+
+
+def _overlap(new: Float64, taken: Float64) -> bool:
+    a, b = new[:, None], taken[None]
+    apart = (a[..., 0, :] > b[..., 1, :] + CLEARANCE) | (b[..., 0, :] > a[..., 1, :] + CLEARANCE)
+    return not bool(apart.any(axis=-1).all())
+
+
+def _inside(boxes: Float64, width: float, depth: float) -> bool:
+    half = np.array([width, depth]) / 2
+    return bool((boxes[:, 0, :2] > -half - 1e-6).all() and (boxes[:, 1, :2] < half + 1e-6).all())
+
+
+def free_floor(boxes: Float64, width: float, depth: float) -> Float64:
+    """For each CELL of the floor (rows along y, columns along x), at most the distance in m to boxes and walls."""
+    rows, columns = int(depth / CELL), int(width / CELL)
+    free = np.zeros((rows + 2, columns + 2), np.uint8)
+    free[1:-1, 1:-1] = 1
+    for low, high in boxes[boxes[:, 0, 2] < HEAD_ROOM]:
+        c0, c1 = (int(np.floor((x + width / 2) / CELL)) + 1 for x in (low[0], high[0]))
+        r0, r1 = (int(np.floor((y + depth / 2) / CELL)) + 1 for y in (low[1], high[1]))
+        free[max(r0, 0) : r1 + 1, max(c0, 0) : c1 + 1] = 0
+    distance = cv2.distanceTransform(free, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    return np.asarray(np.maximum(distance.astype(np.float64) - 1, 0) * CELL)

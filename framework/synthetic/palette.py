@@ -1,0 +1,79 @@
+"""Colours and materials that rooms are furnished with, drawn at random."""
+
+from __future__ import annotations
+
+import colorsys
+
+import numpy as np
+
+from framework.synthetic.textures import Material, Texture
+
+Color = tuple[float, float, float]
+
+WOODS: tuple[tuple[Color, Color], ...] = (
+    ((0.78, 0.60, 0.40), (0.62, 0.43, 0.25)),  # oak
+    ((0.55, 0.36, 0.22), (0.38, 0.22, 0.12)),  # walnut
+    ((0.86, 0.73, 0.54), (0.74, 0.57, 0.37)),  # birch
+    ((0.62, 0.33, 0.19), (0.43, 0.19, 0.10)),  # cherry
+    ((0.36, 0.26, 0.20), (0.22, 0.15, 0.11)),  # wenge
+)
+CLOTHS: tuple[Color, ...] = (
+    (0.20, 0.33, 0.50), (0.55, 0.23, 0.22), (0.30, 0.45, 0.36), (0.75, 0.60, 0.28), (0.48, 0.47, 0.46),
+    (0.26, 0.50, 0.55), (0.62, 0.42, 0.50), (0.80, 0.74, 0.64), (0.72, 0.40, 0.22), (0.34, 0.28, 0.44),
+)  # fmt: skip
+WALLS: tuple[Color, ...] = (
+    (0.87, 0.84, 0.77), (0.78, 0.84, 0.85), (0.83, 0.86, 0.78), (0.90, 0.80, 0.72), (0.82, 0.80, 0.86),
+)  # fmt: skip
+
+
+def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
+    return choices[int(rng.integers(len(choices)))]
+
+
+def shade(color: Color, factor: float) -> Color:
+    """The colour made darker (below 1) or lighter (above 1)."""
+    r, g, b = (min(1.0, factor * c) for c in color)
+    return r, g, b
+
+
+def vivid(rng: np.random.Generator) -> Color:
+    """A strong colour of any hue, for books, bags and pictures."""
+    return colorsys.hsv_to_rgb(rng.uniform(), rng.uniform(0.55, 0.9), rng.uniform(0.35, 0.85))
+
+
+def wood(rng: np.random.Generator) -> Material:
+    first, second = WOODS[int(rng.integers(len(WOODS)))]
+    tone = rng.uniform(0.9, 1.08)
+    return Material(Texture.WOOD, shade(first, tone), shade(second, tone), rng.uniform(0.03, 0.06), seed=_seed(rng))
+
+
+def cloth(rng: np.random.Generator, color: Color | None = None) -> Material:
+    """Upholstery of one colour."""
+    base = pick(rng, CLOTHS) if color is None else color
+    return Material(Texture.FABRIC, base, shade(base, 0.72), rng.uniform(0.10, 0.2), seed=_seed(rng))
+
+
+def patterned_cloth(rng: np.random.Generator) -> Material:
+    """Bed linen: striped, checked or plain."""
+    base, other = pick(rng, CLOTHS), (0.90, 0.88, 0.84)
+    texture = (Texture.STRIPES, Texture.CHECKS, Texture.FABRIC)[int(rng.integers(3))]
+    second = shade(base, 0.75) if texture is Texture.FABRIC else base
+    first = base if texture is Texture.FABRIC else other
+    return Material(texture, first, second, rng.uniform(0.10, 0.2), seed=_seed(rng))
+
+
+def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=_seed(rng))
+
+
+def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
+    return Material(Texture.METAL, color, shade(color, 0.91), seed=_seed(rng))
+
+
+def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
+    """A painting or a screen of this size (m)."""
+    return Material(texture, vivid(rng), vivid(rng), 0.1, (width, height), _seed(rng), emission)
+
+
+def _seed(rng: np.random.Generator) -> int:
+    return int(rng.integers(4096))

@@ -1,0 +1,69 @@
+"""Open3D's Embree ray-caster, with this project's pixel convention and repeatable results."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+import open3d as o3d
+
+from framework.data import Bool, Camera, Float32, Float64, Int32
+
+Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
+
+NO_TRIANGLE = -1
+
+
+@dataclass(frozen=True)
+class Hits:
+    """Where rays met the surface, with the shape of the rays in front."""
+
+    distance: Float32  # in lengths of the ray's direction, inf = nothing was met
+    triangle: Int32  # NO_TRIANGLE = nothing was met
+    uv: Float32  # (..., 2) barycentric weights of the triangle's second and third vertex
+    normal: Float32  # (..., 3) of the triangle, towards no particular side
+
+
+class RayCaster:
+    """Casts rays at a fixed triangle mesh. Safe to call from several threads."""
+
+    def __init__(self, vertices: Float32, triangles: Int32) -> None:
+        # One thread builds the tree, so that ties between triangles are always decided alike.
+        self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
+        self._scene.add_triangles(
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
+            o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, np.uint32)),
+        )
+
+    def cast(self, rays: Float32) -> Hits:
+        """The first hits of rays (..., 6), origin and direction."""
+        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)))
+        triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
+        return Hits(
+            answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy(), answer["primitive_normals"].numpy()
+        )
+
+    def occluded(self, origins: Float32, ends: Float32) -> Bool:
+        """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""
+        rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
+        return np.asarray(self._scene.test_occlusions(o3d.core.Tensor.from_numpy(rays), tnear=1e-3, tfar=0.999).numpy())
+
+
+def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
+    """Rays (..., 6) through the image points u, v (px, pixel centres at integers).
+
+    The direction has length 1 along the optical axis, so that the distance of a hit is its depth.
+    """
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    R = T_world_camera[:3, :3]
+    rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)
+    rays[..., :3] = T_world_camera[:3, 3]
+    for c in range(3):  # without BLAS: its rounding may depend on the number of threads
+        rays[..., 3 + c] = R[c, 0] * x + (R[c, 1] * y + R[c, 2])
+    return rays
+
+
+def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
+    """The rays (H, W, 6) through all pixel centres."""
+    return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])

@@ -1,0 +1,159 @@
+"""A furnished room: shell, furniture and lamps. World axes: x and y along the walls, z up, origin amid the floor."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+
+from framework.data import Float64
+from framework.synthetic import clutter, fixtures, groups, palette, seating
+from framework.synthetic.groups import Group, single
+from framework.synthetic.layout import Layout, arrange, place_on_wall
+from framework.synthetic.lights import Lamp, globe, rectangle
+from framework.synthetic.piece import Furniture, Rng
+from framework.synthetic.solids import panel, rounded_box
+from framework.synthetic.surfaces import Surfaces, assemble
+from framework.synthetic.textures import Material, Texture
+
+HEIGHT = 2.55  # m
+WARM, DAY = (1.0, 0.86, 0.66), (0.86, 0.94, 1.0)  # linear colour of lamps and of daylight
+
+
+class RoomKind(StrEnum):
+    """What a room is for. A studio holds all nine classes."""
+
+    STUDIO = "studio"
+    LIVING_ROOM = "living_room"
+    BEDROOM = "bedroom"
+    KITCHEN = "kitchen"
+    OFFICE = "office"
+
+
+SMALLEST = {  # m, width and depth of the smallest room tried
+    RoomKind.STUDIO: (5.6, 4.8),
+    RoomKind.LIVING_ROOM: (4.6, 4.2),
+    RoomKind.BEDROOM: (4.2, 3.8),
+    RoomKind.KITCHEN: (4.0, 3.6),
+    RoomKind.OFFICE: (4.4, 3.8),
+}
+
+
+@dataclass(frozen=True)
+class Room:
+    """One room, complete."""
+
+    kind: RoomKind
+    layout: Layout
+    objects: tuple[tuple[int, Furniture], ...]  # (instance id, piece); 0 = shell
+    lamps: tuple[Lamp, ...]
+    surfaces: Surfaces  # the exact triangles of all objects
+
+
+def furnish(kind: RoomKind, rng: Rng) -> Room:
+    """A room of this kind, drawn at random."""
+    layout = arrange(_groups(kind, rng), *SMALLEST[kind], rng)
+    globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
+    pieces = [*layout.pieces, globe_lamp]
+    objects = ((0, _shell(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))
+    return Room(kind, layout, objects, tuple(_lamps(pieces)), assemble(objects))
+
+
+def _groups(kind: RoomKind, rng: Rng) -> list[Group]:
+    """What the room holds, largest first: the first ones find a place most easily."""
+    door, window = single("door", clutter.door(rng)), single("window", clutter.window(rng), z=0.95, hung=True)
+    bag = single("backpack", fixtures.backpack(rng))
+    extras = [
+        single("plant", clutter.plant(rng)),
+        single("lamp", clutter.floor_lamp(rng)),
+        single("carton", clutter.carton(rng)),
+        single("picture", clutter.painting(rng), z=1.35, hung=True),
+        single("picture", clutter.painting(rng), z=1.4, hung=True),
+    ]
+    cupboard = single("cupboard", clutter.cupboard(rng))
+    main: list[Group]
+    if kind is RoomKind.STUDIO:
+        main = [groups.bed_group(rng), groups.couch_group(rng), groups.tv_group(rng), groups.dining_group(rng)]
+        main += [groups.kitchen_group(rng), groups.toilet_group(rng), door, window, bag, *extras]
+    elif kind is RoomKind.LIVING_ROOM:
+        main = [groups.couch_group(rng), groups.tv_group(rng), groups.dining_group(rng), door, window, cupboard, bag]
+        main += [single("pouf", clutter.pouf(rng)), *extras]
+    elif kind is RoomKind.BEDROOM:
+        main = [groups.bed_group(rng), groups.desk_group(rng), door, window, cupboard, bag, *extras]
+    elif kind is RoomKind.KITCHEN:
+        main = [groups.dining_group(rng), groups.kitchen_group(rng), door, window, bag, cupboard, *extras]
+    else:
+        second = replace(groups.desk_group(rng), name="desk 2")
+        main = [groups.desk_group(rng), second, single("couch", seating.couch(rng)), door, window, cupboard, bag]
+        main += extras
+    return main
+
+
+def _shell(width: float, depth: float, rng: Rng) -> Furniture:
+    """Floor, ceiling and four walls with skirting boards, one of them papered."""
+    shell = Furniture("shell", None)
+    shell.add(panel(width, depth).turned("x", np.pi / 2).moved(y=depth / 2), _floor(rng))
+    ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
+    shell.add(ceiling, palette.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12))
+    color = palette.pick(rng, palette.WALLS)
+    plain, pattern = palette.paint(rng, color, 0.88), int(rng.integers(4096))
+    paper = Material(Texture.WALLPAPER, color, palette.shade(color, 0.78), rng.uniform(0.13, 0.2), seed=pattern)
+    papered, skirting = int(rng.integers(4)), palette.wood(rng)
+    for wall in range(4):
+        length = width if wall % 2 == 0 else depth
+        x, y, angle = place_on_wall(wall, 0.0, width, depth)
+        shell.add(panel(length, HEIGHT).turned("z", angle).moved(x, y), paper if wall == papered else plain)
+        board = rounded_box(length, 0.012, 0.08, 0.004).moved(y=0.006, z=0.04)
+        shell.add(board.turned("z", angle).moved(x, y), skirting)
+    return shell
+
+
+def _floor(rng: Rng) -> Material:
+    style = rng.uniform()
+    if style < 0.65:
+        first, second = palette.WOODS[int(rng.integers(len(palette.WOODS)))]
+        return Material(Texture.PLANKS, first, second, rng.uniform(0.11, 0.17), seed=int(rng.integers(4096)))
+    if style < 0.85:
+        tone = palette.pick(rng, ((0.72, 0.66, 0.58), (0.60, 0.61, 0.62), (0.76, 0.52, 0.38)))
+        return Material(
+            Texture.TILES, tone, palette.shade(tone, 0.6), rng.uniform(0.28, 0.42), seed=int(rng.integers(4096))
+        )
+    return palette.cloth(rng, palette.pick(rng, palette.CLOTHS))
+
+
+def _lamps(pieces: list[Furniture]) -> list[Lamp]:
+    """The light of everything that glows."""
+    lamps: list[Lamp] = []
+    for piece in pieces:
+        low, high = piece.bounds()
+        center = (low + high) / 2
+        if piece.kind == "ceiling lamp":
+            lamps.append(globe(np.array([*center[:2], HEIGHT - 0.22]), 0.24, _scaled(WARM, 9.0), 24))
+        elif piece.kind in ("floor lamp", "table lamp"):
+            strength, below = (3.0, 0.10) if piece.kind == "floor lamp" else (0.9, 0.08)
+            # Sample points lie outside the shade, else it would swallow its own light.
+            lamps.append(
+                globe(np.array([*center[:2], high[2] - below]), 0.24 if strength > 1 else 0.16, _scaled(WARM, strength))
+            )
+        elif piece.kind == "window":
+            lamps.append(_daylight(low, high))
+    return lamps
+
+
+def _daylight(low: Float64, high: Float64) -> Lamp:
+    """A window's light, sent from between its curtains; the window lies against the wall nearest to it."""
+    thin = int(np.argmin((high - low)[:2]))
+    wide = 1 - thin
+    normal = np.zeros(3)
+    normal[thin] = -np.sign((low + high)[thin])
+    along, up = np.zeros(3), np.zeros(3)
+    along[wide], up[2] = 0.52 * (high - low)[wide], 1.0
+    corner = (low + high) / 2 - along / 2
+    corner[thin] = (high if normal[thin] > 0 else low)[thin] + 0.02 * normal[thin]
+    corner[2] = high[2] - 1.40
+    return rectangle(corner, along, up, normal, _scaled(DAY, 16.0))
+
+
+def _scaled(color: tuple[float, float, float], power: float) -> tuple[float, float, float]:
+    return color[0] * power, color[1] * power, color[2] * power

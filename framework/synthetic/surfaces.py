@@ -1,0 +1,66 @@
+"""The triangles of a furnished room, in the arrays that ray-casting and shading read."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from framework.data import Float32, Float64, Int32
+from framework.synthetic.piece import Furniture
+from framework.synthetic.textures import Material, material_table
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """The exact geometry of a room: what a reconstruction can be measured against."""
+
+    vertices: Float32  # (V, 3) m, world
+    normals: Float32  # (V, 3) unit, smoothed over each part
+    texture: Float32  # (V, 3) m
+    triangles: Int32  # (F, 3)
+    instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
+    materials: Int32  # (F,) row of material_table
+    parts: Int32  # (F,) part that the triangle belongs to: pictures have edges between parts
+    material_table: Float32  # (M, 13), see textures.material_table
+    class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
+
+
+def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
+    """All parts of the (instance id, object) pairs, which stand where they belong."""
+    vertices: list[Float64] = []
+    normals: list[Float64] = []
+    texture: list[Float64] = []
+    triangles: list[Int32] = []
+    ids: list[npt.NDArray[np.int64]] = []
+    materials: list[npt.NDArray[np.int64]] = []
+    parts: list[npt.NDArray[np.int64]] = []
+    rows: dict[Material, int] = {}
+    class_names: dict[int, str | None] = {}
+    count = 0
+    for instance, piece in objects:
+        if instance:
+            class_names[instance] = piece.class_name
+        for solid, material in piece.parts:
+            faces = len(solid.triangles)
+            vertices.append(solid.vertices)
+            normals.append(solid.normals)
+            texture.append(solid.texture)
+            triangles.append(solid.triangles + count)
+            ids.append(np.full(faces, instance))
+            materials.append(np.full(faces, rows.setdefault(material, len(rows))))
+            parts.append(np.full(faces, len(parts)))
+            count += len(solid.vertices)
+    return Surfaces(
+        vertices=np.concatenate(vertices).astype(np.float32),
+        normals=np.concatenate(normals).astype(np.float32),
+        texture=np.concatenate(texture).astype(np.float32),
+        triangles=np.concatenate(triangles).astype(np.int32),
+        instance_ids=np.concatenate(ids).astype(np.int32),
+        materials=np.concatenate(materials).astype(np.int32),
+        parts=np.concatenate(parts).astype(np.int32),
+        material_table=material_table(list(rows)),
+        class_names=class_names,
+    )

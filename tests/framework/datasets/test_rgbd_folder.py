@@ -1,0 +1,369 @@
+"""RGB-D folders written in the exact layout, sound and with every fault."""
+
+import json
+import shutil
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import ConfigError, DataError, FrameError
+
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
+WIDTH, HEIGHT, FRAMES = 24, 16, 4
+CAMERA = {"width": WIDTH, "height": HEIGHT, "fx": 20.0, "fy": 21.0, "cx": 11.5, "cy": 7.5, "depth_scale": 1000.0}
+
+
+def picture(k):
+    return np.random.default_rng(k).integers(0, 255, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+
+
+def depth_mm(k):
+    return (1000 + 10 * k + np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH)).astype(np.uint16)
+
+
+def write_frame(folder, k):
+    cv2.imwrite(str(folder / f"color/{k:06d}.png"), picture(k)[..., ::-1])
+    cv2.imwrite(str(folder / f"depth/{k:06d}.png"), depth_mm(k))
+    ids = np.zeros((HEIGHT, WIDTH), np.uint16)
+    ids[4:9, 5:12] = 7
+    ids[10:14] = 300
+    cv2.imwrite(str(folder / f"instance/{k:06d}.png"), ids)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    root = tmp_path / "kitchen"
+    for name in ("color", "depth", "instance"):
+        (root / name).mkdir(parents=True)
+    (root / "camera.json").write_text(json.dumps(CAMERA))
+    for k in range(FRAMES):
+        write_frame(root, k)
+    lines = [f"{k / 10:.3f} {0.1 * k} 0 -0.5 0 0.6 0 0.8" for k in range(FRAMES)]
+    (root / "poses.txt").write_text("# timestamp tx ty tz qx qy qz qw\n" + "\n".join(lines) + "\n")
+    (root / "instances.json").write_text(
+        json.dumps({"7": {"name": "arm chair", "class": "chair"}, "300": {"name": "floor", "class": None}})
+    )
+    return root
+
+
+def set_pose_line(folder, k, line):
+    lines = (folder / "poses.txt").read_text().splitlines()
+    lines[1 + k] = line
+    (folder / "poses.txt").write_text("\n".join(lines) + "\n")
+
+
+def change_camera(folder, **changes):
+    (folder / "camera.json").write_text(json.dumps(CAMERA | changes))
+
+
+def test_a_frame_holds_exactly_what_the_files_hold(folder):
+    sequence = RgbdFolder(folder)
+    assert (len(sequence), sequence.name) == (FRAMES, "kitchen")
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, 0.2)
+    np.testing.assert_array_equal(frame.color, picture(2))
+    np.testing.assert_array_equal(frame.depth, depth_mm(2).astype(np.float32) / np.float32(1000))
+    # A turn about y with sin(a/2) = 0.6, cos(a/2) = 0.8: cos a = 0.28, sin a = 0.96.
+    expected = [[0.28, 0, 0.96, 0.2], [0, 1, 0, 0], [-0.96, 0, 0.28, -0.5], [0, 0, 0, 1]]
+    np.testing.assert_allclose(frame.T_world_camera, expected, atol=1e-12)
+    assert frame.truth.class_names == {7: "chair", 300: None}
+    assert set(np.unique(frame.truth.instance_ids)) == {0, 7, 300}
+
+
+def test_start_stop_stride_choose_and_the_index_counts_before_them(folder):
+    sequence = RgbdFolder(folder, start=1, stop=4, stride=2)
+    assert [frame.index for frame in (sequence[0], sequence[1])] == [1, 3]
+    assert len(sequence) == 2
+    with pytest.raises(IndexError):
+        sequence[2]
+
+
+def test_a_scene_is_a_sub_folder(folder):
+    assert RgbdFolder(folder.parent, scene="kitchen").name == "kitchen"
+
+
+def test_65535_and_what_is_beyond_max_depth_are_no_reading(folder):
+    image = depth_mm(0)
+    image[0, :3] = 65535, 2500, 0
+    cv2.imwrite(str(folder / "depth/000000.png"), image)
+    assert RgbdFolder(folder, max_depth=0)[0].depth[0, :3].tolist() == [0, 2.5, 0]
+    assert RgbdFolder(folder, max_depth=2.0)[0].depth[0, :3].tolist() == [0, 0, 0]
+
+
+def test_numbers_may_have_gaps_and_start_anywhere(folder):
+    for name in ("color", "depth", "instance"):
+        (folder / name / "000001.png").rename(folder / name / "frame-12345.png")
+    sequence = RgbdFolder(folder)
+    np.testing.assert_array_equal(sequence[3].color, picture(1))
+    np.testing.assert_array_equal(sequence[1].color, picture(2))
+
+
+def test_without_poses_the_pose_is_not_known(folder):
+    (folder / "poses.txt").unlink()
+    sequence = RgbdFolder(folder)
+    assert sequence[3].T_world_camera is None
+    assert sequence[3].timestamp == pytest.approx(3 / 30)
+    assert sequence.scene_truth() is None
+
+
+def test_without_instances_there_is_no_truth(folder):
+    shutil.rmtree(folder / "instance")
+    (folder / "instances.json").unlink()
+    sequence = RgbdFolder(folder)
+    assert sequence[0].truth is None
+    assert sequence.scene_truth() is None
+
+
+def test_scene_truth_lies_on_the_labelled_surface(folder):
+    truth = RgbdFolder(folder, stop=1).scene_truth()
+    assert truth.class_names == {7: "chair", 300: None}
+    depth, ids = depth_mm(0) / 1000, RgbdFolder(folder)[0].truth.instance_ids
+    v, u = np.nonzero(ids == 7)
+    z = depth[v, u]
+    camera = np.stack([(u - 11.5) / 20 * z, (v - 7.5) / 21 * z, z], axis=1)
+    world = camera @ np.array([[0.28, 0, 0.96], [0, 1, 0], [-0.96, 0, 0.28]]).T + [0, 0, -0.5]
+    mine = truth.points_world[truth.instance_ids == 7]
+    nearest = np.linalg.norm(mine[:, None] - world[None], axis=-1).min(axis=1)
+    assert len(mine) > 20
+    assert nearest.max() < 0.02
+
+
+def test_scene_truth_leaves_out_frames_that_cannot_be_read(folder):
+    (folder / "depth/000001.png").write_bytes(b"")
+    assert len(RgbdFolder(folder).scene_truth().points_world) > 100
+
+
+# Faults of the whole sequence: known when it is built.
+
+
+def test_a_missing_folder_is_named(tmp_path):
+    with pytest.raises(DataError, match=r"nowhere.*does not exist"):
+        RgbdFolder(tmp_path / "nowhere")
+
+
+@pytest.mark.parametrize("name", ["color", "depth"])
+def test_a_missing_image_folder_is_named(folder, name):
+    shutil.rmtree(folder / name)
+    with pytest.raises(DataError, match=f"{name} is missing"):
+        RgbdFolder(folder)
+
+
+def test_missing_camera_json_says_what_a_folder_needs(folder):
+    (folder / "camera.json").unlink()
+    with pytest.raises(DataError, match=r"camera\.json is missing"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize("key", list(CAMERA))
+def test_a_missing_camera_key_is_named(folder, key):
+    (folder / "camera.json").write_text(json.dumps({k: v for k, v in CAMERA.items() if k != key}))
+    with pytest.raises(DataError, match=f"camera.json: the key '{key}' is missing"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"fx": "wide"}, {"fx": -1.0}, {"width": 24.5}, {"depth_scale": 0}, {"cx": float("nan")}, {"fy": True}]
+)
+def test_a_bad_camera_value_is_named(folder, changes):
+    change_camera(folder, **changes)
+    with pytest.raises(DataError, match=rf"camera\.json.*{next(iter(changes))}"):
+        RgbdFolder(folder)
+
+
+def test_camera_json_that_is_no_json(folder):
+    (folder / "camera.json").write_text("{width: 3")
+    with pytest.raises(DataError, match="not valid JSON"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize("name", ["color", "depth", "instance"])
+def test_counts_that_differ_name_the_first_frame_without_partner(folder, name):
+    (folder / name / "000002.png").unlink()
+    with pytest.raises(DataError, match=rf"4 images .* 3: frame 2 .* not in {name}/"):
+        RgbdFolder(folder)
+
+
+def test_two_files_of_one_frame(folder):
+    shutil.copy(folder / "color/000001.png", folder / "color/1.png")
+    with pytest.raises(DataError, match="same frame number 1"):
+        RgbdFolder(folder)
+
+
+def test_a_file_without_number(folder):
+    shutil.copy(folder / "color/000001.png", folder / "color/cover.png")
+    with pytest.raises(DataError, match="must end in the frame's number"):
+        RgbdFolder(folder)
+
+
+def test_fewer_poses_than_frames(folder):
+    lines = (folder / "poses.txt").read_text().splitlines()
+    (folder / "poses.txt").write_text("\n".join(lines[:-1]))
+    with pytest.raises(DataError, match="holds 3 poses, but color/ holds 4 frames"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0.2 1 2 3 0 0 0", "line 4: expected 8 numbers .*, found 7"),
+        ("0.2 1 2 three 0 0 0 1", "line 4: expected numbers"),
+        ("nan 1 2 3 0 0 0 1", "line 4: the timestamp"),
+    ],
+)
+def test_a_bad_line_of_poses_is_named_by_number(folder, line, message):
+    set_pose_line(folder, 2, line)
+    with pytest.raises(DataError, match=rf"poses\.txt, {message}"):
+        RgbdFolder(folder)
+
+
+def test_instance_images_without_names(folder):
+    (folder / "instances.json").unlink()
+    with pytest.raises(DataError, match=r"instances\.json is missing"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize(
+    "entry", [{"0": {"class": None}}, {"chair": {"class": "chair"}}, {"7": "chair"}, {"7": {"class": 3}}]
+)
+def test_a_bad_entry_of_instances(folder, entry):
+    (folder / "instances.json").write_text(json.dumps(entry))
+    with pytest.raises(DataError, match=r"instances\.json"):
+        RgbdFolder(folder)
+
+
+def test_images_of_another_size_than_the_camera(folder):
+    change_camera(folder, width=48)
+    with pytest.raises(DataError, match=r"000000\.png is 24x16, but .*camera\.json says 48x16"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize("values", [{"max_depth": -1.0}, {"truth_voxel": 0.0}, {"stride": 0}])
+def test_parameters_are_checked(folder, values):
+    with pytest.raises(ConfigError, match=f"dataset.{next(iter(values))}"):
+        RgbdFolder(folder, **values)
+
+
+# Faults of one frame: known when it is read, and the others can be.
+
+
+def read_all_but(folder, bad):
+    sequence = RgbdFolder(folder)
+    for k in range(FRAMES):
+        if k != bad:
+            assert sequence[k].index == k
+    with pytest.raises(FrameError) as caught:
+        sequence[bad]
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg"])
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.5, 0.9, 0.999])
+def test_a_truncated_color_image(folder, suffix, share):
+    (folder / "color/000002.png").unlink()
+    path = folder / f"color/000002.{suffix}"
+    cv2.imwrite(str(path), np.repeat(np.repeat(picture(2), 1, axis=0), 1, axis=1))
+    assert RgbdFolder(folder)[2].color.shape == (HEIGHT, WIDTH, 3)
+    data = path.read_bytes()
+    path.write_bytes(data[: int(share * len(data))])
+    assert "000002" in read_all_but(folder, 2)
+
+
+def test_zeros_behind_a_jpeg_are_no_fault(folder):
+    (folder / "color/000002.png").unlink()
+    path = folder / "color/000002.jpg"
+    cv2.imwrite(str(path), picture(2))
+    path.write_bytes(path.read_bytes() + b"\0" * 10)
+    assert RgbdFolder(folder)[2].index == 2
+
+
+def test_a_damaged_depth_image(folder):
+    path = folder / "depth/000001.png"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(data)
+    assert "damaged" in read_all_but(folder, 1)
+
+
+def test_a_file_that_is_no_image(folder):
+    (folder / "color/000001.png").write_bytes(b"hello world" * 20)
+    assert "neither a JPEG nor a PNG" in read_all_but(folder, 1)
+
+
+@pytest.mark.parametrize("name", ["color", "depth", "instance"])
+def test_one_image_of_another_size(folder, name):
+    path = folder / name / "000003.png"
+    cv2.imwrite(str(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[:-2])
+    message = read_all_but(folder, 3)
+    assert "24x14" in message
+    assert "24x16" in message
+
+
+def test_depth_that_is_not_uint16(folder):
+    cv2.imwrite(str(folder / "depth/000001.png"), picture(1))
+    assert "one channel of uint16, found 3 of uint8" in read_all_but(folder, 1)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("0.1 nan 0 0 0 0 0 1", "not finite"),
+        ("0.1 0 0 inf 0 0 0 1", "not finite"),
+        ("0.1 0 0 0 0 0 0 0.5", "length 0.5, expected 1"),
+        ("0.1 0 0 0 0 0 0 0", "length 0, expected 1"),
+    ],
+)
+def test_a_pose_that_is_none(folder, line, message):
+    set_pose_line(folder, 1, line)
+    found = read_all_but(folder, 1)
+    assert message in found
+    assert "poses.txt, line 3" in found
+
+
+def test_a_quaternion_of_few_digits_is_made_rigid(folder):
+    set_pose_line(folder, 1, "0.1 0 0 0 0 0.601 0 0.801")
+    R = RgbdFolder(folder)[1].T_world_camera[:3, :3]
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+
+
+def test_an_instance_without_name(folder):
+    ids = np.full((HEIGHT, WIDTH), 9, np.uint16)
+    cv2.imwrite(str(folder / "instance/000001.png"), ids)
+    assert "instance 9 is not in" in read_all_but(folder, 1)
+
+
+# Real data.
+
+
+@pytest.mark.parametrize(
+    ("scene", "frames", "shape", "labeled"),
+    [
+        ("redkitchen", 300, (480, 640), False),
+        ("replica_floor2", 123, (512, 512), True),
+        ("mit76", 5, (480, 640), False),
+        ("redwood5", 5, (480, 640), False),
+    ],
+)
+def test_real_folders(scene, frames, shape, labeled):
+    if not (SHARED / scene).is_dir():
+        pytest.skip(f"{SHARED / scene} is not there")
+    sequence = RgbdFolder(SHARED, scene=scene)
+    assert len(sequence) == frames
+    frame = sequence[frames - 1]  # Frame itself checks types and that the pose is rigid
+    assert frame.depth.shape == shape
+    assert 0.3 < np.median(frame.depth[frame.depth > 0]) < 8
+    assert frame.T_world_camera is not None
+    assert (frame.truth is not None) == labeled
+
+
+def test_the_truth_of_replica():
+    if not (SHARED / "replica_floor2").is_dir():
+        pytest.skip(f"{SHARED / 'replica_floor2'} is not there")
+    truth = RgbdFolder(SHARED, scene="replica_floor2", stride=12).scene_truth()
+    extent = np.ptp(truth.points_world, axis=0)
+    assert (extent > 2).all()
+    assert (extent < 25).all()
+    assert {truth.class_names[i] for i in np.unique(truth.instance_ids) if i} >= {"bed", None}
