@@ -101,7 +101,7 @@ class _VoteTable:
         return points.astype(np.float32), self.ids[winners]
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _slot(keys: Int64, ids: Int32, votes: Int64, key: np.int64, instance: np.int32) -> np.int64:
     """The slot that holds (key, instance), or the empty one where it belongs."""
     mask = len(keys) - 1
@@ -114,7 +114,7 @@ def _slot(keys: Int64, ids: Int32, votes: Int64, key: np.int64, instance: np.int
     return slot
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _vote(
     depth: Float32,
     instance_ids: Int32,
@@ -160,7 +160,7 @@ def _vote(
     return taken
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _move(
     keys: Int64,
     ids: Int32,

@@ -98,7 +98,7 @@ def _gather(origins: Float32, normals: Float32, caster: RayCaster) -> tuple[Int3
     return triangle, uv
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _collect(
     triangle: Int32, uv: Float32, triangles: Int32, materials: Int32, reflectance: Float32, irradiance: Float32
 ) -> Float32:

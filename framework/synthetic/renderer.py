@@ -112,7 +112,7 @@ class Renderer:
         light[v, u] = np.minimum(samples, WHITE).mean(axis=1)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _shade_hits(
     triangle: Int32,
     uv: Float32,

@@ -71,7 +71,7 @@ def material_table(materials: list[Material]) -> Float32:
     return rows.astype(np.float32)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _mixed(h: np.uint64) -> float:
     """A number in [0, 1) that depends on every bit of `h`."""
     h ^= h >> np.uint64(32)
@@ -80,14 +80,14 @@ def _mixed(h: np.uint64) -> float:
     return float(h >> np.uint64(40)) * (1.0 / 16777216.0)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _lattice(i: int, j: int, k: int, seed: int) -> float:
     """A number in [0, 1) for each lattice point."""
     h = np.uint64(i) * STEP_X ^ np.uint64(j) * STEP_Y ^ np.uint64(k) * STEP_Z ^ np.uint64(seed) * STEP_SEED
     return float(_mixed(h))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _noise(x: float, y: float, z: float, seed: int) -> float:
     """Smooth value noise in [0, 1] with lattice spacing 1, with Perlin's fade curve of 1985."""
     i, j, k = float(np.floor(x)), float(np.floor(y)), float(np.floor(z))
@@ -103,13 +103,13 @@ def _noise(x: float, y: float, z: float, seed: int) -> float:
     return float((x00 * (1 - fy) + x10 * fy) * (1 - fz) + (x01 * (1 - fy) + x11 * fy) * fz)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _visible(wavelength: float, footprint: float) -> float:
     """How much of a detail of this size (m) a pixel of this size (m) can show, 0 to 1."""
     return min(1.0, max(0.0, wavelength / (2.0 * footprint) - 0.75))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, footprint: float, seed: int) -> float:
     """Noise about 0, within [-1, 1], of halving wavelengths, the ones that a pixel cannot show left out."""
     value, amplitude, total = 0.0, 1.0, 0.0
@@ -125,13 +125,13 @@ def _fractal(x: float, y: float, z: float, wavelength: float, octaves: int, foot
     return value / total
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _step(low: float, high: float, x: float) -> float:
     t = min(1.0, max(0.0, (x - low) / (high - low)))
     return t * t * (3 - 2 * t)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _line(x: float, width: float, footprint: float) -> float:
     """1 on the lines at whole x, 0 between; x in periods, width and footprint in periods too."""
     d = abs(x - float(np.floor(x + 0.5)))
@@ -139,7 +139,7 @@ def _line(x: float, width: float, footprint: float) -> float:
     return float((1.0 - _step(0.5 * width - 0.5 * blur, 0.5 * width + 0.5 * blur, d)) * min(1.0, 2.0 * width / blur))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _within(x: float, low: float, high: float, soft: float) -> float:
     """1 where x lies between the two, with borders `soft` wide."""
     soft = max(soft, 1e-4)
@@ -147,7 +147,7 @@ def _within(x: float, low: float, high: float, soft: float) -> float:
     return float(inside)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: int) -> float:
     """Grain along x: growth rings bent by noise, and fibres."""
     bend = 2.2 * _noise(0.9 * x, 5 * y, 5 * z, seed)
@@ -161,7 +161,7 @@ def _wood(x: float, y: float, z: float, scale: float, footprint: float, seed: in
     return float(mix)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
     """A sunset over three ranges of hills in the material's two colours."""
     sun_u, sun_v = 0.25 + 0.5 * _lattice(1, 2, 3, seed), 0.6 + 0.15 * _lattice(3, 2, 1, seed)
@@ -181,13 +181,13 @@ def _landscape(row: Float32, u: float, v: float, seed: int) -> tuple[float, floa
     return r, g, b
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _cloth(x: float, y: float, z: float, footprint: float, seed: int) -> float:
     """The brightness of woven threads."""
     return 1.0 + float(0.2 * _fractal(x, y, z, 0.012, 2, footprint, seed))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tuple[float, float]:
     """A wooden floor, (mix, gain): boards of this width along x, each cut from another tree."""
     length, gap = 1.1, 0.004
@@ -200,7 +200,7 @@ def _planks(x: float, y: float, width: float, footprint: float, seed: int) -> tu
     return mix, (0.78 + 0.40 * tone) * (1.0 - 0.6 * joint)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tuple[float, float]:
     """Square tiles, (mix, gain); the grout is mix = 1."""
     i, j = np.int64(np.floor(x / side)), np.int64(np.floor(y / side))
@@ -210,7 +210,7 @@ def _tiles(x: float, y: float, side: float, footprint: float, seed: int) -> tupl
     return mix, 0.88 + 0.18 * _lattice(i, j, 2, seed) + 0.10 * clouds
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _rug(x: float, y: float, scale: float, width: float, height: float, footprint: float) -> float:
     """Diamonds within border bands."""
     edge = min(min(x, width - x), min(y, height - y))
@@ -222,7 +222,7 @@ def _rug(x: float, y: float, scale: float, width: float, height: float, footprin
     return float(_within(diamond, 0.20, 0.36, soft) + 1.0 - _step(0.10 - 0.5 * soft, 0.10 + 0.5 * soft, diamond))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _book(u: float, v: float, soft: float) -> float:
     """A cover over [0, 1]^2: a frame, a title of several lines, an emblem."""
     frame = _within(u, 0.07, 0.93, soft) * _within(v, 0.05, 0.95, soft)
@@ -232,7 +232,7 @@ def _book(u: float, v: float, soft: float) -> float:
     return float(frame - inner + lines + emblem)
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
     """Stripes with a flower in each, every other row shifted."""
     u, v = x / scale, y / (1.6 * scale)
@@ -246,7 +246,7 @@ def _wallpaper(x: float, y: float, scale: float, footprint: float) -> float:
     return float((0.35 * stripe + 0.65 * flower) * shown + 0.3 * (1 - shown))
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
     """What a window shows: clouds, and trees below."""
     line = 0.30 + 0.22 * _noise(5 * u, 0.5, 0.5, seed) + 0.08 * _noise(23 * u, 0.5, 0.5, seed)
@@ -260,7 +260,7 @@ def _sky(u: float, v: float, seed: int) -> tuple[float, float, float]:
     )
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, float]:
     """What a television shows: a landscape with a caption."""
     r, g, b = _landscape(row, u, v, seed)
@@ -268,7 +268,7 @@ def _screen(row: Float32, u: float, v: float, seed: int) -> tuple[float, float, 
     return r * (1 - caption) + 0.02 * caption, g * (1 - caption) + 0.05 * caption, b * (1 - caption) + 0.35 * caption
 
 
-@njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
+@njit(cache=True, nogil=True)
 def surface_color(row: Float32, x: float, y: float, z: float, footprint: float) -> tuple[float, float, float]:
     """The linear colour of material `row` (see material_table) at texture coordinates x, y, z (m).
 
