@@ -51,7 +51,7 @@ def suppress_duplicates(masks: Bool, iou: float) -> Int32:
 
 
 @njit(cache=True, nogil=True)
-def _bounds(masks):  # type: ignore[no-untyped-def]
+def _bounds(masks):
     """From both ends of each row, so that a mask's inside is never read."""
     n, height, width = masks.shape
     bounds = np.zeros((n, 4), np.int64)
@@ -74,7 +74,7 @@ def _bounds(masks):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _axis_cells(start, end, cells, pixels):  # type: ignore[no-untyped-def]
+def _axis_cells(start, end, cells, pixels):
     """Where pixels along one axis fall in a ringed grid: first pixel, then the lower cell and the weight of the upper.
 
     `cells` is without the ring. Only pixels within half a cell of the box or inside it can see it.
@@ -94,7 +94,7 @@ def _axis_cells(start, end, cells, pixels):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _paste(ringed, borders, threshold, masks):  # type: ignore[no-untyped-def]
+def _paste(ringed, borders, threshold, masks):
     """Rows first: one blended row of the grid serves a whole row of pixels."""
     n, height, width = masks.shape
     cells = ringed.shape[1] - 2

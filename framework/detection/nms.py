@@ -38,7 +38,7 @@ def suppress_boxes(
 
 
 @njit(cache=True, nogil=True)
-def _suppress_sorted(boxes, classes, order, iou, extent, limit):  # type: ignore[no-untyped-def]
+def _suppress_sorted(boxes, classes, order, iou, extent, limit):
     """Compares each box with the survivors only: the limit makes that far fewer than all pairs."""
     survivors = np.empty(min(limit, len(boxes)), np.int32)
     n = 0

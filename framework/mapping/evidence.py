@@ -57,6 +57,23 @@ def best_instance(evidence, row, n):
 
 
 @njit(cache=True, nogil=True, forceinline=True)
+def best_counted_instance(evidence, row, n, counts):
+    """The most likely instance of a voxel among those that count, by id in counts; 0 when none is likelier than the
+    rest.
+    """
+    best = np.int32(0)
+    best_log = np.float32(0.0)
+    for s in range(SLOTS):
+        label = evidence.instance_ids[row, n, s]
+        if label > 0 and counts[label]:
+            log = evidence.instance_log[row, n, s]
+            if log > best_log or (log == best_log and label < best):
+                best = label
+                best_log = log
+    return best
+
+
+@njit(cache=True, nogil=True, forceinline=True)
 def best_class(evidence, row, n):
     """The most likely class of a voxel, -1 when none was ever named."""
     return np.int32(evidence.class_ids[row, n, 0])

@@ -31,16 +31,24 @@ FORMAT = 1  # of the saved file; a change of meaning counts it up
 class InstanceMap(SceneMap):
     """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads.
 
-    An instance counts, in `mesh` and `instances`, once it has been observed `min_observations` times and has
-    `min_vertices` vertices; before, it is tentative: `render` shows it, because association needs it.
+    An instance counts, in `mesh` and `instances`, once it has been observed `min_observations` times, its confidence
+    is `min_confidence` and it has `min_vertices` vertices; before, it is tentative: `render` shows it, as association
+    needs it.
     """
 
     def __init__(
-        self, voxel_size: float, sensor: Sensor, max_blocks: int, min_observations: int, min_vertices: int
+        self,
+        voxel_size: float,
+        sensor: Sensor,
+        max_blocks: int,
+        min_observations: int,
+        min_confidence: float,
+        min_vertices: int,
     ) -> None:
         self.classes: tuple[str, ...] = ()
         self.sensor = sensor
         self.min_observations = min_observations
+        self.min_confidence = min_confidence
         self.min_vertices = min_vertices
         self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
         self.labels = EvidenceRows(self.voxels)
@@ -76,17 +84,17 @@ class InstanceMap(SceneMap):
 
     @cached_property
     def _surface(self) -> InstanceMesh:
-        vertices, triangles, colors, instance_ids, class_ids = extract_mesh(
-            self.voxels.grid, self.voxels.block_count, self.labels.evidence
-        )
-        shown = np.zeros(self.table.last_id + 1, np.bool_)
-        sizes = np.bincount(instance_ids, minlength=len(shown))
+        counts = np.zeros(self.table.last_id + 1, np.bool_)
         for record in self.table.records.values():
-            enough = record.observations >= self.min_observations and sizes[record.id] >= self.min_vertices
-            shown[record.id] = enough
-        counts = shown[instance_ids]
-        instance_ids[~counts] = 0
-        class_ids[~counts] = -1  # a voxel of no object has no class, whatever a mask once said that bled over it
+            counts[record.id] = (
+                record.observations >= self.min_observations and record.confidence >= self.min_confidence
+            )
+        vertices, triangles, colors, instance_ids, class_ids = extract_mesh(
+            self.voxels.grid, self.voxels.block_count, self.labels.evidence, counts
+        )
+        sizes = np.bincount(instance_ids, minlength=len(counts))
+        instance_ids[sizes[instance_ids] < self.min_vertices] = 0
+        class_ids[instance_ids == 0] = -1  # what belongs to no object has no class, whatever mask once bled over it
         return InstanceMesh(vertices, triangles, colors, instance_ids, class_ids, self.classes)
 
     def instances(self) -> Mapping[int, Instance]:
@@ -109,6 +117,7 @@ class InstanceMap(SceneMap):
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
             "max_blocks": self.voxels.max_blocks,
             "min_observations": self.min_observations,
+            "min_confidence": self.min_confidence,
             "min_vertices": self.min_vertices,
             "classes": self.classes,
             "last_id": self.table.last_id,
@@ -138,6 +147,7 @@ class InstanceMap(SceneMap):
             Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()}),
             header["max_blocks"],
             header["min_observations"],
+            header["min_confidence"],
             header["min_vertices"],
         )
         scene.classes = tuple(header["classes"])

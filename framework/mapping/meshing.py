@@ -11,8 +11,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Float32, Int32, UInt8
-from framework.mapping.evidence import Evidence, best_class, best_instance
+from framework.data import Bool, Float32, Int32, UInt8
+from framework.mapping.evidence import Evidence, best_class, best_counted_instance
 from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid, find_block
 from framework.mapping.voxel_walk import voxel_number
 
@@ -93,7 +93,7 @@ def _find_vertices(grid, blocks, cell_vertex, counts):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _place_vertices(grid, evidence, first, cell_vertex, vertices, colors, instance_ids, class_ids):
+def _place_vertices(grid, evidence, counts, first, cell_vertex, vertices, colors, instance_ids, class_ids):
     """Positions and labels of the vertices; those of a block start at first[block]. Labels are the nearest voxel's."""
     for block in prange(len(first)):
         around = np.empty(8, np.int32)
@@ -117,7 +117,7 @@ def _place_vertices(grid, evidence, first, cell_vertex, vertices, colors, instan
             vertices[target, 2] = (grid.block_coords[block, 2] * BLOCK_SIDE + z + place[2]) * grid.voxel_size
             colors[target] = grid.color[nearest, m]
             row = grid.label_row[nearest]
-            instance_ids[target] = best_instance(evidence, row, m) if row >= 0 else 0
+            instance_ids[target] = best_counted_instance(evidence, row, m, counts) if row >= 0 else 0
             class_ids[target] = best_class(evidence, row, m) if row >= 0 else -1
 
 
@@ -180,28 +180,31 @@ def _make_quads(grid, first, cell_vertex, fill, quad_first, counts, triangles):
         counts[block] = count
 
 
-def extract_mesh(grid: Grid, block_count: int, evidence: Evidence) -> tuple[Float32, Int32, UInt8, Int32, Int32]:
+def extract_mesh(
+    grid: Grid, block_count: int, evidence: Evidence, counts: Bool
+) -> tuple[Float32, Int32, UInt8, Int32, Int32]:
     """(vertices (V, 3) m, triangles (F, 3), colors (V, 3), instance ids (V,), class ids (V,)) of the first blocks.
 
-    Triangles face the side that the surface was seen from. The order of vertices depends on the map alone.
+    Only instances with counts[id] are named; where another one is likelier, the likeliest that counts is. Triangles
+    face the side that the surface was seen from. The order of vertices depends on the map alone.
     """
     cell_vertex = np.empty((block_count, BLOCK_VOXELS), np.int32)
-    counts = np.zeros(block_count, np.int32)
-    _find_vertices(grid, block_count, cell_vertex, counts)
-    first = _starts(counts)
-    total = int(counts.sum())
+    sizes = np.zeros(block_count, np.int32)
+    _find_vertices(grid, block_count, cell_vertex, sizes)
+    first = _starts(sizes)
+    total = int(sizes.sum())
     vertices = np.empty((total, 3), np.float32)
     colors = np.empty((total, 3), np.uint8)
     instance_ids = np.empty(total, np.int32)
     class_ids = np.empty(total, np.int32)
-    _place_vertices(grid, evidence, first, cell_vertex, vertices, colors, instance_ids, class_ids)
+    _place_vertices(grid, evidence, counts, first, cell_vertex, vertices, colors, instance_ids, class_ids)
     triangles = np.empty((0, 3), np.int32)
-    _make_quads(grid, first, cell_vertex, False, first, counts, triangles)
-    triangles = np.empty((2 * int(counts.sum()), 3), np.int32)
-    _make_quads(grid, first, cell_vertex, True, _starts(counts), counts, triangles)
+    _make_quads(grid, first, cell_vertex, False, first, sizes, triangles)
+    triangles = np.empty((2 * int(sizes.sum()), 3), np.int32)
+    _make_quads(grid, first, cell_vertex, True, _starts(sizes), sizes, triangles)
     return vertices, triangles, colors, instance_ids, class_ids
 
 
-def _starts(counts: Int32) -> Int32:
+def _starts(sizes: Int32) -> Int32:
     """Where each block's share begins: the exclusive prefix sum."""
-    return np.concatenate([[0], np.cumsum(counts)[:-1]]).astype(np.int32) if len(counts) else counts
+    return (np.cumsum(sizes) - sizes).astype(np.int32)

@@ -49,6 +49,7 @@ class BayesianTsdf(MapFuser):
     instance_floor: float = 0.05  # in (0, 1): P(O = another instance); the matched one has the detection's score
     absence: float = 0.3  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
     min_observations: int = 3  # frames, >= 1: before that an instance is tentative
+    min_confidence: float = 0.05  # in [0, 1]: likewise
     min_vertices: int = 30  # mesh vertices, >= 1: of an instance that counts
 
     def __post_init__(self) -> None:
@@ -72,6 +73,7 @@ class BayesianTsdf(MapFuser):
             ("instance_floor", self.instance_floor, 1e-6, 0.999),
             ("absence", self.absence, 1e-6, 1.0),
             ("min_observations", self.min_observations, 1, 2**31),
+            ("min_confidence", self.min_confidence, 0.0, 1.0),
             ("min_vertices", self.min_vertices, 1, 2**31),
         ):
             if not low <= value <= high:
@@ -85,7 +87,12 @@ class BayesianTsdf(MapFuser):
             full_weight_depth=np.float32(self.full_weight_depth),
         )
         self.scene: InstanceMap = InstanceMap(
-            self.voxel_size, sensor, self.max_blocks, self.min_observations, self.min_vertices
+            self.voxel_size,
+            sensor,
+            self.max_blocks,
+            self.min_observations,
+            self.min_confidence,
+            self.min_vertices,
         )
         self._integrator = Integrator(self.scene.voxels, sensor)
         self._together: Counter[tuple[int, int]] = Counter()  # frames in which two instances looked like one object
