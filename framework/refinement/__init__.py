@@ -1,0 +1,1 @@
+"""What cluster refiners share: the neighborhood of each mask, and mixtures fitted to it."""

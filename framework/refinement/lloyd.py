@@ -1,0 +1,104 @@
+"""Lloyd's k-means for many point sets at the same time."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Float32, Float64, Int32
+
+Int64 = npt.NDArray[np.int64]
+
+
+def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:
+    """Labels (S,) and centers (N, K, 3) after Lloyd's iterations on each set `points[starts[k]:starts[k + 1]]`.
+
+    `centers` (N, K, 3) are the start. It ends when no label changes or after `max_iterations`. A center that loses all
+    of its points stays where it is; of equally near centers the first is taken.
+    """
+    labels = np.full(len(points), -1, np.int32)
+    centers = centers.copy()
+    _lloyd_all(points, starts, centers, max_iterations, labels)
+    return labels, centers
+
+
+def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
+    """(S,) the nearest of the centers of set k for each of `points[begins[k]:ends[k]]`; -1 outside of the ranges."""
+    return np.asarray(_nearest_all(points, begins, ends, centers), np.int32)
+
+
+def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
+    """(N, groups, 3) means of the points cut into `groups` equally many by depth: a start for `cluster`.
+
+    Depth is what separates an occluder in front, the surface that carries an object and the wall behind. A set with
+    fewer points than groups gives repeated centers, an empty one zeros.
+    """
+    return np.asarray(_depth_groups(points, starts, groups), np.float64)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: int, labels: Int32) -> None:
+    for k in prange(len(starts) - 1):
+        if starts[k + 1] > starts[k]:
+            _lloyd(points[starts[k] : starts[k + 1]], centers[k], max_iterations, labels[starts[k] : starts[k + 1]])
+
+
+@njit(cache=True, nogil=True)
+def _lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
+    sums = np.zeros((len(centers), 4))
+    for _ in range(max_iterations):
+        changed = False
+        sums[:] = 0.0
+        for i in range(len(points)):
+            j = _nearest(points[i], centers)
+            changed |= j != labels[i]
+            labels[i] = j
+            sums[j, 0] += 1.0
+            sums[j, 1] += points[i, 0]
+            sums[j, 2] += points[i, 1]
+            sums[j, 3] += points[i, 2]
+        if not changed:
+            return
+        for j in range(len(centers)):
+            if sums[j, 0] > 0:
+                for a in range(3):
+                    centers[j, a] = sums[j, a + 1] / sums[j, 0]
+
+
+@njit(cache=True, nogil=True)
+def _nearest(point: Float32, centers: Float64) -> int:
+    nearest, least = 0, np.inf
+    for j in range(len(centers)):
+        x, y, z = point[0] - centers[j, 0], point[1] - centers[j, 1], point[2] - centers[j, 2]
+        distance = x * x + y * y + z * z
+        if distance < least:
+            nearest, least = j, distance
+    return nearest
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
+    labels = np.full(len(points), -1, np.int32)
+    for k in range(len(begins)):
+        for i in prange(begins[k], ends[k]):
+            labels[i] = _nearest(points[i], centers[k])
+    return labels
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
+    n = len(starts) - 1
+    means = np.zeros((n, groups, 3))
+    for k in prange(n):
+        own = points[starts[k] : starts[k + 1]]
+        if len(own) == 0:
+            continue
+        by_depth = np.argsort(own[:, 2], kind="mergesort")
+        for g in range(groups):
+            first, last = g * len(own) // groups, (g + 1) * len(own) // groups
+            last = max(last, first + 1)
+            for r in range(first, last):
+                for a in range(3):
+                    means[k, g, a] += own[by_depth[r], a] / (last - first)
+    return means

@@ -1,0 +1,125 @@
+"""Cluster refinement by a flat Gaussian mixture: the paper's step, with components for what surrounds the object."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters
+from framework.interfaces import ClusterRefiner
+from framework.refinement import lloyd, mixture
+from framework.refinement.bounds import check_bounds
+from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, neighborhoods
+from framework.refinement.selection import keep_points
+
+START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
+
+
+@dataclass
+class GmmEm(ClusterRefiner):
+    """Drops the points that a Gaussian mixture of object, background and outliers assigns to the last two.
+
+    Eqs. [1] to [4] of the paper, once for each mask: object components start from the mask's points, background
+    components from a ring of pixels around the mask, grouped by place; a uniform component takes outliers. The mask
+    stays known after the start: a point deep inside has log-odds of `mask_log_odds` for the object, a point of the ring
+    as much against it, with a linear ramp between (our choice: without it the Gaussians of object and background
+    trade places in one mask of eight). Clusters only shrink: a dropped point leaves the arrays, clusters keep their
+    index. Clusters with fewer than `min_points` points, or with as few in their ring, are left as they are.
+    """
+
+    object_components: int = 2  # from 1; the visible faces of an object, which one Gaussian covers badly
+    background_components: int = 6  # from 1; occluders, supporting surface, neighbors, walls
+    max_iterations: int = 8  # from 1
+    tolerance: float = 1e-3  # nats a point; EM ends when the mean log-likelihood gains less
+    std_floor: float = 0.01  # m, least standard deviation of a component along any axis
+    outlier_fraction: float = 0.02  # in [0, 1), share of outliers at the start
+    min_posterior: float = 0.5  # in (0, 1), a point stays when the object's share of it is larger
+    mask_log_odds: float = 2.0  # nats, from 0; 0 = the mask is the start only, as in the paper
+    expected_bleed: float = 0.5  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
+    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
+    min_ring: int = 4  # px, least width
+    max_ring: int = 12  # px, largest width
+    max_points: int = 1000  # from 100, points of a mask and its ring that EM sees; all are judged at the end
+    min_points: int = 30  # from 10, smaller clusters or rings are too little for a mixture
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "object_components", 1, 64)
+        check_bounds(self, "background_components", 1, 64)
+        check_bounds(self, "max_iterations", 1, 1000)
+        check_bounds(self, "tolerance", 0.0, np.inf)
+        check_bounds(self, "std_floor", 1e-4, 1.0)
+        check_bounds(self, "outlier_fraction", 0.0, 0.99)
+        check_bounds(self, "min_posterior", 1e-6, 1 - 1e-6)
+        check_bounds(self, "mask_log_odds", 0.0, 20.0)
+        check_bounds(self, "expected_bleed", 0.0, 0.99)
+        check_bounds(self, "ring_fraction", 0.0, 10.0)
+        check_bounds(self, "min_ring", 1, MAX_RING_WIDTH)
+        check_bounds(self, "max_ring", self.min_ring, MAX_RING_WIDTH)
+        check_bounds(self, "max_points", 100, 10**9)
+        check_bounds(self, "min_points", 10, 10**9)
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.thinned(self.max_points)
+        mixtures = mixture.fit(
+            sample.points_camera,
+            sample.starts,
+            self._start(sample),
+            self.object_components + self.background_components,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+            variance_floor=self.std_floor**2,
+            outlier_fraction=self.outlier_fraction,
+            prior_log_odds=self._prior(sample),
+            own_components=self.object_components,
+        )
+        begins = around.starts[:-1]
+        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        claimed = mixture.likely_members(
+            around.points_camera,
+            begins,
+            begins + np.where(judged, around.mask_counts, 0),
+            mixtures,
+            own_components=self.object_components,
+            min_posterior=self.min_posterior,
+            prior_log_odds=self._prior(around),
+        )
+        return keep_points(clusters, around.kept(claimed, judged, len(clusters.cluster)))
+
+    def _start(self, sample: Neighborhoods) -> Int32:
+        """(S,) the component that each point starts in: the object's come first, then the background's.
+
+        The border of the mask, as far in as it is expected to bleed, starts in the nearest group of the ring.
+        """
+        points, of_ring = sample.points_camera, sample.source < 0
+        in_core = ~of_ring & (self._prior(sample) >= 0)
+        of_border = ~of_ring & ~in_core
+        labels = np.empty(len(points), np.int32)
+        labels[in_core], _ = _groups(points[in_core], _counts(in_core, sample), self.object_components)
+        labels[of_ring], centers = _groups(points[of_ring], sample.ring_counts, self.background_components)
+        ends = np.cumsum(_counts(of_border, sample))
+        begins = ends - _counts(of_border, sample)
+        labels[of_border] = lloyd.nearest_centers(points[of_border], begins, ends, centers)
+        labels[~in_core] += self.object_components
+        return labels
+
+    def _prior(self, around: Neighborhoods) -> Float32:
+        """(S,) log-odds of each point for the object, from where it lies in the mask or the ring.
+
+        A mask too thin for the whole ramp gets a shorter one, so that its innermost points always speak for the object.
+        """
+        reach = np.maximum(np.minimum(around.ring_widths, around.mask_radii), 1).astype(np.float32)
+        ramp = (around.depth_in_mask / reach[around.owner] - self.expected_bleed) / (1 - self.expected_bleed)
+        return np.asarray(self.mask_log_odds * np.clip(ramp, -1, 1), np.float32)
+
+
+def _counts(chosen: Bool, sample: Neighborhoods) -> Int64:
+    """(N,) how many points of each neighborhood are chosen (S,)."""
+    return np.bincount(sample.owner[chosen], minlength=len(sample))
+
+
+def _groups(points: Float32, counts: Int64, groups: int) -> tuple[Int32, Float64]:
+    """Each of the N sets, `counts` long, cut into groups that lie together: (S,) in [0, groups), (N, groups, 3)."""
+    starts = np.concatenate([[0], np.cumsum(counts)])
+    return lloyd.cluster(points, starts, lloyd.depth_groups(points, starts, groups), START_ITERATIONS)

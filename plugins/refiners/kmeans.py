@@ -1,0 +1,63 @@
+"""Cluster refinement by k-means: the conventional alternative that the paper compares its mixture with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Float64, Frame, PointClusters
+from framework.interfaces import ClusterRefiner
+from framework.refinement import lloyd
+from framework.refinement.bounds import check_bounds
+from framework.refinement.neighborhood import MAX_RING_WIDTH, Neighborhoods, neighborhoods
+from framework.refinement.selection import keep_points
+
+
+@dataclass
+class KMeans(ClusterRefiner):
+    """Drops the points that lie nearer to a center of the background than to one of the object.
+
+    Lloyd's algorithm once for each mask, on the mask's points and the same ring around it that `gmm_em` uses: the
+    object's centers start at the means of the mask cut into equal parts by depth, the background's likewise in
+    the ring. Clusters only shrink: a dropped point leaves the arrays, clusters keep their index. Clusters with fewer
+    than `min_points` points, or with as few in their ring, are left as they are.
+    """
+
+    object_centers: int = 5  # from 1
+    background_centers: int = 5  # from 1
+    max_iterations: int = 20  # from 1; it ends sooner when no label changes
+    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
+    min_ring: int = 4  # px, least width
+    max_ring: int = 12  # px, largest width
+    max_points: int = 1000  # from 100, points of a mask and its ring that k-means sees; all are judged at the end
+    min_points: int = 30  # from 10, smaller clusters or rings are too little
+
+    def __post_init__(self) -> None:
+        check_bounds(self, "object_centers", 1, 64)
+        check_bounds(self, "background_centers", 1, 64)
+        check_bounds(self, "max_iterations", 1, 1000)
+        check_bounds(self, "ring_fraction", 0.0, 10.0)
+        check_bounds(self, "min_ring", 1, MAX_RING_WIDTH)
+        check_bounds(self, "max_ring", self.min_ring, MAX_RING_WIDTH)
+        check_bounds(self, "max_points", 100, 10**9)
+        check_bounds(self, "min_points", 10, 10**9)
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.thinned(self.max_points)
+        _, centers = lloyd.cluster(sample.points_camera, sample.starts, self._start(sample), self.max_iterations)
+        begins = around.starts[:-1]
+        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        ends = begins + np.where(judged, around.mask_counts, 0)
+        labels = lloyd.nearest_centers(around.points_camera, begins, ends, centers)
+        return keep_points(clusters, around.kept(labels < self.object_centers, judged, len(clusters.cluster)))
+
+    def _start(self, sample: Neighborhoods) -> Float64:
+        """(N, object_centers + background_centers, 3) the object's centers, then the background's."""
+        of_ring = sample.source < 0
+        mask_starts = np.concatenate([[0], np.cumsum(sample.mask_counts)])
+        ring_starts = np.concatenate([[0], np.cumsum(sample.ring_counts)])
+        objects = lloyd.depth_groups(sample.points_camera[~of_ring], mask_starts, self.object_centers)
+        background = lloyd.depth_groups(sample.points_camera[of_ring], ring_starts, self.background_centers)
+        return np.concatenate([objects, background], axis=1)

@@ -1,0 +1,99 @@
+"""Speed of the refiners: ten masks in a 640x480 frame, and gmm_em's mixtures beside scikit-learn's.
+
+Run with `python -m pytest tests/benchmarks/test_refiners.py --benchmark-only -s`.
+"""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import pytest
+from sklearn.mixture import GaussianMixture
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.geometry import lift
+from framework.interfaces import ClusterRefiner
+from framework.refinement import mixture
+from framework.refinement.neighborhood import neighborhoods
+from plugins.refiners.gmm_em import GmmEm
+from plugins.refiners.identity import Identity
+from plugins.refiners.kmeans import KMeans
+from plugins.refiners.largest_component import LargestComponent
+
+MASKS = 10
+CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
+
+
+def ten_masks() -> tuple[PointClusters, Frame]:
+    """Ten ellipsoidal objects of 30 to 100 px before a slanted wall, masks bleeding 8 px, depth noise of a Kinect."""
+    rng = np.random.default_rng(0)
+    v, u = np.mgrid[:480, :640]
+    depth = 2.5 + 0.001 * u
+    masks = np.zeros((MASKS, 480, 640), np.bool_)
+    for k in range(MASKS):
+        cu, cv, radius = 70 + 125 * (k % 5), 120 + 240 * (k // 5), rng.uniform(30, 100)
+        distance = np.hypot(u - cu, v - cv)
+        bulge = 1.5 + 0.3 * k / MASKS - 0.2 * np.sqrt(np.clip(1 - (distance / radius) ** 2, 0, 1))
+        depth = np.where(distance < radius, bulge, depth)
+        masks[k] = distance < radius + 8
+    depth += rng.normal(0, 0.0019, depth.shape) * depth**2
+    frame = Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), depth.astype(np.float32), CAMERA)
+    ones = np.ones(MASKS, np.float32)
+    detections = Detections(masks, np.zeros((MASKS, 4), np.float32), ones, ones[:, None], ("thing",))
+    return lift(detections, frame, Pose(np.eye(4))), frame
+
+
+@pytest.mark.parametrize("refiner", [Identity(), GmmEm(), KMeans(), LargestComponent()], ids=lambda r: type(r).__name__)
+def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
+    clusters, frame = ten_masks()
+    refiner.refine(clusters, frame)
+    refined = benchmark(refiner.refine, clusters, frame)
+    assert len(refined) == MASKS
+    benchmark.extra_info["points"] = len(clusters.cluster)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_em_beside_scikit_learn(benchmark):
+    """The same points, start and number of iterations: log-likelihoods agree, times are compared."""
+    iterations, components = 8, 8
+    clusters, frame = ten_masks()
+    sample = neighborhoods(clusters, frame, 0.25, 4, 12).thinned(1000)
+    # a start without empty groups, which scikit-learn could not take
+    labels = (np.arange(len(sample.source)) * 7 // 3 % components).astype(np.int32)
+
+    def ours() -> mixture.Mixtures:
+        return mixture.fit(
+            sample.points_camera, sample.starts, labels, components, max_iterations=iterations, tolerance=-np.inf,
+            variance_floor=1e-6, outlier_fraction=0.0,
+        )  # fmt: skip
+
+    def theirs() -> np.ndarray:
+        lower_bounds = np.zeros(MASKS)
+        for k in range(MASKS):
+            own = slice(sample.starts[k], sample.starts[k + 1])
+            points, own_labels = sample.points_camera[own].astype(np.float64), labels[own]
+            groups = [points[own_labels == j] for j in range(components)]
+            reference = GaussianMixture(
+                components,
+                max_iter=iterations,
+                tol=0.0,
+                reg_covar=0.0,
+                weights_init=np.array([len(group) for group in groups]) / len(points),
+                means_init=np.array([group.mean(axis=0) for group in groups]),
+                precisions_init=np.array([np.linalg.inv(np.cov(group.T, bias=True)) for group in groups]),
+            )
+            lower_bounds[k] = reference.fit(points).lower_bound_
+        return lower_bounds
+
+    ours()
+    fitted = benchmark(ours)
+    begin = time.perf_counter()
+    lower_bounds = theirs()
+    their_seconds = time.perf_counter() - begin
+    np.testing.assert_allclose(fitted.log_likelihoods, lower_bounds, rtol=1e-3)
+    ratio = their_seconds / benchmark.stats.stats.median
+    benchmark.extra_info["times faster than scikit-learn"] = ratio
+    print(f"\nEM of {MASKS} mixtures: {1e3 * benchmark.stats.stats.median:.1f} ms, scikit-learn "
+          f"{1e3 * their_seconds:.0f} ms: {ratio:.0f} times faster")  # fmt: skip
+    assert ratio > 5

@@ -1,0 +1,119 @@
+"""Rings around masks, beside slow obvious references."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.geometry import back_project, lift
+from framework.refinement.neighborhood import grouped, neighborhoods
+
+CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
+
+
+def frame_of(depth: np.ndarray) -> Frame:
+    return Frame(0, 0.0, np.zeros((40, 60, 3), np.uint8), depth.astype(np.float32), CAMERA)
+
+
+def clusters_of(masks: np.ndarray, frame: Frame) -> PointClusters:
+    n = len(masks)
+    ones = np.ones(n, np.float32)
+    detections = Detections(masks, np.zeros((n, 4), np.float32), ones, ones[:, None], ("thing",))
+    return lift(detections, frame, Pose(np.eye(4)))
+
+
+def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
+    """Five blobs, some at the image's border and overlapping, over a depth image with holes."""
+    rng = np.random.default_rng(seed)
+    masks = np.zeros((5, 40, 60), np.uint8)
+    for mask in masks:
+        center = tuple(int(x) for x in rng.integers((0, 0), (60, 40)))
+        cv2.ellipse(mask, center, tuple(int(x) for x in rng.integers(2, 15, 2)), 30, 0, 360, 1, -1)
+    depth = rng.uniform(1, 3, (40, 60)) * (rng.random((40, 60)) > 0.2)
+    return masks.astype(bool), frame_of(depth)
+
+
+def test_grouped_is_a_stable_sort():
+    cluster = np.random.default_rng(0).integers(-1, 4, 200).astype(np.int32)
+    order, firsts = grouped(cluster, 5)
+    expected = np.argsort(cluster, kind="stable")[(cluster < 0).sum() :]
+    np.testing.assert_array_equal(order, expected)
+    np.testing.assert_array_equal(firsts, np.searchsorted(cluster[expected], np.arange(6)))
+
+
+def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transform():
+    for seed in range(5):
+        masks, frame = random_scene(seed)
+        clusters = clusters_of(masks, frame)
+        around = neighborhoods(clusters, frame, ring_fraction=0.25, min_ring=3, max_ring=5)
+        for k in range(5):
+            own = masks[k] & (frame.depth > 0)
+            width = int(np.clip(np.rint(0.25 * np.sqrt(own.sum())), 3, 5))
+            assert around.ring_widths[k] == width
+            # OpenCV's 3-4 chamfer distance, in pixels of 0.955 / 3: only its proportion to the step matters
+            steps = cv2.distanceTransform((~own).astype(np.uint8), cv2.DIST_C, 3)
+            ring = ~own & (frame.depth > 0) & (_chamfer_reference(own) <= 3 * width)
+            assert (steps[ring] <= width).all()
+            s = slice(around.starts[k], around.starts[k + 1])
+            pixels = np.concatenate([np.argwhere(own), np.argwhere(ring)])[:, ::-1].astype(np.int32)
+            expected = back_project(CAMERA, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])
+            np.testing.assert_array_equal(around.points_camera[s], expected)
+            assert around.mask_counts[k] == own.sum()
+            assert around.ring_counts[k] == ring.sum()
+            source = around.source[s]
+            assert (clusters.cluster[source[: own.sum()]] == k).all()
+            assert (source[own.sum() :] == -1).all()
+
+
+def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
+    """3-4 chamfer distance by relaxation until nothing changes."""
+    distance = np.where(mask, 0, 10**6)
+    while True:
+        padded = np.pad(distance, 1, constant_values=10**6)
+        shifted = [
+            padded[1 + dv : 41 + dv, 1 + du : 61 + du] + (3 if 0 in (dv, du) else 4)
+            for dv in (-1, 0, 1)
+            for du in (-1, 0, 1)
+            if (dv, du) != (0, 0)
+        ]
+        relaxed = np.minimum(distance, np.min(shifted, axis=0))
+        if (relaxed == distance).all():
+            return distance
+        distance = relaxed
+
+
+def test_depth_in_mask_ignores_pixels_without_a_reading():
+    mask = np.zeros((1, 40, 60), bool)
+    mask[0, 10:31, 20:41] = True
+    depth = np.ones((40, 60))
+    depth[20, 30] = 0  # a hole in the middle of the mask is no border
+    frame = frame_of(depth)
+    around = neighborhoods(clusters_of(mask, frame), frame, 0.25, 4, 12)
+    inside = np.zeros((40, 60))
+    inside[np.nonzero(mask[0] & (depth > 0))] = around.depth_in_mask[: around.mask_counts[0]]
+    assert inside[20, 29] == 10.0
+    assert inside[10, 30] == 1.0
+    assert around.depth_in_mask.min() == -around.ring_widths[0]
+
+
+def test_thinned_keeps_every_nth_point():
+    masks, frame = random_scene(1)
+    around = neighborhoods(clusters_of(masks, frame), frame, 0.25, 4, 12)
+    thin = around.thinned(50)
+    counts = np.diff(around.starts)
+    for k, step in enumerate(np.maximum(-(-counts // 50), 1)):
+        own = slice(around.starts[k], around.starts[k + 1])
+        np.testing.assert_array_equal(
+            thin.points_camera[thin.starts[k] : thin.starts[k + 1]], around.points_camera[own][::step]
+        )
+        is_mask = thin.source[thin.starts[k] : thin.starts[k + 1]] >= 0
+        assert is_mask.sum() == thin.mask_counts[k]
+
+
+def test_nothing_at_all():
+    frame = frame_of(np.zeros((40, 60)))
+    around = neighborhoods(clusters_of(np.zeros((0, 40, 60), bool), frame), frame, 0.25, 4, 12)
+    assert len(around) == 0
+    around = neighborhoods(clusters_of(np.ones((2, 40, 60), bool), frame), frame, 0.25, 4, 12)
+    assert around.mask_counts.tolist() == around.ring_counts.tolist() == [0, 0]

@@ -1,0 +1,71 @@
+"""TUM files: what is written is read back, and what is wrong is named with its line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.errors import DataError
+from framework.geometry import exp_se3
+from framework.trajectory_file import read_tum, write_tum
+
+GOOD = "0.0 1 2 3 0 0 0 1\n"
+
+
+def test_round_trip(tmp_path):
+    rng = np.random.default_rng(0)
+    poses = [exp_se3(rng.normal(0, 2, 6)) for _ in range(20)]
+    timestamps = 1.7e9 + np.arange(20) / 30
+    write_tum(tmp_path / "trajectory.txt", timestamps, poses)
+    read_timestamps, read_poses = read_tum(tmp_path / "trajectory.txt")
+    np.testing.assert_allclose(read_timestamps, timestamps, atol=1e-6)
+    np.testing.assert_allclose(read_poses, poses, atol=1e-9)
+    assert [path.name for path in tmp_path.iterdir()] == ["trajectory.txt"]
+
+
+def test_known_line(tmp_path):
+    """A quarter turn about z: x goes to y."""
+    path = tmp_path / "t.txt"
+    path.write_text(f"# {'timestamp tx ty tz qx qy qz qw'}\n\n 0.5 1 2 3 0 0 {np.sqrt(0.5)} {np.sqrt(0.5)}\r\n")
+    timestamps, poses = read_tum(path)
+    assert timestamps.tolist() == [0.5]
+    np.testing.assert_allclose(poses[0], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
+
+
+def test_empty(tmp_path):
+    write_tum(tmp_path / "t.txt", [], [])
+    timestamps, poses = read_tum(tmp_path / "t.txt")
+    assert (timestamps.shape, poses.shape) == ((0,), (0, 4, 4))
+
+
+@pytest.mark.parametrize(
+    ("bad", "message"),
+    [
+        ("1.0 1 2 3 0 0 0\n", "line 3: expected 8 numbers .* found 7"),
+        ("1.0 1 2 3 0 0 0 one\n", "line 3: expected 8 numbers .*'one'"),
+        ("1.0 1 nan 3 0 0 0 1\n", "line 3: expected finite numbers"),
+        ("1.0 1 2 3 0 0 0 0\n", "line 3: qx qy qz qw must have length 1"),
+        ("0.0 1 2 3 0 0 0 1\n", "line 3: timestamps must grow"),
+    ],
+)
+def test_faults_name_file_and_line(tmp_path, bad, message):
+    path = tmp_path / "t.txt"
+    path.write_text("# comment\n" + GOOD + bad)
+    with pytest.raises(DataError, match=f"t.txt, {message}"):
+        read_tum(path)
+
+
+def test_unreadable_files(tmp_path):
+    with pytest.raises(DataError, match="does not exist"):
+        read_tum(tmp_path / "missing.txt")
+    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(DataError, match="could not be read as text"):
+        read_tum(tmp_path / "binary.txt")
+
+
+def test_nothing_is_left_of_a_failed_write(tmp_path):
+    with pytest.raises(DataError, match="pose 1"):
+        write_tum(tmp_path / "t.txt", [0.0, 1.0], [np.eye(4), 2 * np.eye(4)])
+    with pytest.raises(DataError, match="1 timestamps for 2 poses"):
+        write_tum(tmp_path / "t.txt", [0.0], [np.eye(4), np.eye(4)])
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,230 @@
+"""The shrinking refiners on a toy scene: a box on a floor before a wall, under a mask that bleeds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.errors import ConfigError
+from framework.geometry import exp_se3, lift
+from framework.interfaces import ClusterRefiner
+from plugins.refiners.gmm_em import GmmEm
+from plugins.refiners.identity import Identity
+from plugins.refiners.kmeans import KMeans
+from plugins.refiners.largest_component import LargestComponent
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+REFINERS: list[Callable[[], ClusterRefiner]] = [Identity, GmmEm, KMeans, LargestComponent]
+T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))
+
+
+def room(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) m with 1 % noise, and the true ids: 0 wall at 3 m and floor 0.8 m below, 1 a box of 0.5 m on it.
+
+    The front of the box is 2 m away; a pole (id 2) stands before its left edge at 1.2 m.
+    """
+    v, u = np.mgrid[:240, :320]
+    ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    with np.errstate(divide="ignore"):
+        floor = np.where(ray_y > 0, 0.8 / ray_y, np.inf)
+    depth = np.minimum(3.0, floor)
+    ids = np.zeros(depth.shape, np.int32)
+    front = (np.abs(2.0 * ray_x) < 0.25) & (2.0 * ray_y > 0.3) & (2.0 * ray_y < 0.8)
+    top_z = 0.3 / np.maximum(ray_y, 1e-9)
+    top = (top_z > 2.0) & (top_z < 2.5) & (np.abs(top_z * ray_x) < 0.25)
+    depth, ids = np.where(front, 2.0, depth), np.where(front, 1, ids)
+    depth, ids = np.where(top, top_z, depth), np.where(top, 1, ids)
+    pole = (np.abs(1.2 * ray_x + 0.16) < 0.02) & (1.2 * ray_y > -0.1)
+    depth, ids = np.where(pole, 1.2, depth), np.where(pole, 2, ids)
+    noise = np.random.default_rng(seed).normal(0, 0.003, depth.shape) * depth
+    return (depth + noise).astype(np.float32), ids.astype(np.int32)
+
+
+def frame_of(depth: np.ndarray, camera: Camera = CAMERA) -> Frame:
+    return Frame(0, 0.0, np.zeros((*camera.shape, 3), np.uint8), depth, camera)
+
+
+def lifted(masks: np.ndarray, frame: Frame) -> PointClusters:
+    n = len(masks)
+    ones = np.ones(n, np.float32)
+    detections = Detections(
+        masks, np.zeros((n, 4), np.float32), ones, np.tile(np.float32([0.25, 0.75]), (n, 1)), ("a", "b")
+    )
+    return lift(detections, frame, Pose(T_WORLD_CAMERA))
+
+
+def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), np.uint8)).astype(bool)
+
+
+def recall_and_rejection(refined: PointClusters, before: PointClusters, ids: np.ndarray) -> tuple[float, float]:
+    """The share of the box's points that is kept and of all others that is dropped, in cluster 0."""
+    right, was_right = (ids[c.pixels[c.cluster == 0, 1], c.pixels[c.cluster == 0, 0]] == 1 for c in (refined, before))
+    return right.sum() / was_right.sum(), 1 - (~right).sum() / (~was_right).sum()
+
+
+@pytest.mark.parametrize("px", [4, 6, 8])
+def test_gmm_em_takes_the_bleeding_away(px):
+    """Pole, floor and wall around the box are dropped, both faces of the box stay: better than the alternatives."""
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(bleeding(ids == 1, px)[None], frame)
+    recall, rejection = recall_and_rejection(GmmEm().refine(before, frame), before, ids)
+    assert recall > 0.97
+    assert rejection > 0.95
+    for other in (KMeans(), LargestComponent(), GmmEm(mask_log_odds=0.0)):
+        other_recall, other_rejection = recall_and_rejection(other.refine(before, frame), before, ids)
+        assert recall + rejection > other_recall + other_rejection, other
+
+
+@pytest.mark.parametrize("make", REFINERS)
+def test_only_shrinks_and_keeps_what_belongs_to_a_point(make):
+    depth, ids = room()
+    depth[100:110, 150:160] = 0
+    frame = frame_of(depth)
+    masks = np.stack([bleeding(ids == 1, 8), np.zeros_like(ids, bool), bleeding(ids == 2, 3), ids == 1])
+    before = lifted(masks, frame)
+    after = make().refine(before, frame)
+    assert len(after) == len(before) == 4
+    np.testing.assert_array_equal(after.scores, before.scores)
+    np.testing.assert_array_equal(after.class_probabilities, before.class_probabilities)
+    assert after.classes == before.classes
+    known = {
+        (int(k), *pixel): tuple(point)
+        for k, pixel, point in zip(before.cluster, before.pixels.tolist(), before.points_world.tolist(), strict=True)
+    }
+    for k, pixel, point in zip(after.cluster, after.pixels.tolist(), after.points_world.tolist(), strict=True):
+        assert known[(int(k), *pixel)] == tuple(point)
+    assert set(np.unique(after.cluster)) == {0, 2, 3}
+
+
+@pytest.mark.parametrize("make", REFINERS)
+def test_does_not_depend_on_the_order_of_points_or_clusters_or_on_other_clusters(make):
+    depth, ids = room()
+    frame = frame_of(depth)
+    masks = np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)])
+    both, first = lifted(masks, frame), lifted(masks[:1], frame)
+    refined = make().refine(both, frame)
+    alone = make().refine(first, frame)
+    np.testing.assert_array_equal(refined.pixels[refined.cluster == 0], alone.pixels)
+    swapped = make().refine(lifted(masks[::-1], frame), frame)
+    np.testing.assert_array_equal(swapped.pixels[swapped.cluster == 1], alone.pixels)
+
+
+@pytest.mark.parametrize("make", REFINERS)
+def test_same_result_with_one_thread_and_with_two(make):
+    numba = pytest.importorskip("numba")
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)]), frame)
+    threads = numba.get_num_threads()
+    results = []
+    try:
+        for n in {1, threads}:
+            numba.set_num_threads(n)
+            results.append(make().refine(before, frame).pixels)
+    finally:
+        numba.set_num_threads(threads)
+    for result in results[1:]:
+        np.testing.assert_array_equal(results[0], result)
+
+
+@pytest.mark.parametrize("make", REFINERS)
+def test_degenerate_input(make):
+    refiner = make()
+    depth, ids = room()
+    nothing = lifted(np.zeros((0, 240, 320), bool), frame_of(depth))
+    assert len(refiner.refine(nothing, frame_of(depth))) == 0
+    blind = frame_of(np.zeros_like(depth))
+    empty = refiner.refine(lifted(np.ones((2, 240, 320), bool), blind), blind)
+    assert (len(empty), len(empty.points_world)) == (2, 0)
+    whole = lifted(np.ones((1, 240, 320), bool), frame_of(depth))
+    assert len(refiner.refine(whole, frame_of(depth)).points_world) > 0
+    flat = frame_of(np.full_like(depth, 2.0))
+    on_wall = refiner.refine(lifted((ids == 1)[None], flat), flat)
+    assert len(on_wall) == 1, "object and background in one plane: no crash, whatever is kept"
+
+
+@pytest.mark.parametrize("make", [GmmEm, KMeans])
+def test_too_little_to_tell_is_left_alone(make):
+    depth, ids = room()
+    tiny = np.zeros((1, 240, 320), bool)
+    tiny[0, 100:105, 150:155] = True
+    frame = frame_of(depth)
+    assert len(make().refine(lifted(tiny, frame), frame).pixels) == 25, "fewer than min_points"
+    lonely = frame_of(np.where(ids == 1, depth, 0).astype(np.float32))
+    box = lifted((ids == 1)[None], lonely)
+    assert len(make().refine(box, lonely).pixels) == (ids == 1).sum(), "a ring without readings"
+
+
+def test_points_of_no_cluster_stay():
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(bleeding(ids == 1, 8)[None], frame)
+    cluster = before.cluster.copy()
+    cluster[::7] = -1
+    unassigned = PointClusters(
+        before.points_world, before.pixels, cluster, before.class_probabilities, before.scores, before.classes
+    )
+    for make in REFINERS:
+        assert (make().refine(unassigned, frame).cluster == -1).sum() == (cluster == -1).sum()
+
+
+def test_largest_component_keeps_the_larger_of_two_pieces():
+    """Two pieces beside each other, 1 m and 1.2 m away; the gap allowed at 1 m is 0.05 m."""
+    camera = Camera(40, 20, 50.0, 50.0, 19.5, 9.5)
+    depth = np.full((20, 40), 1.0, np.float32)
+    depth[:, 25:] = 1.2
+    mask = np.ones((1, 20, 40), bool)
+    frame = frame_of(depth, camera)
+    kept = LargestComponent(gap=0.03, gap_per_depth=0.02).refine(lifted(mask, frame), frame)
+    assert set(kept.pixels[:, 0].tolist()) == set(range(25))
+    assert len(kept.pixels) == 25 * 20
+    joined = LargestComponent(gap=0.03, gap_per_depth=0.2).refine(lifted(mask, frame), frame)
+    assert len(joined.pixels) == 40 * 20
+
+
+@pytest.mark.parametrize(("reach", "kept"), [(1, 20), (2, 39)])
+def test_largest_component_bridges_missing_readings(reach, kept):
+    camera = Camera(40, 1, 50.0, 50.0, 19.5, 0.0)
+    depth = np.full((1, 40), 1.0, np.float32)
+    depth[0, 20] = 0
+    frame = frame_of(depth, camera)
+    refined = LargestComponent(reach=reach).refine(lifted(np.ones((1, 1, 40), bool), frame), frame)
+    assert len(refined.pixels) == kept
+
+
+def test_largest_component_is_that_of_scipy():
+    from scipy.ndimage import label
+
+    rng = np.random.default_rng(0)
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    frame = frame_of(np.ones((48, 64), np.float32), camera)
+    for _ in range(10):
+        mask = rng.random((48, 64)) < 0.42
+        pieces, _ = label(mask, structure=np.ones((3, 3)))
+        largest = pieces == 1 + np.bincount(pieces[mask] - 1).argmax()
+        refined = LargestComponent(reach=1).refine(lifted(mask[None], frame), frame)
+        found = np.zeros_like(mask)
+        found[refined.pixels[:, 1], refined.pixels[:, 0]] = True
+        np.testing.assert_array_equal(found, largest)
+
+
+@pytest.mark.parametrize(
+    ("make", "parameters", "message"),
+    [
+        (GmmEm, {"object_components": 0}, "GmmEm: object_components must be in"),
+        (GmmEm, {"std_floor": float("nan")}, "std_floor .* found nan"),
+        (GmmEm, {"min_posterior": 1.0}, "min_posterior"),
+        (GmmEm, {"min_ring": 20}, r"max_ring must be in \[20, 80\], found 12"),
+        (KMeans, {"background_centers": 0}, "KMeans: background_centers"),
+        (LargestComponent, {"reach": 0}, "LargestComponent: reach"),
+    ],
+)
+def test_parameters_are_checked(make, parameters, message):
+    with pytest.raises(ConfigError, match=message):
+        make(**parameters)
