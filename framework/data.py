@@ -128,6 +128,7 @@ class Detections:
     scores: Float32  # (N,) in [0, 1]
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     classes: tuple[str, ...]  # names of the C columns
+    exact: bool = False  # the masks are the objects' true outlines: refiners have nothing to clean
 
     def __post_init__(self) -> None:
         n, c = len(self.scores), len(self.classes)
@@ -165,6 +166,7 @@ class PointClusters:
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     scores: Float32  # (N,) in [0, 1]
     classes: tuple[str, ...]  # names of the C columns
+    exact: bool = False  # as in Detections
 
     def __post_init__(self) -> None:
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)

@@ -90,4 +90,5 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
         class_probabilities=detections.class_probabilities,
         scores=detections.scores,
         classes=detections.classes,
+        exact=detections.exact,
     )

@@ -80,7 +80,10 @@ class ClusterRefiner(ABC):
 
     @abstractmethod
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        """Points in, points out. `pixels` say where in `frame` each point was seen; N may change."""
+        """Points in, points out. `pixels` say where in `frame` each point was seen; N may change.
+
+        Clusters that are `exact` come back as they are: cleaning the truth could only damage it.
+        """
 
 
 class MapFuser(ABC):

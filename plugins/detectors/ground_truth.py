@@ -35,4 +35,5 @@ class GroundTruthDetector(Detector):
             scores=np.ones(len(truth), np.float32),
             class_probabilities=np.eye(len(self.classes), dtype=np.float32)[truth.class_ids],
             classes=self.classes,
+            exact=True,
         )

@@ -60,6 +60,8 @@ class GmmEm(ClusterRefiner):
         check_bounds(self, "min_points", 10, 10**9)
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        if clusters.exact:
+            return clusters
         around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
         sample = around.thinned(self.max_points)
         mixtures = mixture.fit(

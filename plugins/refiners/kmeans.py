@@ -44,6 +44,8 @@ class KMeans(ClusterRefiner):
         check_bounds(self, "min_points", 10, 10**9)
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        if clusters.exact:
+            return clusters
         around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
         sample = around.thinned(self.max_points)
         _, centers = lloyd.cluster(sample.points_camera, sample.starts, self._start(sample), self.max_iterations)

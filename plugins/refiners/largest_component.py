@@ -37,6 +37,8 @@ class LargestComponent(ClusterRefiner):
         check_bounds(self, "reach", 1, 16)
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        if clusters.exact:
+            return clusters
         order, firsts = grouped(clusters.cluster, len(clusters))
         kept = clusters.cluster < 0  # points of no cluster are nobody's piece
         _keep_largest(clusters.pixels, order, firsts, frame.depth, self.gap, self.gap_per_depth, self.reach, kept)
