@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Float64, Frame, Int32, PointClusters, Pose
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 from framework.interfaces import MapFuser
 from framework.mapping.association import (
     Overlaps,
@@ -24,6 +24,7 @@ from framework.mapping.evidence import NEW_CLASSES, Measurement
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.integration import Integrator
 from framework.mapping.sensor import Sensor, pinhole
+from framework.parameters import check_bounds
 
 
 @dataclass
@@ -53,31 +54,30 @@ class BayesianTsdf(MapFuser):
     min_vertices: int = 30  # mesh vertices, >= 1: of an instance that counts
 
     def __post_init__(self) -> None:
-        for name, value, low, high in (
-            ("voxel_size", self.voxel_size, 1e-4, 1.0),
-            ("truncation", self.truncation, 1.0, 100.0),
-            ("truncation_slope", self.truncation_slope, 0.0, 1.0),
-            ("min_depth", self.min_depth, 1e-3, 100.0),
-            ("max_depth", self.max_depth, self.min_depth, 1000.0),
-            ("max_weight", self.max_weight, 1.0, 255.0),
-            ("full_weight_depth", self.full_weight_depth, 1e-3, 1000.0),
-            ("max_blocks", self.max_blocks, 1, 2**31 // 512),
-            ("label_band", self.label_band, 1.0, self.truncation),
-            ("overlap", self.overlap, 0.0, 1.0),
-            ("create_score", self.create_score, 0.0, 1.0),
-            ("create_points", self.create_points, 1, 2**31),
-            ("duplicate_overlap", self.duplicate_overlap, 0.0, 1.0),
-            ("merge_overlap", self.merge_overlap, 0.0, 1.0),
-            ("merge_frames", self.merge_frames, 1, 2**31),
-            ("class_floor", self.class_floor, 1e-6, 0.999),
-            ("instance_floor", self.instance_floor, 1e-6, 0.999),
-            ("absence", self.absence, 1e-6, 1.0),
-            ("min_observations", self.min_observations, 1, 2**31),
-            ("min_confidence", self.min_confidence, 0.0, 1.0),
-            ("min_vertices", self.min_vertices, 1, 2**31),
-        ):
-            if not low <= value <= high:
-                raise ConfigError(f"fuser.{name} must be in [{low}, {high}], found {value}")
+        check_bounds(
+            self,
+            voxel_size=(1e-4, 1.0),
+            truncation=(1.0, 100.0),
+            truncation_slope=(0.0, 1.0),
+            min_depth=(1e-3, 100.0),
+            max_depth=(self.min_depth, 1000.0),
+            max_weight=(1.0, 255.0),
+            full_weight_depth=(1e-3, 1000.0),
+            max_blocks=(1, 2**31 // 512),
+            label_band=(1.0, self.truncation),
+            overlap=(0.0, 1.0),
+            create_score=(0.0, 1.0),
+            create_points=(1, 2**31),
+            duplicate_overlap=(0.0, 1.0),
+            merge_overlap=(0.0, 1.0),
+            merge_frames=(1, 2**31),
+            class_floor=(1e-6, 0.999),
+            instance_floor=(1e-6, 0.999),
+            absence=(1e-6, 1.0),
+            min_observations=(1, 2**31),
+            min_confidence=(0.0, 1.0),
+            min_vertices=(1, 2**31),
+        )
         sensor = Sensor(
             truncation=np.float32(self.truncation * self.voxel_size),
             truncation_slope=np.float32(self.truncation_slope),

@@ -8,8 +8,8 @@ import numpy as np
 
 from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters
 from framework.interfaces import ClusterRefiner
+from framework.parameters import check_bounds
 from framework.refinement import lloyd, mixture
-from framework.refinement.bounds import check_bounds
 from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, neighborhoods
 from framework.refinement.selection import keep_points
 
@@ -44,20 +44,23 @@ class GmmEm(ClusterRefiner):
     min_points: int = 30  # from 10, smaller clusters or rings are too little for a mixture
 
     def __post_init__(self) -> None:
-        check_bounds(self, "object_components", 1, 64)
-        check_bounds(self, "background_components", 1, 64)
-        check_bounds(self, "max_iterations", 1, 1000)
-        check_bounds(self, "tolerance", 0.0, np.inf)
-        check_bounds(self, "std_floor", 1e-4, 1.0)
-        check_bounds(self, "outlier_fraction", 0.0, 0.99)
-        check_bounds(self, "min_posterior", 1e-6, 1 - 1e-6)
-        check_bounds(self, "mask_log_odds", 0.0, 20.0)
-        check_bounds(self, "expected_bleed", 0.0, 0.99)
-        check_bounds(self, "ring_fraction", 0.0, 10.0)
-        check_bounds(self, "min_ring", 1, MAX_RING_WIDTH)
-        check_bounds(self, "max_ring", self.min_ring, MAX_RING_WIDTH)
-        check_bounds(self, "max_points", 100, 10**9)
-        check_bounds(self, "min_points", 10, 10**9)
+        check_bounds(
+            self,
+            object_components=(1, 64),
+            background_components=(1, 64),
+            max_iterations=(1, 1000),
+            tolerance=(0.0, np.inf),
+            std_floor=(1e-4, 1.0),
+            outlier_fraction=(0.0, 0.99),
+            min_posterior=(1e-6, 1 - 1e-6),
+            mask_log_odds=(0.0, 20.0),
+            expected_bleed=(0.0, 0.99),
+            ring_fraction=(0.0, 10.0),
+            min_ring=(1, MAX_RING_WIDTH),
+            max_ring=(self.min_ring, MAX_RING_WIDTH),
+            max_points=(100, 10**9),
+            min_points=(10, 10**9),
+        )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:

@@ -8,8 +8,8 @@ import numpy as np
 
 from framework.data import Float64, Frame, PointClusters
 from framework.interfaces import ClusterRefiner
+from framework.parameters import check_bounds
 from framework.refinement import lloyd
-from framework.refinement.bounds import check_bounds
 from framework.refinement.neighborhood import MAX_RING_WIDTH, Neighborhoods, neighborhoods
 from framework.refinement.selection import keep_points
 
@@ -34,14 +34,17 @@ class KMeans(ClusterRefiner):
     min_points: int = 30  # from 10, smaller clusters or rings are too little
 
     def __post_init__(self) -> None:
-        check_bounds(self, "object_centers", 1, 64)
-        check_bounds(self, "background_centers", 1, 64)
-        check_bounds(self, "max_iterations", 1, 1000)
-        check_bounds(self, "ring_fraction", 0.0, 10.0)
-        check_bounds(self, "min_ring", 1, MAX_RING_WIDTH)
-        check_bounds(self, "max_ring", self.min_ring, MAX_RING_WIDTH)
-        check_bounds(self, "max_points", 100, 10**9)
-        check_bounds(self, "min_points", 10, 10**9)
+        check_bounds(
+            self,
+            object_centers=(1, 64),
+            background_centers=(1, 64),
+            max_iterations=(1, 1000),
+            ring_fraction=(0.0, 10.0),
+            min_ring=(1, MAX_RING_WIDTH),
+            max_ring=(self.min_ring, MAX_RING_WIDTH),
+            max_points=(100, 10**9),
+            min_points=(10, 10**9),
+        )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:

@@ -10,7 +10,7 @@ from numba import njit, prange
 
 from framework.data import Float32, Frame, Int32, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.refinement.bounds import check_bounds
+from framework.parameters import check_bounds
 from framework.refinement.neighborhood import grouped
 from framework.refinement.selection import keep_points
 
@@ -32,9 +32,12 @@ class LargestComponent(ClusterRefiner):
     reach: int = 2  # px, from 1; 2 bridges single missing readings
 
     def __post_init__(self) -> None:
-        check_bounds(self, "gap", 0.0, np.inf)
-        check_bounds(self, "gap_per_depth", 0.0, np.inf)
-        check_bounds(self, "reach", 1, 16)
+        check_bounds(
+            self,
+            gap=(0.0, np.inf),
+            gap_per_depth=(0.0, np.inf),
+            reach=(1, 16),
+        )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:

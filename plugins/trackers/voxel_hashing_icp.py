@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Float64, Frame, Pose, View
-from framework.errors import ConfigError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
+from framework.parameters import check_bounds
 from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearise
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
@@ -36,26 +36,25 @@ class VoxelHashingIcp(PoseTracker):
     min_information: float = 3e-4  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
 
     def __post_init__(self) -> None:
-        for name, value, low, high in (
-            ("finest", self.finest, 1 / 64, 1.0),
-            ("iterations_coarse", self.iterations_coarse, 0, 1000),
-            ("iterations_middle", self.iterations_middle, 0, 1000),
-            ("iterations_fine", self.iterations_fine, 1, 1000),
-            ("max_distance", self.max_distance, 1e-4, 10.0),
-            ("min_normal_dot", self.min_normal_dot, -1.0, 1.0),
-            ("geometric_scale", self.geometric_scale, 1e-3, 1e3),
-            ("photometric_scale", self.photometric_scale, 1e-3, 1e3),
-            ("intensity_noise", self.intensity_noise, 1e-3, 1.0),
-            ("color_weight", self.color_weight, 0.0, 1e3),
-            ("depth_weight", self.depth_weight, 0.0, 1.0),
-            ("max_step", self.max_step, 1e-3, 100.0),
-            ("max_turn", self.max_turn, 1e-3, 3.15),
-            ("min_visible", self.min_visible, 0.0, 1.0),
-            ("min_matched", self.min_matched, 0.0, 1.0),
-            ("min_information", self.min_information, 0.0, 1.0),
-        ):
-            if not low <= value <= high:
-                raise ConfigError(f"tracker.{name} must be in [{low}, {high}], found {value}")
+        check_bounds(
+            self,
+            finest=(1 / 64, 1.0),
+            iterations_coarse=(0, 1000),
+            iterations_middle=(0, 1000),
+            iterations_fine=(1, 1000),
+            max_distance=(1e-4, 10.0),
+            min_normal_dot=(-1.0, 1.0),
+            geometric_scale=(1e-3, 1e3),
+            photometric_scale=(1e-3, 1e3),
+            intensity_noise=(1e-3, 1.0),
+            color_weight=(0.0, 1e3),
+            depth_weight=(0.0, 1.0),
+            max_step=(1e-3, 100.0),
+            max_turn=(1e-3, 3.15),
+            min_visible=(0.0, 1.0),
+            min_matched=(0.0, 1.0),
+            min_information=(0.0, 1.0),
+        )
         self._weights = Weights(
             max_distance=np.float32(self.max_distance),
             min_normal_dot=np.float32(self.min_normal_dot),
