@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.errors import ConfigError, InstanceMapError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 
-STAGES: Mapping[str, type] = {
+STAGES: Mapping[str, type[Any]] = {
     "dataset": RGBDSequence,
     "detector": Detector,
     "tracker": PoseTracker,
@@ -77,8 +77,8 @@ def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
         fitting = [name for name, value in vars(module).items() if _implements(value, interface)]
         raise ConfigError(f"{where}: module {module_name} has no {class_name}{_did_you_mean(class_name, fitting)}")
     if not _implements(found, interface):
-        kind = "class" if isinstance(found, type) else type(found).__name__
-        raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, found another {kind}")
+        kind = "a class that does not" if isinstance(found, type) else f"a {type(found).__name__}"
+        raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, found {kind}")
     if "__dataclass_fields__" not in vars(found):
         raise ConfigError(f"{where}: a plugin must be a dataclass, and {class_name} is not decorated with @dataclass")
     if inspect.isabstract(found):

@@ -88,13 +88,14 @@ def one_line(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):
-        return f"{error.override!r} is not an override of the form key=value: {_joined(error.message)}"
-    message = _joined(str(error)) or type(error).__name__
-    if isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
-        return f"{_joined(str(error).partition('To append')[0])}{_known_keys(error.__cause__)}"
-    if isinstance(error.__cause__, OmegaConfBaseException):
-        return f"{message} {_joined(str(error.__cause__))}"
-    return message
+        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
+        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return _joined(f"{error} {error.__cause__}")
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return _joined(str(error)) or type(error).__name__
 
 
 def _no_such_option(error: MissingConfigException) -> str:
@@ -103,7 +104,7 @@ def _no_such_option(error: MissingConfigException) -> str:
         return _joined(str(error))
     options = list(error.options or ())
     close = get_close_matches(name, options, n=1)
-    suggestion = f"; did you mean {close[0]}?" if close else ""
+    suggestion = f"; did you mean {close[0]}?" if close else "."
     return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
 
 
@@ -113,8 +114,8 @@ def _known_keys(error: OmegaConfBaseException) -> str:
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)
     if close:
-        return f" There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
-    return f" There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
+        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
 
 
 def _joined(text: str) -> str:

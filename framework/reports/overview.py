@@ -66,7 +66,7 @@ def _panels(
     normals = surface.vertex_normals()
     coarse = surface.seen_by(camera, T_world_camera)
     fine = surface.seen_by(camera.scaled(SUPERSAMPLING), T_world_camera)
-    open_sky = surface.openness(coarse, _normals_seen(coarse, normals, T_world_camera))
+    open_sky = surface.openness(coarse, _normals_seen(coarse, normals, T_world_camera), T_world_camera[:3, 3])
     light = _lighting(fine, _normals_seen(fine, normals, T_world_camera), T_world_camera)
     light *= cv2.resize(open_sky, light.shape[::-1], interpolation=cv2.INTER_LINEAR)
 

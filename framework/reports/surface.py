@@ -118,11 +118,12 @@ class Surface:
             weights=weights.reshape(height, width, 3),
         )
 
-    def openness(self, hits: Hits, normals: Float32) -> Float32:
-        """(H, W) in (0, 1]: how much of the light from around reaches what is seen (ambient occlusion)."""
+    def openness(self, hits: Hits, normals: Float32, eye_world: Float64) -> Float32:
+        """(H, W) in (0, 1]: how much of the light around reaches what the eye (3,) m sees (ambient occlusion)."""
         height, width = hits.depth.shape
         seen = hits.seen
         points, n = hits.points_world[seen], normals[seen]
+        view = points - eye_world.astype(np.float32)
         helper = np.where(np.abs(n[:, :1]) < 0.7, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]).astype(np.float32)
         tangent = np.cross(n, helper)
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-12)
@@ -137,8 +138,8 @@ class Surface:
             around = np.cos(angle)[:, None] * tangent + np.sin(angle)[:, None] * bitangent
             directions = sine * around + np.sqrt(1 - sine**2) * n
             found = self._cast(points + 2e-3 * n, directions)
-            front = (found["primitive_normals"] * directions).sum(axis=1) < 0  # the back sides are not shown either
-            blocked += front & (found["t_hit"] < OCCLUSION_RANGE_M)
+            shown = (found["primitive_normals"] * view).sum(axis=1) < 0  # what is looked through casts no shade
+            blocked += shown & (found["t_hit"] < OCCLUSION_RANGE_M)
         image = np.zeros((height, width), np.float32)
         image[seen] = blocked / OCCLUSION_RAYS
         # the mean over a tile, of the pixels that see something
