@@ -15,7 +15,7 @@ from framework.atomic_files import written_whole
 from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32, UInt8
 from framework.geometry import inverse, project, transform
 from framework.reports.palette import instance_colors
-from framework.reports.surface import Hits, Surface
+from framework.reports.surface import FrontSides, Hits, Surface
 from framework.reports.viewpoint import best_view
 
 PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px
@@ -26,6 +26,7 @@ LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
 PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
+LABEL_MOVES_PIXELS = 1500  # the name of an object that shows less stays on it or is left out
 LABEL_MIN_PIXELS = 250  # an object that shows less gets no name in the picture, only in the legend
 
 
@@ -61,14 +62,14 @@ def overview(mesh: InstanceMesh, instances: Mapping[int, tuple[str, float]], pos
 def _panels(
     mesh: InstanceMesh, ids: Int32, names: Mapping[int, str], colors: Mapping[int, UInt8], poses: Float64
 ) -> UInt8:
-    surface = Surface(mesh.vertices, mesh.triangles).facing(poses)
+    surface = Surface.seen_from(mesh.vertices, mesh.triangles, poses)
     camera, T_world_camera = best_view(surface, ids, poses, PANEL_WIDTH, PANEL_HEIGHT)
-    normals = surface.vertex_normals()
-    coarse = surface.seen_by(camera, T_world_camera)
-    fine = surface.seen_by(camera.scaled(SUPERSAMPLING), T_world_camera)
-    open_sky = surface.openness(coarse, _normals_seen(coarse, normals, T_world_camera), T_world_camera[:3, 3])
-    light = _lighting(fine, _normals_seen(fine, normals, T_world_camera), T_world_camera)
-    light *= cv2.resize(open_sky, light.shape[::-1], interpolation=cv2.INTER_LINEAR)
+    sides = FrontSides(surface, T_world_camera[:3, 3])
+    fine = sides.seen_by(camera.scaled(SUPERSAMPLING), T_world_camera[:3, :3])
+    coarse = fine.every(SUPERSAMPLING)
+    normals = _normals_seen(fine, surface.vertex_normals(), T_world_camera)
+    openness = sides.openness(coarse, normals[::SUPERSAMPLING, ::SUPERSAMPLING])
+    light = _lighting(normals, T_world_camera) * cv2.resize(openness, fine.depth.shape[::-1])
 
     color = fine.interpolated(mesh.colors.astype(np.float32))
     instance_image = fine.nearest(ids)
@@ -99,7 +100,7 @@ def _normals_seen(hits: Hits, vertex_normals: Float32, T_world_camera: Float64) 
     return np.asarray(np.where(away, -normals, normals), np.float32)
 
 
-def _lighting(hits: Hits, normals: Float32, T_world_camera: Float64) -> Float32:
+def _lighting(normals: Float32, T_world_camera: Float64) -> Float32:
     """(H, W) brightness: a soft lamp over the viewer's left shoulder."""
     lamp = T_world_camera[:3, :3] @ np.array([-0.45, -0.75, -0.6])
     lamp /= np.linalg.norm(lamp)
@@ -165,7 +166,7 @@ def _draw_names(image: Image.Image, ids: Int32, names: Mapping[int, str]) -> Non
             break
         v, u = np.argwhere(ids == key).mean(axis=0)
         left, top, right, bottom = canvas.textbbox((u, v), names[key], font, anchor="mm")
-        for shift in (0, -18, 18):
+        for shift in (0, -18, 18) if pixels[key] > LABEL_MOVES_PIXELS else (0,):
             box = (left - 2, top + shift - 1, right + 2, bottom + shift + 1)
             if not any(_overlap(box, other) for other in taken):
                 taken.append(box)

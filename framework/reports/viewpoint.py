@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.data import Camera, Float64, Int32
+from framework.data import Camera, Float32, Float64, Int32
+from framework.geometry import inverse, project, transform
 from framework.reports.surface import Surface
 
 FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, so that far objects are not much smaller than near ones
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
 AZIMUTHS = 16  # candidates around the vertical
 MARGIN = 1.04  # of free space around what is shown
-TRIAL_WIDTH = 120  # px, of the small pictures that candidates are judged by
+TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, of the small pictures that candidates are judged by
+TRIAL_POINTS = 60000  # vertices in those pictures
 LEVEL_CONE_RAD = np.deg2rad(30)  # floors and tables are looked for this near to the cameras' mean upward direction
 
 
@@ -50,21 +52,21 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
     forward /= np.linalg.norm(forward)
     side = np.cross(forward, up)
 
-    trial_height = round(TRIAL_WIDTH * height / width)
-    spread = surface.vertices[:: max(1, len(surface.vertices) // 20000)].astype(np.float64)
-    best, best_score = np.eye(3), -np.inf
+    chosen = slice(None, None, max(1, len(surface.vertices) // TRIAL_POINTS))
+    points, normals = surface.vertices[chosen], surface.vertex_normals()[chosen]
+    best_score, shown = -np.inf, points
+    R = np.eye(3)
     for elevation in ELEVATIONS_RAD:
         for azimuth in 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS:
             level = np.cos(azimuth) * forward + np.sin(azimuth) * side
-            R = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
-            score = _score(surface, instance_ids, *fitted(R, spread, TRIAL_WIDTH, trial_height))
+            R_trial = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
+            visible = _visible(points, normals, *fitted(R_trial, points, TRIAL_WIDTH, TRIAL_HEIGHT))
+            score = _score(instance_ids[chosen][visible])
             score *= 1 + 0.15 * np.cos(azimuth)  # between equals, the way that the cameras looked
             if score > best_score:
-                best, best_score = R, score
-    # frame what is really seen: the ceiling and the near walls, which are looked through, need no room
-    hits = surface.seen_by(*fitted(best, spread, TRIAL_WIDTH, trial_height))
-    shown = hits.points_world[hits.seen].astype(np.float64)
-    return fitted(best, shown if len(shown) else spread, width, height)
+                best_score, R, shown = score, R_trial, points[visible]
+    # framed for what is seen: the ceiling and the near walls, which are looked through, need no room
+    return fitted(R, shown, width, height)
 
 
 def looking(forward: Float64, up: Float64) -> Float64:
@@ -75,7 +77,7 @@ def looking(forward: Float64, up: Float64) -> Float64:
     return np.stack([x, np.cross(z, x), z], axis=1)
 
 
-def fitted(R_world_camera: Float64, points_world: Float64, width: int, height: int) -> tuple[Camera, Float64]:
+def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
     """A camera with this rotation, as near as it can be with the points (P, 3) in its picture of width x height px."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
@@ -93,8 +95,18 @@ def fitted(R_world_camera: Float64, points_world: Float64, width: int, height: i
     return camera, T_world_camera
 
 
-def _score(surface: Surface, instance_ids: Int32, camera: Camera, T_world_camera: Float64) -> float:
-    """How much a view shows. Square roots, so that ten objects in sight are worth more than a large one."""
-    hits = surface.seen_by(camera, T_world_camera)
-    pixels = np.bincount(hits.nearest(instance_ids).ravel())[1:]
-    return float(np.sqrt(pixels).sum() + np.sqrt(hits.seen.sum()))
+def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
+    """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
+    front = np.flatnonzero(((points - T_world_camera[:3, 3]) * normals).sum(axis=1) < 0)
+    local = transform(inverse(T_world_camera), points[front])
+    u, v = np.rint(project(camera, local)).astype(int).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixel, z, front = (v * camera.width + u)[inside], local[inside, 2], front[inside]
+    nearest_first = np.lexsort((z, pixel))
+    _, first = np.unique(pixel[nearest_first], return_index=True)
+    return np.asarray(front[nearest_first][first], np.int32)
+
+
+def _score(instance_ids: Int32) -> float:
+    """How much a picture shows, given its pixels' ids. Square roots: ten objects are worth more than a large one."""
+    return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))
