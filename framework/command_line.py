@@ -52,7 +52,7 @@ def one_line_errors() -> Iterator[None]:
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
-    except KNOWN_ERRORS as error:
+    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
         if "debug=true" in sys.argv:
             traceback.print_exception(error)
         print(f"error: {one_line(error)}", file=sys.stderr)

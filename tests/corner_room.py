@@ -122,8 +122,7 @@ class SphereDetector(Detector):
             raise DataError(f"frame {frame.index} has no true instances: choose a detector that needs none")
         masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
         boxes = [
-            [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0]
-            for v, u in map(np.nonzero, masks)
+            [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
         ]
         sure = np.array([[0.9, 0.1], [0.2, 0.8]], np.float32)
         return Detections(masks, np.array(boxes, np.float32), sure.max(1), sure, CLASSES)

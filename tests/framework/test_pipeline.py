@@ -59,9 +59,7 @@ def test_an_unreadable_frame_is_skipped(ahead: int, caplog: pytest.LogCaptureFix
     result = pipeline(ahead).run(CornerRoom(unreadable=2))
     assert (result.frames, result.frames_skipped) == (6, 1)
     assert [frame.index for frame in result.tracked] == [0, 1, 3, 4, 5]
-    assert [record.message for record in caplog.records] == [
-        "frame skipped: frame 2: depth/000002.png is truncated"
-    ]
+    assert [record.message for record in caplog.records] == ["frame skipped: frame 2: depth/000002.png is truncated"]
 
 
 @AHEAD
