@@ -60,7 +60,7 @@ def registered(stage: str) -> Iterator[Option]:
 
 
 def _option(stage: str, name: str, provider: str, node: DictConfig, text: str) -> Option:
-    target = str(OmegaConf.to_container(node).get("_target_"))  # type: ignore[union-attr]
+    target = str(node.get("_target_"))
     try:
         plugin_class = find_class(STAGES[stage], target)
     except ConfigError as error:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+
 from framework.atomic_files import written_whole
 from framework.data import (
     Box,

@@ -8,11 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
+
 from framework.build import STAGES, build, find_class
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker
-from omegaconf import OmegaConf
 
 HERE = "build_targets"
 

@@ -5,13 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from corner_room import CornerRoom, pose_at
-from framework import geometry
-from framework.data import Camera, Detections, Frame, Pose
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
+
+from framework import geometry
+from framework.data import Camera, Detections, Frame, Pose
 
 twists = arrays(np.float64, 6, elements=st.floats(-3, 3, width=32))
 CAMERA = Camera(64, 48, 50.0, 52.0, 30.5, 24.25)

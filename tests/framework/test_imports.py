@@ -10,7 +10,7 @@ import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = ["errors", "data", "geometry", "interfaces", "mapping", "journal", "pipeline", "reports"]
-"""From the ground up: a module imports nothing from a layer above its own. Modules not named here stand beside these."""
+"""From the ground up: a module imports nothing from a layer above its own; modules not named here stand beside."""
 
 OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pycocotools", "pandas", "defusedxml"}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
@@ -36,7 +36,7 @@ def at_module_level(tree: ast.Module) -> Iterator[str]:
 
 
 def layer(module: str) -> int | None:
-    part = (module.split(".") + [""])[1]
+    part = module.partition(".")[2].partition(".")[0]
     return LAYERS.index(part) if part in LAYERS else None
 
 
