@@ -34,10 +34,8 @@ def exp_se3(xi: Float64) -> Float64:
     W = skew(phi)
     A = np.sinc(theta / np.pi)  # sin(theta) / theta
     B = np.sinc(theta / 2 / np.pi) ** 2 / 2  # (1 - cos(theta)) / theta^2, which would cancel
-    if theta < 1e-2:  # C = (theta - sin(theta)) / theta^3 as a series: the difference would cancel, theta^6 is lost
-        C = 1 / 6 - theta**2 / 120 + theta**4 / 5040
-    else:
-        C = (theta - np.sin(theta)) / theta**3
+    # (theta - sin(theta)) / theta^3, as a series where the difference would cancel: what it leaves out is theta^6
+    C = (theta - np.sin(theta)) / theta**3 if theta > 1e-2 else 1 / 6 - theta**2 / 120 + theta**4 / 5040
     T = np.eye(4)
     T[:3, :3] = np.eye(3) + A * W + B * W @ W
     T[:3, 3] = (np.eye(3) + B * W + C * W @ W) @ rho
