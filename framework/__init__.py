@@ -4,6 +4,7 @@ import os
 
 __version__ = "0.1.0"
 
-# Before numba is imported: OpenMP first, which may be entered by several threads at once and is on every machine that
-# Open3D runs on; numba's own first choice, TBB, is often found too old and then complained about on every start.
-os.environ.setdefault("NUMBA_THREADING_LAYER_PRIORITY", "omp tbb workqueue")
+# The detector's thread and the mapping thread both launch parallel kernels. Of numba's threading layers only OpenMP
+# and TBB allow that; OpenMP comes with torch's requirements, TBB does not, and an old one on the system only gives a
+# warning.
+os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
