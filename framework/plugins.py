@@ -24,7 +24,7 @@ from framework.build import STAGES, find_class
 from framework.command_line import CONF, one_line_errors
 from framework.errors import ConfigError
 
-_COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#]*#\s*(?P<comment>.*\S)\s*$", re.MULTILINE)
+_COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from corner_room import CornerRoom
+
+from tests.corner_room import CornerRoom
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 

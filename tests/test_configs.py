@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import pytest
-import registered
 from omegaconf import OmegaConf
 
 from framework.build import STAGES
 from framework.command_line import CONF
 from framework.errors import ConfigError, DataError
 from framework.plugins import registered as options_of
+from tests import registered
 
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)

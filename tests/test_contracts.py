@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import registered
-from corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 
 from framework.data import Detections, Frame, FrameTruth, PointClusters, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from tests import registered
+from tests.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 
 
 def built(stage: str, name: str) -> Any:
@@ -26,7 +26,10 @@ def built(stage: str, name: str) -> Any:
 
 def same(a: object, b: object) -> bool:
     """Whether two of the pipeline's data hold the same arrays."""
-    return all(np.array_equal(x, y) for x, y in zip(vars(a).values(), vars(b).values(), strict=True))
+    return all(
+        same(x, y) if is_dataclass(x) else np.array_equal(x, y)
+        for x, y in zip(vars(a).values(), vars(b).values(), strict=True)
+    )
 
 
 # Datasets

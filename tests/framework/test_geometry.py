@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from corner_room import CornerRoom, pose_at
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -13,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from framework import geometry
 from framework.data import Camera, Detections, Frame, Pose
+from tests.corner_room import CornerRoom, pose_at
 
 twists = arrays(np.float64, 6, elements=st.floats(-3, 3, width=32))
 CAMERA = Camera(64, 48, 50.0, 52.0, 30.5, 24.25)

@@ -23,8 +23,8 @@ def command(*arguments: str) -> list[str]:
 
 
 def environment() -> dict[str, str]:
-    path = os.pathsep.join([str(CHECKOUT), str(CHECKOUT / "tests")])
-    return {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"} | {"PYTHONPATH": path}
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    return clean | {"PYTHONPATH": str(CHECKOUT)}
 
 
 def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.CompletedProcess[str]:
@@ -39,8 +39,8 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
     ("override", "said"),
     [
         ("detector=fakke", ["there is no detector=fakke; did you mean fake?", "The options are:"]),
-        ("dataset.frames=many", ["ERROR", "dataset corner_room.CornerRoom", "frames", "'many'", "Integer"]),
-        ("refiner._target_=corner_room.GivenPose", ["ERROR", "refiner", "ClusterRefiner"]),
+        ("dataset.frames=many", ["ERROR", "dataset tests.corner_room.CornerRoom", "frames", "'many'", "Integer"]),
+        ("refiner._target_=tests.corner_room.GivenPose", ["ERROR", "refiner", "ClusterRefiner"]),
         ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
         ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
         ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),
