@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 
 from framework.build import STAGES, build
 from framework.command_line import CONF
-from framework.plugins from tests import registered
+from framework.plugins import registered
 
 OPTIONS = [(stage, option.name) for stage in STAGES for option in registered(stage)]
 
