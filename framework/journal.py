@@ -37,8 +37,7 @@ class TrackedFrame:
 
     index: int  # Frame.index
     timestamp: float  # s
-    T_world_camera: Float64  # (4, 4); for a lost frame the last pose that was trusted
-    lost: bool
+    pose: Pose
     T_world_camera_truth: Float64 | None  # (4, 4)
 
 
@@ -57,7 +56,7 @@ class RunResult:
     @property
     def frames_lost(self) -> int:
         """Frames that were not fused because the tracker could not tell their pose."""
-        return sum(frame.lost for frame in self.tracked)
+        return sum(frame.pose.lost for frame in self.tracked)
 
     @property
     def fps(self) -> float:
@@ -122,9 +121,7 @@ class Journal:
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
         """Keeps the pose; says when tracking gets lost and when it is found again."""
-        self.tracked.append(
-            TrackedFrame(frame.index, frame.timestamp, pose.T_world_camera, pose.lost, frame.T_world_camera)
-        )
+        self.tracked.append(TrackedFrame(frame.index, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
             if not self._lost_for:
                 log.warning("frame %d: lost: %s", frame.index, pose.reason or "the tracker gave no reason")

@@ -7,6 +7,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from framework.data import Instance, InstanceMesh
+from framework.evaluation import instances, trajectory
+from framework.evaluation.instances import PredictedInstances
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
 
@@ -35,42 +37,31 @@ def run_metrics(result: RunResult) -> Metrics:
 
 def pose_source(result: RunResult) -> str:
     """`ground_truth` where each pose is exactly the frame's true one, so that nothing was tracked; else `tracked`."""
-    given = [
-        frame.T_world_camera_truth is not None and np.array_equal(frame.T_world_camera, frame.T_world_camera_truth)
+    exact = [
+        frame.T_world_camera_truth is not None and np.array_equal(frame.pose.T_world_camera, frame.T_world_camera_truth)
         for frame in result.tracked
     ]
-    return "ground_truth" if given and all(given) else "tracked"
+    return "ground_truth" if exact and all(exact) else "tracked"
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
-    """The error of the poses that were not lost; nothing where fewer than two true poses are known."""
-    known = [
-        (frame.T_world_camera, frame.T_world_camera_truth)
-        for frame in result.tracked
-        if not frame.lost and frame.T_world_camera_truth is not None
-    ]
-    if len(known) < 2:
-        return {}
-    from framework.evaluation.trajectory import evaluate_trajectory
-
-    estimated, truth = (np.stack(poses) for poses in zip(*known, strict=True))
-    error = evaluate_trajectory(estimated, truth)
-    return {"trajectory.ate_rmse_m": error.ate_rmse_m, "trajectory.rpe_rmse_m": error.rpe_rmse_m}
+    """The error of the poses that were not lost; nothing where no true pose is known."""
+    error = trajectory.evaluate(
+        reference=[frame.T_world_camera_truth for frame in result.tracked],
+        estimated=[frame.pose for frame in result.tracked],
+    )
+    return dict(error.metrics())
 
 
 def instance_metrics(
-    sequence: RGBDSequence, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: tuple[str, ...]
+    sequence: RGBDSequence, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> Metrics:
     """How many instances were found and, where the true ones are known, how well."""
-    count: Metrics = {"instances.count": len(instances)}
+    count: Metrics = {"instances.count": len(found)}
     truth = sequence.scene_truth()
     if truth is None:
         return count
-    from framework.evaluation.instances import evaluate_instances
-
-    found = {instance.id: (class_name(instance, classes) or "", instance.confidence) for instance in instances.values()}
-    evaluation = evaluate_instances(mesh.vertices, mesh.instance_ids, found, truth)
-    return {**count, **evaluation.metrics()}
+    return count | instances.evaluate(PredictedInstances.of_map(mesh, found, classes), truth).metrics()
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:

@@ -61,8 +61,8 @@ class RunRecord:
         scene, classes = result.scene, result.scene.classes
         mesh, instances = scene.mesh(), scene.instances()
         names = {key: class_name(instance, classes) for key, instance in instances.items()}
-        trusted = [frame for frame in result.tracked if not frame.lost]
-        poses = np.array([frame.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
+        trusted = [frame for frame in result.tracked if not frame.pose.lost]
+        poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         metrics: Metrics = {
             "sequence": sequence.name,
             **{f"choice.{group}": self.choices.get(group) for group in STAGES},

@@ -35,7 +35,7 @@ def test_maps_every_frame_in_order(room: CornerRoom, ahead: int) -> None:
     result = pipeline(ahead).run(room)
     assert (result.frames, result.frames_lost, result.frames_skipped, result.stopped_by) == (6, 0, 0, None)
     assert [frame.index for frame in result.tracked] == list(range(6))
-    np.testing.assert_array_equal(result.tracked[5].T_world_camera, pose_at(5))
+    np.testing.assert_array_equal(result.tracked[5].pose.T_world_camera, pose_at(5))
     assert set(mapped(result).instances()) == {1, 2}
     assert result.fps == pytest.approx(6 / result.seconds)
     for stage in ("read", "detect", "track", "lift", "refine", "fuse"):
@@ -105,7 +105,7 @@ def test_a_sequence_without_a_usable_frame_is_an_error() -> None:
 def test_lost_frames_are_counted_and_not_fused(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
     result = pipeline(tracker=GivenPose(lost_from=2, lost_to=5)).run(room)
     assert (result.frames, result.frames_lost, len(mapped(result).vertices)) == (6, 3, 3)
-    assert [frame.lost for frame in result.tracked] == [False, False, True, True, True, False]
+    assert [frame.pose.lost for frame in result.tracked] == [False, False, True, True, True, False]
     assert [record.message for record in caplog.records] == [
         "frame 2: lost: too few points associate",
         "frame 5: tracked again after 3 lost frames",
