@@ -16,7 +16,7 @@ import numpy as np
 from omegaconf import DictConfig
 from threadpoolctl import threadpool_limits
 
-from framework.build import build
+from framework.build import STAGES, build
 from framework.errors import ConfigError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from framework.journal import RunResult
@@ -44,6 +44,8 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
         ahead=config.ahead,
     )
     record = RunRecord.begin(directory, config, choices)
+    chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
+    log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)
     result = pipeline.run(sequence)
     record.write(sequence, result)
     if result.stopped_by is not None:
