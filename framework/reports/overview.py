@@ -23,6 +23,7 @@ SUPERSAMPLING = 2  # rays per pixel in either direction
 TITLE_HEIGHT = 56  # px
 LEGEND_ROW = 30  # px
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
+NOTHING = (229, 232, 236)  # where nothing was mapped: a shade off the paper, as mapped things may be white
 PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
@@ -120,7 +121,7 @@ def _borders(ids: Int32) -> Bool:
 
 def _developed(color: Float32, light: Float32, hits: Hits) -> UInt8:
     """The lit picture on paper, (H, W, 3), scaled down to the panel."""
-    lit = np.where(hits.seen[..., None], np.clip(color * light[..., None], 0, 255), np.array(PAPER, np.float32))
+    lit = np.where(hits.seen[..., None], np.clip(color * light[..., None], 0, 255), np.array(NOTHING, np.float32))
     panel = cv2.resize(lit.astype(np.float32), (PANEL_WIDTH, PANEL_HEIGHT), interpolation=cv2.INTER_AREA)
     return np.asarray(panel, np.uint8)
 
