@@ -17,11 +17,10 @@ from framework.reports.surface import FrontSides, Surface
 from framework.reports.viewpoint import best_view, fitted, looking, upward
 
 RNG = np.random.default_rng(0)
-Z_UP, Y_UP, Y_DOWN = (
-    np.eye(3),
-    np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]),
-    np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]),
-)
+Z_UP = np.eye(3)
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+Triangles = tuple[np.ndarray, np.ndarray]
 
 
 def box(
@@ -92,7 +91,7 @@ def test_a_ray_sees_the_nearest_front_at_its_exact_depth() -> None:
 
 def test_walls_and_ceiling_between_the_eye_and_the_room_are_looked_through() -> None:
     mesh = furnished()
-    camera, R = Camera(9, 9, 30.0, 30.0, 4.0, 4.0), looking(np.array([0.0, 0.1, -1.0]), np.array([0.0, 0, 1]))
+    camera, R = Camera(9, 9, 60.0, 60.0, 4.0, 4.0), looking(np.array([0.0, 0.1, -1.0]), np.array([0.0, 0, 1]))
     hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([0.0, -0.5, 5.0])).seen_by(camera, R)
     np.testing.assert_allclose(hits.points_world[..., 2], 0, atol=1e-4)  # the floor, through the ceiling at 2.5 m
 
@@ -107,10 +106,8 @@ def test_corners_are_darker_than_open_floor() -> None:
     openness = sides.openness(hits, normals)
     x, y, z = np.moveaxis(hits.points_world, -1, 0)
     floor = hits.seen & (np.abs(z) < 1e-3)
-    near_box, free = (
-        floor & (np.abs(x + 0.55) < 0.05) & (np.abs(y) < 0.3),
-        floor & (np.abs(x) < 0.1) & (y < -0.3) & (y > -0.8),
-    )
+    near_box = floor & (np.abs(x + 0.55) < 0.05) & (np.abs(y) < 0.3)
+    free = floor & (np.abs(x) < 0.1) & (y < -0.3) & (y > -0.8)
     assert openness[free].mean() > 0.98
     assert openness[near_box].mean() < 0.85
 
