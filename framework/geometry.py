@@ -32,12 +32,10 @@ def exp_se3(xi: Float64) -> Float64:
     rho, phi = np.asarray(xi[:3], np.float64), np.asarray(xi[3:], np.float64)
     theta = float(np.linalg.norm(phi))
     W = skew(phi)
-    if theta < 1e-8:  # the series' next terms are below double precision
-        A, B, C = 1.0, 0.5, 1.0 / 6.0
-    else:
-        A = np.sin(theta) / theta
-        B = (1.0 - np.cos(theta)) / theta**2
-        C = (theta - np.sin(theta)) / theta**3
+    A = np.sinc(theta / np.pi)  # sin(theta) / theta
+    B = np.sinc(theta / 2 / np.pi) ** 2 / 2  # (1 - cos(theta)) / theta^2, which would cancel
+    # (theta - sin(theta)) / theta^3, as a series where the difference would cancel: what it leaves out is theta^6
+    C = (theta - np.sin(theta)) / theta**3 if theta > 1e-2 else 1 / 6 - theta**2 / 120 + theta**4 / 5040
     T = np.eye(4)
     T[:3, :3] = np.eye(3) + A * W + B * W @ W
     T[:3, 3] = (np.eye(3) + B * W + C * W @ W) @ rho

@@ -14,7 +14,7 @@ registers it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from framework.data import (
@@ -47,6 +47,9 @@ class RGBDSequence(ABC):
     @abstractmethod
     def __getitem__(self, k: int) -> Frame:
         """Frame k of the chosen ones, 0 <= k < len. Raises FrameError when that frame cannot be read."""
+
+    def __iter__(self) -> Iterator[Frame]:
+        return (self[k] for k in range(len(self)))
 
     def scene_truth(self) -> SceneTruth | None:
         """The true instances of the chosen frames' scene, None where nobody labelled it."""
@@ -113,6 +116,11 @@ class SceneMap(ABC):
     @abstractmethod
     def byte_count(self) -> int:
         """Bytes that the map's arrays take."""
+
+    @property
+    def instance_count(self) -> int:
+        """The number of objects found so far; asked often, for the progress bar: override it where it can be cheap."""
+        return len(self.instances())
 
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:

@@ -1,0 +1,81 @@
+# make demo and make test set up what is missing, also on a bare Debian or Ubuntu; a second call is quick.
+
+SHELL := /bin/bash
+.SHELLFLAGS := -euo pipefail -c
+.DEFAULT_GOAL := help
+
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed # its time says for which pyproject.toml the environment was made
+DEMO := outputs/demo
+
+IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
+
+# The first Python in the range that the libraries have wheels for; a plain python3 may be a version manager's shim.
+PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
+	"$$python" -c '$(IN_RANGE)' 2>/dev/null && \
+	command -v "$$python" && break; done)
+
+.PHONY: help
+help: ## this list
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | column -t -s $$'\t'
+
+.PHONY: demo
+demo: $(INSTALLED) ## map the synthetic room, leave the record in outputs/demo
+	@$(BIN)/python -m framework hydra.run.dir=$(DEMO)
+
+.PHONY: test
+test: $(INSTALLED) ## lint, check types, run the tests
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+	$(BIN)/python -m pytest
+
+.PHONY: install
+install: $(INSTALLED) ## only set up
+
+.PHONY: format
+format: $(INSTALLED) ## format the code and mend what the linter can
+	$(BIN)/ruff check --fix
+	$(BIN)/ruff format
+
+.PHONY: clean
+clean: ## remove the environment and all caches; outputs stay
+	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis
+	find framework plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# torch by its exact version first: pip then takes a local CPU wheel where the machine offers one.
+$(INSTALLED): pyproject.toml
+	@$(MAKE) --no-print-directory system-libraries
+	@test -x $(BIN)/python || "$(or $(PYTHON),python3)" -m venv $(VENV)
+	$(BIN)/python -m pip install 'torch==2.13.0'
+	$(BIN)/python -m pip install --editable '.[dev]'
+	@touch $(INSTALLED)
+
+# What is missing of: Python with venv, git (for the commit in the run records), Open3D's shared libraries.
+define MISSING
+PATH="$$PATH:/usr/sbin:/sbin"; libraries="$$(ldconfig -p 2>/dev/null || true)"; missing=""; \
+test -n "$(PYTHON)" || missing="$$missing python3"; \
+test -n "$(PYTHON)" && "$(PYTHON)" -c 'import ensurepip, venv' 2>/dev/null || missing="$$missing python3-venv"; \
+command -v git >/dev/null || missing="$$missing git"; \
+grep -q 'libusb-1\.0\.so\.0' <<<"$$libraries" || missing="$$missing libusb-1.0-0"; \
+grep -q 'libGL\.so\.1' <<<"$$libraries" || missing="$$missing libgl1"; \
+grep -q 'libEGL\.so\.1' <<<"$$libraries" || missing="$$missing libegl1"; \
+grep -q 'libgomp\.so\.1' <<<"$$libraries" || missing="$$missing libgomp1"
+endef
+
+.PHONY: system-libraries
+system-libraries: ## install the system packages that are missing, with apt
+	@$(MISSING); \
+	if test -z "$$missing"; then exit 0; fi; \
+	apt="apt-get update && apt-get install --yes --no-install-recommends$$missing"; \
+	if ! command -v apt-get >/dev/null; then \
+		echo "missing:$$missing; install what your system calls them" >&2; exit 1; \
+	elif test "$$(id -u)" = 0; then \
+		echo "installing$$missing"; DEBIAN_FRONTEND=noninteractive bash -c "$$apt"; \
+	elif sudo -n true 2>/dev/null || { test -t 0 && command -v sudo >/dev/null; }; then \
+		echo "installing$$missing"; sudo DEBIAN_FRONTEND=noninteractive bash -c "$$apt"; \
+	else \
+		echo "as root: $$apt" >&2; exit 1; \
+	fi
+	@"$(or $(PYTHON),python3)" -c '$(IN_RANGE)' || { echo "Python 3.11 to 3.13 is needed" >&2; exit 1; }

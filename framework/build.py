@@ -1,0 +1,160 @@
+"""Config nodes become checked plugins: the only place where a name in a config turns into code that runs."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import inspect
+import pkgutil
+from collections.abc import Mapping
+from difflib import get_close_matches
+from types import ModuleType
+from typing import Any, TypeVar
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from framework.errors import ConfigError, InstanceMapError
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+
+STAGES: Mapping[str, type[Any]] = {
+    "dataset": RGBDSequence,
+    "detector": Detector,
+    "tracker": PoseTracker,
+    "refiner": ClusterRefiner,
+    "fuser": MapFuser,
+}
+"""The config groups and the interface that their options implement."""
+
+Plugin = TypeVar("Plugin")
+
+
+def build(interface: type[Plugin], node: DictConfig) -> Plugin:
+    """The plugin that a config node describes: `_target_` names the class, every other key is a parameter of it.
+
+    The class is imported and refused unless it is a concrete dataclass that implements `interface`; only then is
+    anything called, so a config cannot run arbitrary code. Interpolations in the node are resolved against the config
+    that it belongs to.
+
+    Raises:
+        ConfigError: the class or a parameter is wrong; one line that names the stage, the plugin and what is wrong.
+        InstanceMapError: what the plugin itself raises, with the stage and the plugin in front.
+    """
+    stage = stage_of(interface)
+    if not isinstance(node, DictConfig) or OmegaConf.is_missing(node, "_target_") or not node.get("_target_"):
+        raise ConfigError(
+            f"{stage}: expected a plugin's config with a _target_, found {_shown(node)}; choose {stage}=NAME"
+        )
+    target = str(node["_target_"])
+    plugin_class = find_class(interface, target)
+    where = f"{stage} {target}"
+    arguments = parameters(where, plugin_class, node)
+    try:
+        return plugin_class(**arguments)
+    except InstanceMapError as error:
+        raise type(error)(f"{where}: {error}") from error
+    except (ImportError, ValueError) as error:
+        raise ConfigError(f"{where}: {_first_line(error)}") from error
+
+
+def stage_of(interface: type) -> str:
+    """The config group whose options implement `interface`."""
+    return next(stage for stage, of in STAGES.items() if of is interface)
+
+
+def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
+    """The class that `target` ("package.module.Class") names.
+
+    Raises ConfigError unless it can be imported and is a concrete dataclass that implements `interface`.
+    """
+    where = f"{stage_of(interface)} {target}"
+    module_name, _, class_name = target.rpartition(".")
+    if not module_name:
+        raise ConfigError(f"{where}: _target_ must be package.module.Class")
+    module = _import(where, module_name)
+    found = getattr(module, class_name, None)
+    if found is None:
+        fitting = [name for name, value in vars(module).items() if _implements(value, interface)]
+        raise ConfigError(f"{where}: module {module_name} has no {class_name}{_did_you_mean(class_name, fitting)}")
+    if not _implements(found, interface):
+        kind = "a class that does not" if isinstance(found, type) else f"a {type(found).__name__}"
+        raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, found {kind}")
+    if "__dataclass_fields__" not in vars(found):
+        raise ConfigError(f"{where}: a plugin must be a dataclass, and {class_name} is not decorated with @dataclass")
+    if inspect.isabstract(found):
+        missing = ", ".join(sorted(found.__abstractmethods__))
+        raise ConfigError(f"{where}: {class_name} does not implement {missing} of {interface.__name__}")
+    plugin_class: type[Plugin] = found
+    return plugin_class
+
+
+def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
+    """The keyword arguments that `node` gives to `plugin_class`, each with the type of its dataclass field.
+
+    Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing mandatory value.
+    """
+    try:
+        schema = OmegaConf.structured(plugin_class)
+    except OmegaConfBaseException as error:
+        raise ConfigError(
+            f"{where}: parameters must be bool, int, float, str, Path or Enum: {_first_line(error)}"
+        ) from error
+    names = [field.name for field in dataclasses.fields(plugin_class) if field.init]
+    for key in node:
+        if key == "_target_" or OmegaConf.is_missing(node, key):
+            continue
+        if key not in names:
+            raise ConfigError(f"{where}: there is no parameter {str(key)!r}{_did_you_mean(str(key), names, 'it has')}")
+        try:
+            schema[key] = node[key]
+        except OmegaConfBaseException as error:
+            raise ConfigError(f"{where}: {key}: {_first_line(error)}") from error
+    missing = [name for name in names if OmegaConf.is_missing(schema, name)]
+    if missing:
+        stage = where.split()[0]
+        needed = " ".join(f"{stage}.{name}=..." for name in missing)
+        raise ConfigError(f"{where}: {', '.join(missing)} must be given: {needed}")
+    return {name: schema[name] for name in names}
+
+
+def _import(where: str, module_name: str) -> ModuleType:
+    try:
+        return importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        missing = error.name or ""
+        if not f"{module_name}.".startswith(f"{missing}."):  # the module is there, something that it needs is not
+            raise ConfigError(
+                f"{where}: {module_name} needs the package {missing!r}, which is not installed"
+            ) from error
+        raise ConfigError(f"{where}: there is no module {missing}{_siblings_of(missing)}") from error
+    except Exception as error:  # whatever a third party's module does at import
+        kind = type(error).__name__
+        raise ConfigError(f"{where}: {module_name} cannot be imported: {kind}: {_first_line(error)}") from error
+
+
+def _siblings_of(module_name: str) -> str:
+    """A suggestion from the modules beside the one that does not exist."""
+    package_name, _, name = module_name.rpartition(".")
+    if not package_name:
+        return ""
+    package = importlib.import_module(package_name)
+    return _did_you_mean(name, [module.name for module in pkgutil.iter_modules(getattr(package, "__path__", []))])
+
+
+def _implements(found: Any, interface: type) -> bool:
+    return isinstance(found, type) and issubclass(found, interface) and found is not interface
+
+
+def _did_you_mean(name: str, known: list[str], otherwise: str = "") -> str:
+    close = get_close_matches(name, known, n=1)
+    if close:
+        return f"; did you mean {close[0]!r}?"
+    return f"; {otherwise} {', '.join(known) or 'none'}" if otherwise else ""
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__
+
+
+def _shown(node: Any) -> str:
+    return repr(OmegaConf.to_container(node) if OmegaConf.is_config(node) else node)

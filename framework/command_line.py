@@ -1,0 +1,132 @@
+"""How the commands answer faults: one line on stderr and an exit status; the traceback only where it is asked for."""
+
+from __future__ import annotations
+
+import logging
+import os
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from functools import wraps
+from pathlib import Path
+
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from framework.errors import InstanceMapError
+
+log = logging.getLogger(__name__)
+
+KNOWN_ERRORS = (InstanceMapError, HydraException, OmegaConfBaseException, OSError)
+EXIT_FAILED = 1
+EXIT_INTERRUPTED = 130  # what shells report after Ctrl-C
+
+_PACKAGE = Path(__file__).resolve().parent
+CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else _PACKAGE.parent / "conf"
+"""The configs: inside the package where it was installed from a wheel, beside it in a checkout."""
+
+
+def directory_name(overrides: str) -> str:
+    """Overrides as the name of one directory: no separators, and short enough for every file system."""
+    name = overrides.replace(os.sep, "_") or "defaults"
+    if len(name) <= 200:
+        return name
+    import hashlib
+
+    return f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+
+
+OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Ends the process with one line on stderr and a status when a known error, or Ctrl-C, comes out of the body."""
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors in place of printing them
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED)
+    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
+        if "debug=true" in sys.argv:
+            traceback.print_exception(error)
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+
+
+@dataclass
+class Jobs:
+    """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and counts the failed."""
+
+    failed: int = 0
+    process: int = field(default_factory=os.getpid)
+
+    def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+        """`job`, with its faults in the log: one line for a known error, the traceback for others and with `debug`."""
+
+        @wraps(job)
+        def reported_job(config: DictConfig) -> None:
+            try:
+                job(config)
+            except Exception as error:
+                known = isinstance(error, KNOWN_ERRORS)
+                _log_error(one_line(error), error if config.get("debug") or not known else None)
+                if os.getpid() != self.process:  # a worker of a parallel launcher: Hydra carries the error to where
+                    raise  # somebody counts
+                self.failed += 1
+
+        return reported_job
+
+
+def one_line(error: BaseException) -> str:
+    """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _no_such_option(error)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
+        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return _joined(f"{error} {error.__cause__}")
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return _joined(str(error)) or type(error).__name__
+
+
+def _no_such_option(error: MissingConfigException) -> str:
+    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if not group:
+        return _joined(str(error))
+    options = list(error.options or ())
+    close = get_close_matches(name, options, n=1)
+    suggestion = f"; did you mean {close[0]}?" if close else "."
+    return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
+
+
+def _known_keys(error: OmegaConfBaseException) -> str:
+    """The keys that there are in place of the one that is not."""
+    keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
+    close = get_close_matches(str(error.key), keys, n=1)
+    path = str(error.full_key or error.key)
+    if close:
+        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
+
+
+def _joined(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _log_error(message: str, error: BaseException | None) -> None:
+    """Through the log, which also keeps it beside the job's other files; to stderr where there is no log."""
+    if logging.getLogger().handlers and not log.disabled:
+        log.error("%s", message, exc_info=error)
+        return
+    if error is not None:
+        traceback.print_exception(error)
+    print(f"error: {message}", file=sys.stderr)

@@ -1,0 +1,143 @@
+"""What happens while a pipeline runs: timings, poses, faults and progress."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from types import TracebackType
+
+from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from framework.data import Float64, Frame, Pose
+from framework.errors import FrameError, MapFullError
+from framework.interfaces import SceneMap
+
+log = logging.getLogger(__name__)
+
+SKIPS_LOGGED = 10  # later unusable frames are only counted, so that a broken disk does not flood the log
+COUNT_INTERVAL_S = 1.0  # how often the progress bar asks the map for its number of instances
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """How long one stage took for one frame."""
+
+    frame: int  # Frame.index
+    stage: str  # read, detect, track, lift, refine or fuse
+    milliseconds: float
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Where the camera was believed to be, and where it was."""
+
+    index: int  # Frame.index
+    timestamp: float  # s
+    pose: Pose
+    T_world_camera_truth: Float64 | None  # (4, 4)
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run over a sequence leaves in memory."""
+
+    scene: SceneMap
+    frames: int  # taken from the sequence: mapped, lost and skipped ones
+    frames_skipped: int  # could not be used: unreadable or inconsistent
+    tracked: tuple[TrackedFrame, ...]  # in order, lost frames included
+    timings: tuple[StageTime, ...]
+    seconds: float  # wall clock of the whole loop
+    stopped_by: KeyboardInterrupt | MapFullError | None = None  # None = the sequence was mapped to its end
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames that were not fused because the tracker could not tell their pose."""
+        return sum(frame.pose.lost for frame in self.tracked)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of wall clock, reading and detection included."""
+        return self.frames / self.seconds
+
+
+@dataclass
+class Journal:
+    """Keeps the record of a run while it goes on, and shows its progress where a terminal is watching."""
+
+    scene: SceneMap
+    frames_expected: int
+    frames: int = 0
+    frames_skipped: int = 0
+    tracked: list[TrackedFrame] = field(default_factory=list)
+    timings: list[StageTime] = field(default_factory=list)
+    stopped_by: KeyboardInterrupt | MapFullError | None = None
+
+    def __enter__(self) -> Journal:
+        self._screen = ExitStack()
+        self._bar = self._screen.enter_context(
+            tqdm(total=self.frames_expected, unit=" frames", disable=None, dynamic_ncols=True)
+        )
+        if not self._bar.disable:
+            self._screen.enter_context(logging_redirect_tqdm())
+        self._lost_for = 0  # frames
+        self._counted_at = self._started = time.perf_counter()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.seconds = time.perf_counter() - self._started
+        self._screen.close()
+        if self.frames_skipped > SKIPS_LOGGED:
+            log.warning("%d frames skipped in all", self.frames_skipped)
+
+    @contextmanager
+    def timed(self, frame: int, stage: str) -> Iterator[None]:
+        """Notes how long the body takes, if it succeeds."""
+        started = time.perf_counter()
+        yield
+        self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
+
+    def frame_begins(self) -> None:
+        """Counts a frame that was taken from the sequence, whatever becomes of it."""
+        self.frames += 1
+        self._bar.update()
+        now = time.perf_counter()
+        if not self._bar.disable and now - self._counted_at > COUNT_INTERVAL_S:
+            self._bar.set_postfix(instances=self.scene.instance_count, refresh=False)
+            self._counted_at = time.perf_counter()
+
+    def frame_skipped(self, error: FrameError) -> None:
+        """Counts a frame that cannot be used."""
+        self.frames_skipped += 1
+        if self.frames_skipped <= SKIPS_LOGGED:
+            log.warning("frame skipped: %s", error)
+        if self.frames_skipped == SKIPS_LOGGED:
+            log.warning("further skipped frames are only counted")
+
+    def frame_tracked(self, frame: Frame, pose: Pose) -> None:
+        """Keeps the pose; says when tracking gets lost and when it is found again."""
+        self.tracked.append(TrackedFrame(frame.index, frame.timestamp, pose, frame.T_world_camera))
+        if pose.lost:
+            if not self._lost_for:
+                log.warning("frame %d: lost: %s", frame.index, pose.reason or "the tracker gave no reason")
+            self._lost_for += 1
+        elif self._lost_for:
+            log.warning("frame %d: tracked again after %d lost frames", frame.index, self._lost_for)
+            self._lost_for = 0
+
+    def result(self) -> RunResult:
+        """The run as it stands once the loop has ended."""
+        return RunResult(
+            scene=self.scene,
+            frames=self.frames,
+            frames_skipped=self.frames_skipped,
+            tracked=tuple(self.tracked),
+            timings=tuple(self.timings),
+            seconds=self.seconds,
+            stopped_by=self.stopped_by,
+        )

@@ -1,0 +1,163 @@
+"""The loop: detect, track, lift, refine, fuse."""
+
+from __future__ import annotations
+
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from types import FrameType
+from typing import TypeVar
+
+import numba
+
+from framework.data import Detections, Frame
+from framework.errors import ConfigError, DataError, FrameError, MapFullError
+from framework.geometry import lift
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.journal import Journal, RunResult, StageTime
+
+Item = TypeVar("Item")
+Outcome = TypeVar("Outcome")
+
+
+@dataclass
+class Pipeline:
+    """The four stages and the loop over them: `Pipeline(detector, tracker, refiner, fuser).run(sequence)`."""
+
+    detector: Detector
+    tracker: PoseTracker
+    refiner: ClusterRefiner
+    fuser: MapFuser
+    ahead: int = 2  # frames that a worker thread reads and detects in front of the mapping; 0 = no thread
+
+    def __post_init__(self) -> None:
+        if self.ahead < 0:
+            raise ConfigError(f"Pipeline: ahead must be 0 or more frames, found {self.ahead}")
+
+    def run(self, sequence: RGBDSequence) -> RunResult:
+        """Maps `sequence` frame by frame.
+
+        A frame that raises FrameError is skipped, a frame whose pose is lost is not fused; both are counted. Ctrl-C
+        (once the frame in work is done) and a full map end the loop early: the result holds what has been mapped so
+        far, and `stopped_by` says why.
+
+        Raises DataError when there is no frame that can be used, and whatever else a stage raises.
+        """
+        if len(sequence) == 0:
+            raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
+        journal = Journal(self.fuser.scene, len(sequence))
+        with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
+            try:
+                for frame, detections in detected:
+                    self.map_frame(frame, detections, journal)
+                    if interrupted.is_set():
+                        raise KeyboardInterrupt
+            except (KeyboardInterrupt, MapFullError) as stop:
+                journal.stopped_by = stop
+        if journal.frames_skipped == journal.frames:
+            raise DataError(f"{sequence.name}: none of the {journal.frames} frames can be used; the log says why")
+        return journal.result()
+
+    def detect_ahead(self, sequence: RGBDSequence, journal: Journal) -> Generator[tuple[Frame, Detections]]:
+        """The frames with their detections, in order and without those that cannot be used.
+
+        Frame k + 1 is read and detected while frame k is tracked and fused; the results do not depend on it.
+        """
+        read_and_detect = partial(self.read_and_detect, sequence)
+        with closing(map_ahead(read_and_detect, range(len(sequence)), self.ahead)) as outcomes:
+            for outcome in outcomes:
+                journal.frame_begins()
+                if isinstance(outcome, FrameError):
+                    journal.frame_skipped(outcome)
+                    continue
+                frame, detections, timings = outcome
+                journal.timings += timings
+                yield frame, detections
+
+    def read_and_detect(self, sequence: RGBDSequence, k: int) -> tuple[Frame, Detections, list[StageTime]] | FrameError:
+        """Frame k, its detections and what they took; or why that frame cannot be used."""
+        try:
+            started = time.perf_counter()
+            frame = sequence[k]
+            read = time.perf_counter()
+            detections = self.detector.detect(frame)
+            detected = time.perf_counter()
+        except FrameError as error:
+            return error
+        return (
+            frame,
+            detections,
+            [
+                StageTime(frame.index, "read", 1e3 * (read - started)),
+                StageTime(frame.index, "detect", 1e3 * (detected - read)),
+            ],
+        )
+
+    def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> None:
+        """Track, lift, refine, fuse: what happens to one frame."""
+        try:
+            with journal.timed(frame.index, "track"):
+                pose = self.tracker.track(frame, self.fuser.scene)
+            journal.frame_tracked(frame, pose)
+            if pose.lost:
+                return
+            with journal.timed(frame.index, "lift"):
+                clusters = lift(detections, frame, pose)
+            with journal.timed(frame.index, "refine"):
+                clusters = self.refiner.refine(clusters, frame)
+            with journal.timed(frame.index, "fuse"):
+                self.fuser.fuse(frame, pose, clusters)
+        except FrameError as error:
+            journal.frame_skipped(error)
+
+
+def map_ahead(function: Callable[[Item], Outcome], items: Iterable[Item], ahead: int) -> Generator[Outcome]:
+    """`map(function, items)` by a worker thread that stays at most `ahead` outcomes in front of the consumer.
+
+    What the worker raises is raised here, in its place. Closing the generator ends the worker after the item in work.
+    """
+    if ahead == 0:
+        yield from map(function, items)
+        return
+    # numba keeps its number of threads by thread: the worker gets the consumer's
+    worker = ThreadPoolExecutor(1, "detect-ahead", numba.set_num_threads, (numba.get_num_threads(),))
+    pending: deque[Future[Outcome]] = deque()
+    try:
+        for item in items:
+            pending.append(worker.submit(function, item))
+            if len(pending) > ahead:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
+    finally:
+        worker.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def ctrl_c_deferred() -> Iterator[threading.Event]:
+    """The first Ctrl-C sets the event that this yields, in place of raising; the second one raises at once.
+
+    An exception in the middle of a frame would leave it half integrated. Outside the main thread, where Python does
+    not let signals be handled, and where the process ignores them, nothing changes.
+    """
+    interrupted = threading.Event()
+    before = signal.getsignal(signal.SIGINT)
+    if threading.current_thread() is not threading.main_thread() or not callable(before):
+        yield interrupted
+        return
+
+    def set_once(_signal: int, _frame: FrameType | None) -> None:
+        signal.signal(signal.SIGINT, before)
+        interrupted.set()
+
+    signal.signal(signal.SIGINT, set_once)
+    try:
+        yield interrupted
+    finally:
+        signal.signal(signal.SIGINT, before)

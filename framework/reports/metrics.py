@@ -1,0 +1,69 @@
+"""The figures of one run: the flat dictionary that becomes metrics.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from framework.data import Instance, InstanceMesh
+from framework.evaluation import instances, trajectory
+from framework.evaluation.instances import PredictedInstances
+from framework.interfaces import RGBDSequence
+from framework.journal import RunResult
+
+Metrics = dict[str, float | int | str | bool | None]
+
+STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
+
+
+def run_metrics(result: RunResult) -> Metrics:
+    """Counts, speed, time by stage and the size of the map."""
+    metrics: Metrics = {
+        "frames": result.frames,
+        "frames_lost": result.frames_lost,
+        "frames_skipped": result.frames_skipped,
+        "fps": result.fps,
+        "pose_source": pose_source(result),
+        "map.voxels": result.scene.voxel_count,
+        "map.bytes": result.scene.byte_count,
+    }
+    for stage in STAGES_TIMED:
+        milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
+        metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
+        metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
+    return metrics
+
+
+def pose_source(result: RunResult) -> str:
+    """`ground_truth` where each pose is exactly the frame's true one, so that nothing was tracked; else `tracked`."""
+    exact = [
+        frame.T_world_camera_truth is not None and np.array_equal(frame.pose.T_world_camera, frame.T_world_camera_truth)
+        for frame in result.tracked
+    ]
+    return "ground_truth" if exact and all(exact) else "tracked"
+
+
+def trajectory_metrics(result: RunResult) -> Metrics:
+    """The error of the poses that were not lost; nothing where no true pose is known."""
+    error = trajectory.evaluate(
+        reference=[frame.T_world_camera_truth for frame in result.tracked],
+        estimated=[frame.pose for frame in result.tracked],
+    )
+    return dict(error.metrics())
+
+
+def instance_metrics(
+    sequence: RGBDSequence, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
+) -> Metrics:
+    """How many instances were found and, where the true ones are known, how well."""
+    count: Metrics = {"instances.count": len(found)}
+    truth = sequence.scene_truth()
+    if truth is None:
+        return count
+    return count | instances.evaluate(PredictedInstances.of_map(mesh, found, classes), truth).metrics()
+
+
+def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:
+    """The most probable class of an instance; None where the map knows no classes."""
+    return classes[int(np.argmax(instance.class_probabilities))] if classes else None

@@ -1,0 +1,112 @@
+"""From where to look at a map: obliquely from above, into the room, with as many objects in sight as there can be."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from framework.data import Camera, Float32, Float64, Int32
+from framework.geometry import inverse, project, transform
+from framework.reports.surface import Surface
+
+FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, so that far objects are not much smaller than near ones
+ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
+AZIMUTHS = 16  # candidates around the vertical
+MARGIN = 1.04  # of free space around what is shown
+TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, of the small pictures that candidates are judged by
+TRIAL_POINTS = 60000  # vertices in those pictures
+LEVEL_CONE_RAD = np.deg2rad(30)  # floors and tables are looked for this near to the cameras' mean upward direction
+
+
+def upward(poses: Float64, surface: Surface) -> Float64:
+    """(3,) the direction up in the world: the mean of the cameras' -y axes, straightened by floors and table tops.
+
+    The world's axes say nothing: z-up, y-up and the first camera's frame all exist.
+    """
+    up = -poses[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    areas = np.linalg.norm(surface.face_normals, axis=1)
+    normals = surface.face_normals / np.maximum(areas, 1e-12)[:, None]
+    cone = LEVEL_CONE_RAD
+    for _ in range(5):  # mean shift with a narrowing cone
+        inside = normals @ up > np.cos(cone)
+        mean = surface.face_normals[inside].sum(axis=0)
+        if areas[inside].sum() < 0.02 * areas.sum() or np.linalg.norm(mean) == 0:
+            return np.asarray(up)
+        up = mean / np.linalg.norm(mean)
+        cone = max(cone / 1.5, np.deg2rad(6))
+    return np.asarray(up)
+
+
+def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
+    """The camera of width x height px and its T_world_camera that show most.
+
+    Args:
+        instance_ids: (V,) of the surface's vertices, 0 = no instance.
+        poses: (F, 4, 4) of the cameras that saw the surface.
+    """
+    up = upward(poses, surface)
+    forward = poses[:, :3, 2].mean(axis=0)
+    forward -= (forward @ up) * up
+    if np.linalg.norm(forward) < 0.1:  # the cameras looked all around
+        forward = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    forward /= np.linalg.norm(forward)
+    side = np.cross(forward, up)
+
+    chosen = slice(None, None, max(1, len(surface.vertices) // TRIAL_POINTS))
+    points, normals = surface.vertices[chosen], surface.vertex_normals()[chosen]
+    best_score, shown = -np.inf, points
+    R = np.eye(3)
+    for elevation in ELEVATIONS_RAD:
+        for azimuth in 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS:
+            level = np.cos(azimuth) * forward + np.sin(azimuth) * side
+            R_trial = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
+            visible = _visible(points, normals, *fitted(R_trial, points, TRIAL_WIDTH, TRIAL_HEIGHT))
+            score = _score(instance_ids[chosen][visible])
+            score *= 1 + 0.15 * np.cos(azimuth)  # between equals, the way that the cameras looked
+            if score > best_score:
+                best_score, R, shown = score, R_trial, points[visible]
+    # framed for what is seen: the ceiling and the near walls, which are looked through, need no room
+    return fitted(R, shown, width, height)
+
+
+def looking(forward: Float64, up: Float64) -> Float64:
+    """(3, 3) the rotation of a camera that looks along `forward` (3,) with `up` (3,) upwards in its picture."""
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
+    """A camera with this rotation, as near as it can be with the points (P, 3) in its picture of width x height px."""
+    focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
+    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    low, high = np.percentile(points_world, [0.3, 99.7], axis=0)  # stray points at the border of a map do not count
+    kept = points_world[((points_world >= low) & (points_world <= high)).all(axis=1)]
+    p = (kept if len(kept) else points_world) @ R_world_camera
+    # |x - x0| <= tan_x (z - z0) for all points; the extreme lines of either side meet where the camera must be
+    tan_x, tan_y = width / 2 / focal / MARGIN, height / 2 / focal / MARGIN
+    right, left = (p[:, 0] - tan_x * p[:, 2]).max(), (p[:, 0] + tan_x * p[:, 2]).min()
+    below, above = (p[:, 1] - tan_y * p[:, 2]).max(), (p[:, 1] + tan_y * p[:, 2]).min()
+    z = min(-(right - left) / (2 * tan_x), -(below - above) / (2 * tan_y), p[:, 2].min() - 0.1)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = R_world_camera
+    T_world_camera[:3, 3] = R_world_camera @ [(right + left) / 2, (below + above) / 2, z]
+    return camera, T_world_camera
+
+
+def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
+    """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
+    front = np.flatnonzero(((points - T_world_camera[:3, 3]) * normals).sum(axis=1) < 0)
+    local = transform(inverse(T_world_camera), points[front])
+    u, v = np.rint(project(camera, local)).astype(int).T
+    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+    pixel, z, front = (v * camera.width + u)[inside], local[inside, 2], front[inside]
+    nearest_first = np.lexsort((z, pixel))
+    _, first = np.unique(pixel[nearest_first], return_index=True)
+    return np.asarray(front[nearest_first][first], np.int32)
+
+
+def _score(instance_ids: Int32) -> float:
+    """How much a picture shows, given its pixels' ids. Square roots: ten objects are worth more than a large one."""
+    return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))

@@ -1,0 +1,43 @@
+"""What all tests share: seeds, and the way to the data that are not part of the project."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.corner_room import CornerRoom
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+
+
+@pytest.fixture(autouse=True)
+def seeded() -> None:
+    """The same random numbers in every test, whichever tests run before it."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002
+
+
+@pytest.fixture(scope="session")
+def shared() -> Path:
+    """The directory `shared` beside the checkout, with data and weights; skips where there is none."""
+    directory = CHECKOUT.parent / "shared"
+    if not directory.is_dir():
+        pytest.skip(f"{directory} with its data and weights is not there")
+    return directory
+
+
+@pytest.fixture(scope="session")
+def shared_data(shared: Path) -> Path:
+    """`shared/data`, with the RGB-D folders."""
+    if not (shared / "data").is_dir():
+        pytest.skip(f"{shared / 'data'} is not there")
+    return shared / "data"
+
+
+@pytest.fixture
+def room() -> CornerRoom:
+    """A video of six frames whose every pixel is known."""
+    return CornerRoom()

@@ -1,0 +1,138 @@
+"""Data check themselves where they are made."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.data import (
+    Camera,
+    Detections,
+    Frame,
+    FrameTruth,
+    InstanceMesh,
+    PointClusters,
+    Pose,
+    SceneTruth,
+)
+from framework.errors import DataError
+from framework.geometry import exp_se3
+
+CAMERA = Camera(4, 3, 5.0, 5.0, 1.5, 1.0)
+
+
+def frame(**changes: Any) -> Frame:
+    parts = {
+        "index": 7,
+        "timestamp": 0.5,
+        "color": np.zeros((3, 4, 3), np.uint8),
+        "depth": np.ones((3, 4), np.float32),
+        "camera": CAMERA,
+        "T_world_camera": np.eye(4),
+    }
+    return Frame(**(parts | changes))
+
+
+def detections(**changes: Any) -> Detections:
+    parts = {
+        "masks": np.zeros((2, 3, 4), np.bool_),
+        "boxes": np.zeros((2, 4), np.float32),
+        "scores": np.array([0.9, 0.2], np.float32),
+        "class_probabilities": np.array([[0.7, 0.3], [0.5, 0.5]], np.float32),
+        "classes": ("chair", "couch"),
+    }
+    return Detections(**(parts | changes))
+
+
+def clusters(**changes: Any) -> PointClusters:
+    parts = {
+        "points_world": np.zeros((3, 3), np.float32),
+        "pixels": np.zeros((3, 2), np.int32),
+        "cluster": np.array([0, -1, 1], np.int32),
+        "class_probabilities": np.array([[0.7, 0.3], [0.5, 0.5]], np.float32),
+        "scores": np.array([0.9, 0.2], np.float32),
+        "classes": ("chair", "couch"),
+    }
+    return PointClusters(**(parts | changes))
+
+
+def mesh(**changes: Any) -> InstanceMesh:
+    parts = {
+        "vertices": np.zeros((3, 3), np.float32),
+        "triangles": np.array([[0, 1, 2]], np.int32),
+        "colors": np.zeros((3, 3), np.uint8),
+        "instance_ids": np.zeros(3, np.int32),
+        "class_ids": np.full(3, -1, np.int32),
+        "classes": (),
+    }
+    return InstanceMesh(**(parts | changes))
+
+
+def with_nan(shape: tuple[int, ...], dtype: type = np.float32) -> np.ndarray:
+    array = np.ones(shape, dtype)
+    array.flat[0] = np.nan
+    return array
+
+
+def test_sound_data_pass() -> None:
+    assert len(detections()) == len(clusters()) == 2
+    assert len(Detections.none((3, 4), ("chair",))) == 0
+    frame()
+    mesh()
+    Pose(exp_se3(np.arange(6.0)))
+    SceneTruth(np.zeros((2, 3), np.float32), np.zeros(2, np.int32))
+
+
+@pytest.mark.parametrize(
+    ("make", "changes", "said"),
+    [
+        (frame, {"color": np.zeros((3, 5, 3), np.uint8)}, r"frame 7: color must have shape \(3, 4, 3\)"),
+        (frame, {"color": np.zeros((3, 4, 3), np.float32)}, "color must be an array of uint8, found float32"),
+        (frame, {"depth": np.ones((4, 3), np.float32)}, r"depth must have shape \(3, 4\), found \(4, 3\)"),
+        (frame, {"depth": np.ones((3, 4))}, "depth must be an array of float32, found float64"),
+        (frame, {"depth": with_nan((3, 4))}, "depth holds values that are not finite"),
+        (frame, {"depth": -np.ones((3, 4), np.float32)}, "depth must be 0 or positive, found -1.0 m"),
+        (frame, {"T_world_camera": with_nan((4, 4), np.float64)}, "frame 7: T_world_camera holds values"),
+        (frame, {"T_world_camera": 2 * np.eye(4)}, "not a rigid transform"),
+        (frame, {"T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a rigid transform"),
+        (frame, {"truth": FrameTruth(np.zeros((2, 2), np.int32), {})}, "truth.instance_ids must have shape"),
+        (detections, {"masks": np.zeros((3, 3, 4), np.bool_)}, r"masks must have shape \(2, any, any\)"),
+        (detections, {"scores": np.array([0.9, 1.2], np.float32)}, r"scores must be in \[0, 1\]"),
+        (detections, {"class_probabilities": np.full((2, 2), 0.4, np.float32)}, "each row must be a distribution"),
+        (
+            detections,
+            {"class_probabilities": np.array([[1.5, -0.5], [1, 0]], np.float32)},
+            "each row must be a distribution",
+        ),
+        (clusters, {"cluster": np.array([0, 2, 1], np.int32)}, r"cluster must be in \[-1, 2\), found 0 to 2"),
+        (clusters, {"points_world": with_nan((3, 3))}, "points_world holds values that are not finite"),
+        (clusters, {"pixels": np.zeros((2, 2), np.int32)}, "pixels must have shape"),
+        (mesh, {"class_ids": np.zeros(2, np.int32)}, "class_ids must have shape"),
+        (mesh, {"triangles": [[0, 1, 2]]}, "triangles must be an array of int32, found list"),
+    ],
+)
+def test_unsound_data_are_refused_in_one_line(make: Callable[..., object], changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(DataError, match=said) as caught:
+        make(**changes)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("wrong", [{"width": 0}, {"fx": 0.0}, {"fy": -3.0}, {"cx": np.nan}, {"cy": np.inf}])
+def test_a_camera_checks_itself(wrong: dict[str, float]) -> None:
+    numbers = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}
+    with pytest.raises(DataError, match="Camera"):
+        Camera(**(numbers | wrong))  # type: ignore[arg-type]
+
+
+def test_a_pose_is_rigid_within_the_digits_that_files_carry() -> None:
+    rounded = np.round(exp_se3(np.array([1, 2, 3, 0.3, -0.7, 0.2])), 4)
+    Pose(rounded)
+    with pytest.raises(DataError, match="not a rigid transform"):
+        Pose(np.round(rounded, 1))
+    sheared = rounded.copy()
+    sheared[3, 0] = 0.1
+    with pytest.raises(DataError, match="not a rigid transform"):
+        Pose(sheared)

@@ -1,0 +1,132 @@
+"""Rigid motions and the pinhole camera, against their definitions."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from framework import geometry
+from framework.data import Camera, Detections, Frame, Pose
+from tests.corner_room import CornerRoom, pose_at
+
+twists = arrays(np.float64, 6, elements=st.floats(-3, 3, width=32))
+CAMERA = Camera(64, 48, 50.0, 52.0, 30.5, 24.25)
+
+
+def hat(xi: np.ndarray) -> np.ndarray:
+    matrix = np.zeros((4, 4))
+    matrix[:3, :3], matrix[:3, 3] = geometry.skew(xi[3:]), xi[:3]
+    return matrix
+
+
+@given(twists)
+def test_exp_se3_is_the_matrix_exponential(xi: np.ndarray) -> None:
+    np.testing.assert_allclose(geometry.exp_se3(xi), expm(hat(xi)), atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-8, 3e-8, 1e-7, 1e-6, 1e-5, 1e-4, np.pi - 1e-7, np.pi])
+def test_exp_se3_is_exact_at_small_and_large_angles(angle: float) -> None:
+    xi = np.array([1.0, -2.0, 0.5, 0.6 * angle, 0.0, -0.8 * angle])
+    np.testing.assert_allclose(geometry.exp_se3(xi), expm(hat(xi)), rtol=0, atol=1e-14 + 1e-15 * angle)
+
+
+@given(twists)
+def test_inverse_cancels(xi: np.ndarray) -> None:
+    T = geometry.exp_se3(xi)
+    np.testing.assert_allclose(geometry.inverse(T) @ T, np.eye(4), atol=1e-12)
+
+
+@given(twists, arrays(np.float64, (5, 3), elements=st.floats(-10, 10, width=32)))
+def test_transform_is_the_homogeneous_product(xi: np.ndarray, points: np.ndarray) -> None:
+    T = geometry.exp_se3(xi)
+    expected = (np.c_[points, np.ones(5)] @ T.T)[:, :3]
+    np.testing.assert_allclose(geometry.transform(T, points), expected, atol=1e-11)
+    assert geometry.transform(T, points.astype(np.float32)).dtype == np.float32
+
+
+def test_skew_is_the_cross_product() -> None:
+    v, w = np.array([1.0, -2.0, 3.0]), np.array([0.5, 4.0, -1.0])
+    np.testing.assert_allclose(geometry.skew(v) @ w, np.cross(v, w))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-10, 1e-6, 0.3, 3.0, np.pi])
+def test_rotation_angle(angle: float) -> None:
+    R = Rotation.from_rotvec(angle * np.array([2.0, -1.0, 2.0]) / 3).as_matrix()
+    assert geometry.rotation_angle(R) == pytest.approx(angle, rel=1e-9, abs=1e-15)
+
+
+@given(arrays(np.float64, (3, 3), elements=st.floats(-1, 1, width=32)))
+def test_nearest_rotation_is_a_rotation_and_no_other_is_nearer(noise: np.ndarray) -> None:
+    M = np.eye(3) + 0.3 * noise
+    R = geometry.nearest_rotation(M)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(R) == pytest.approx(1)
+    for axis in np.eye(3):
+        for angle in (-1e-3, 1e-3):
+            other = R @ Rotation.from_rotvec(angle * axis).as_matrix()
+            assert np.linalg.norm(M - R) <= np.linalg.norm(M - other) + 1e-12
+
+
+def test_nearest_rotation_of_a_reflection_is_no_reflection() -> None:
+    assert np.linalg.det(geometry.nearest_rotation(np.diag([1.0, 1.0, -1.0]))) == pytest.approx(1)
+
+
+def test_project_inverts_back_project_at_every_pixel() -> None:
+    u, v = np.meshgrid(np.arange(64), np.arange(48))
+    pixels = np.stack([u.ravel(), v.ravel()], 1).astype(np.int32)
+    depth = np.linspace(0.5, 4, len(pixels), dtype=np.float32)
+    points = geometry.back_project(CAMERA, pixels, depth)
+    assert points.dtype == np.float32
+    np.testing.assert_allclose(points[:, 2], depth)
+    np.testing.assert_allclose(geometry.project(CAMERA, points), pixels, atol=1e-4)
+
+
+def test_the_principal_point_is_a_pixel_center() -> None:
+    camera = Camera(3, 3, 10.0, 10.0, 1.0, 1.0)
+    center = geometry.back_project(camera, np.array([[1, 1]], np.int32), np.array([2.0], np.float32))
+    np.testing.assert_array_equal(center, [[0, 0, 2]])
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.25, 2.0])
+def test_a_scaled_camera_sees_the_same_rays(factor: float) -> None:
+    """Pixel k of the half image covers pixels 2k and 2k + 1: their mean ray is its ray."""
+    scaled = CAMERA.scaled(factor)
+    point = np.array([[0.3, -0.2, 1.5]])
+    full, resized = geometry.project(CAMERA, point) + 0.5, geometry.project(scaled, point) + 0.5
+    np.testing.assert_allclose(resized, full * factor)
+
+
+def test_lift_puts_each_masks_readings_into_the_world(room: CornerRoom) -> None:
+    frame = room[3]
+    assert frame.truth is not None
+    masks = np.stack([frame.truth.instance_ids == 1, frame.truth.instance_ids > 0])  # the second covers the first
+    half = np.full((2, 2), 0.5, np.float32)
+    detections = Detections(masks, np.zeros((2, 4), np.float32), np.ones(2, np.float32), half, ("a", "b"))
+    clusters = geometry.lift(detections, frame, Pose(pose_at(3)))
+    assert np.bincount(clusters.cluster).tolist() == masks.sum(axis=(1, 2)).tolist()
+    for (u, v), point in zip(clusters.pixels[::97], clusters.points_world[::97], strict=True):
+        camera_point = geometry.transform(geometry.inverse(pose_at(3)), point.astype(np.float64))
+        assert camera_point[2] == pytest.approx(frame.depth[v, u], abs=1e-5)
+        np.testing.assert_allclose(geometry.project(frame.camera, camera_point), [u, v], atol=1e-3)
+    spheres = np.linalg.norm(clusters.points_world[clusters.cluster == 0] - [-0.5, 0.7, 2.2], axis=1)
+    np.testing.assert_allclose(spheres, 0.35, atol=1e-5)
+
+
+def test_lift_leaves_out_pixels_without_a_reading(room: CornerRoom) -> None:
+    frame = room[0]
+    blind = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth), frame.camera)
+    detections = Detections(
+        np.ones((1, *frame.camera.shape), np.bool_),
+        np.zeros((1, 4), np.float32),
+        np.ones(1, np.float32),
+        np.ones((1, 1), np.float32),
+        ("a",),
+    )
+    clusters = geometry.lift(detections, blind, Pose(np.eye(4)))
+    assert (len(clusters), len(clusters.points_world)) == (1, 0)
+    assert len(geometry.lift(Detections.none(frame.camera.shape, ("a",)), frame, Pose(np.eye(4)))) == 0

@@ -1,0 +1,121 @@
+"""`python -m framework` as a user meets it: a process, its streams and its exit status."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+RECORD = {"config.yaml", "metrics.json", "instances.json", "mesh.ply", "trajectory.txt", "timings.csv", "map.npz"}
+
+
+def command(*arguments: str) -> list[str]:
+    fakes = ["--config-dir", str(CHECKOUT / "tests" / "fake_conf")]
+    return [sys.executable, "-m", "framework", *fakes, *FAKES, *arguments]
+
+
+def environment() -> dict[str, str]:
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    return clean | {"PYTHONPATH": str(CHECKOUT)}
+
+
+def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.CompletedProcess[str]:
+    places = [f"hydra.run.dir={directory}", f"hydra.sweep.dir={directory}"]
+    line = command(*places, *arguments)
+    if sweep:
+        line.insert(3, "-m")
+    return subprocess.run(line, cwd=directory, env=environment(), capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("detector=fakke", ["there is no detector=fakke; did you mean fake?", "The options are:"]),
+        ("dataset.frames=many", ["ERROR", "dataset tests.corner_room.CornerRoom", "frames", "'many'", "Integer"]),
+        ("refiner._target_=tests.corner_room.GivenPose", ["ERROR", "refiner", "ClusterRefiner"]),
+        ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
+        ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
+        ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),
+        ("tracker=null", ["group override must be a string"]),
+    ],
+)
+def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: list[str]) -> None:
+    done = start(tmp_path, override)
+    assert done.returncode == 1
+    assert done.stdout == ""
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    for words in said:
+        assert words in done.stderr
+
+
+def test_debug_shows_the_traceback(tmp_path: Path) -> None:
+    done = start(tmp_path, "dataset.frames=many", "debug=true")
+    assert done.returncode == 1
+    assert "Traceback (most recent call last)" in done.stderr
+    assert "ValidationError" in done.stderr
+
+
+def test_a_run_leaves_its_record(tmp_path: Path) -> None:
+    done = start(tmp_path, "dataset.unreadable=1", "dataset.frames=4")
+    assert done.returncode == 0, done.stderr
+    assert "Traceback" not in done.stderr
+    assert {path.name for path in tmp_path.iterdir()} >= RECORD | {"overview.png", "instancemap.log"}
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["frames_skipped"], metrics["choice.detector"]) == (4, 1, "fake")
+    assert not list(tmp_path.glob("*partial*"))
+    assert "frame skipped: frame 1" in (tmp_path / "instancemap.log").read_text()
+    assert str(tmp_path / "overview.png") in done.stderr
+
+
+def test_a_failed_job_does_not_stop_a_sweep(tmp_path: Path) -> None:
+    done = start(tmp_path, "dataset.frames=2,many,1", "seed=0", sweep=True)
+    assert done.returncode == 1
+    assert done.stderr.count("ERROR") == 1
+    assert "Traceback" not in done.stderr
+    jobs = sorted(path for path in tmp_path.iterdir() if path.is_dir())
+    assert [(job / "metrics.json").exists() for job in jobs] == [True, True, False]  # 1, 2, many
+    assert "'many'" in (jobs[2] / "instancemap.log").read_text()
+
+
+def test_a_misspelt_name_in_a_sweep_is_told_before_the_first_job(tmp_path: Path) -> None:
+    done = start(tmp_path, "detector=fake,fakke", sweep=True)
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert "there is no detector=fakke" in done.stderr
+    assert not [path for path in tmp_path.iterdir() if path.is_dir()]
+
+
+def test_ctrl_c_writes_what_there_is_and_marks_it(tmp_path: Path) -> None:
+    (tmp_path / "metrics.json").write_text("{}")  # of an earlier run into the same directory
+    line = command(f"hydra.run.dir={tmp_path}", "dataset.frames=100000", "dataset.slow_s=0.02")
+    with subprocess.Popen(line, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True) as process:
+        deadline = time.monotonic() + 60
+        while (tmp_path / "metrics.json").exists() and time.monotonic() < deadline:  # removed when mapping begins
+            time.sleep(0.05)
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        _, stderr = process.communicate(timeout=90)
+    assert process.returncode == 130
+    assert "partial run, interrupted by Ctrl-C" in stderr
+    assert "Traceback" not in stderr
+    left = {path.name for path in tmp_path.iterdir()}
+    assert left >= (RECORD - {"metrics.json"}) | {"overview.png", "metrics.partial.json"}
+    assert "metrics.json" not in left
+    metrics = json.loads((tmp_path / "metrics.partial.json").read_text())
+    assert metrics["partial"] == "interrupted by Ctrl-C"
+    assert 0 < metrics["frames"] < 100000
+
+
+def test_a_full_map_is_a_partial_run_and_an_error(tmp_path: Path) -> None:
+    done = start(tmp_path, "fuser.capacity=2")
+    assert done.returncode == 1
+    assert "raise fuser.capacity" in done.stderr.splitlines()[-1]
+    assert json.loads((tmp_path / "metrics.partial.json").read_text())["frames"] == 3
+    assert not (tmp_path / "metrics.json").exists()

@@ -1,0 +1,226 @@
+"""The loop: order, faults, early ends, and the worker thread that changes nothing."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import threading
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, Frame, PointClusters, Pose
+from framework.errors import ConfigError, DataError, FrameError, MapFullError
+from framework.journal import RunResult
+from framework.pipeline import Pipeline, map_ahead
+from tests.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
+
+AHEAD = pytest.mark.parametrize("ahead", [0, 1, 3])
+
+
+def pipeline(ahead: int = 2, **stages: object) -> Pipeline:
+    chosen = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": GridFuser()} | stages
+    return Pipeline(**chosen, ahead=ahead)  # type: ignore[arg-type]
+
+
+def mapped(result: RunResult) -> GridMap:
+    assert isinstance(result.scene, GridMap)
+    return result.scene
+
+
+@AHEAD
+def test_maps_every_frame_in_order(room: CornerRoom, ahead: int) -> None:
+    result = pipeline(ahead).run(room)
+    assert (result.frames, result.frames_lost, result.frames_skipped, result.stopped_by) == (6, 0, 0, None)
+    assert [frame.index for frame in result.tracked] == list(range(6))
+    np.testing.assert_array_equal(result.tracked[5].pose.T_world_camera, pose_at(5))
+    assert set(mapped(result).instances()) == {1, 2}
+    assert result.fps == pytest.approx(6 / result.seconds)
+    for stage in ("read", "detect", "track", "lift", "refine", "fuse"):
+        assert [time.frame for time in result.timings if time.stage == stage] == list(range(6))
+    assert all(time.milliseconds >= 0 for time in result.timings)
+
+
+def test_the_worker_thread_changes_nothing(room: CornerRoom) -> None:
+    meshes = [mapped(pipeline(ahead, fuser=GridFuser(slow_s=0.002)).run(room)).mesh() for ahead in (0, 1, 4)]
+    for mesh in meshes[1:]:
+        for name in ("vertices", "triangles", "colors", "instance_ids"):
+            np.testing.assert_array_equal(getattr(mesh, name), getattr(meshes[0], name))
+
+
+def test_frame_indices_are_those_of_the_sequence() -> None:
+    result = pipeline().run(CornerRoom(frames=9, start=1, stop=8, stride=3))
+    assert [frame.index for frame in result.tracked] == [1, 4, 7]
+
+
+@AHEAD
+def test_an_unreadable_frame_is_skipped(ahead: int, caplog: pytest.LogCaptureFixture) -> None:
+    result = pipeline(ahead).run(CornerRoom(unreadable=2))
+    assert (result.frames, result.frames_skipped) == (6, 1)
+    assert [frame.index for frame in result.tracked] == [0, 1, 3, 4, 5]
+    assert [record.message for record in caplog.records] == ["frame skipped: frame 2: depth/000002.png is truncated"]
+
+
+@AHEAD
+def test_a_frame_that_the_detector_refuses_is_skipped(room: CornerRoom, ahead: int) -> None:
+    result = pipeline(ahead, detector=SphereDetector(broken_at=0)).run(room)
+    assert (result.frames_skipped, len(result.tracked)) == (1, 5)
+
+
+def test_a_frame_that_a_later_stage_refuses_is_skipped(room: CornerRoom) -> None:
+    @dataclass
+    class Refuses(KeepAll):
+        def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+            if frame.index == 3:
+                raise FrameError("frame 3: no points")
+            return clusters
+
+    result = pipeline(refiner=Refuses()).run(room)
+    assert (result.frames, result.frames_skipped, len(mapped(result).vertices)) == (6, 1, 5)
+
+
+def test_many_skipped_frames_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
+    @dataclass
+    class MostlyBroken(CornerRoom):
+        def __getitem__(self, k: int) -> Frame:
+            if k:
+                raise FrameError(f"frame {k}: broken")
+            return super().__getitem__(k)
+
+    result = pipeline().run(MostlyBroken(frames=40))
+    assert result.frames_skipped == 39
+    assert len(caplog.records) == 12
+    assert caplog.records[-1].message == "39 frames skipped in all"
+
+
+def test_a_sequence_without_a_usable_frame_is_an_error() -> None:
+    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+        pipeline().run(CornerRoom(frames=1, unreadable=0))
+    with pytest.raises(DataError, match="no frames to map"):
+        pipeline().run(CornerRoom(start=6))
+
+
+def test_lost_frames_are_counted_and_not_fused(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    result = pipeline(tracker=GivenPose(lost_from=2, lost_to=5)).run(room)
+    assert (result.frames, result.frames_lost, len(mapped(result).vertices)) == (6, 3, 3)
+    assert [frame.pose.lost for frame in result.tracked] == [False, False, True, True, True, False]
+    assert [record.message for record in caplog.records] == [
+        "frame 2: lost: too few points associate",
+        "frame 5: tracked again after 3 lost frames",
+    ]
+    assert {time.frame for time in result.timings if time.stage == "fuse"} == {0, 1, 5}
+
+
+@AHEAD
+def test_other_errors_surface_and_leave_no_thread(ahead: int) -> None:
+    before = threading.active_count()
+    with pytest.raises(DataError, match="no true pose"):
+        pipeline(ahead, detector=_Blind()).run(CornerRoom(truth=False))
+    with pytest.raises(DataError, match="no true instances"):  # raised in the worker
+        pipeline(ahead).run(CornerRoom(truth=False))
+    assert threading.active_count() == before
+
+
+@dataclass
+class _Blind(SphereDetector):
+    def detect(self, frame: Frame) -> Detections:
+        return Detections.none(frame.camera.shape, self.classes)
+
+
+def test_no_detections_and_overlapping_masks_are_mapped(room: CornerRoom) -> None:
+    @dataclass
+    class Doubled(SphereDetector):
+        def detect(self, frame: Frame) -> Detections:
+            once = super().detect(frame)
+            parts = (once.masks, once.boxes, once.scores, once.class_probabilities)
+            return Detections(*(np.concatenate([part, part]) for part in parts), classes=once.classes)
+
+    assert not mapped(pipeline(detector=_Blind()).run(room)).instances()
+    assert set(mapped(pipeline(detector=Doubled()).run(room)).instances()) == {3, 4}
+
+
+def test_a_full_map_ends_the_run_with_what_there_is(room: CornerRoom) -> None:
+    result = pipeline(fuser=GridFuser(capacity=4)).run(room)
+    assert isinstance(result.stopped_by, MapFullError)
+    assert (result.frames, len(mapped(result).vertices)) == (5, 4)
+
+
+@dataclass
+class _PressesCtrlC(GivenPose):
+    times: int = 1
+    at: int = 3
+    noted: list[int] = field(default_factory=list)
+
+    def track(self, frame: Frame, scene: object) -> Pose:
+        self.noted.append(frame.index)
+        if frame.index == self.at:
+            for _ in range(self.times):
+                os.kill(os.getpid(), signal.SIGINT)
+        return super().track(frame, scene)  # type: ignore[arg-type]
+
+
+@AHEAD
+def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, ahead: int) -> None:
+    handler, threads = signal.getsignal(signal.SIGINT), threading.active_count()
+    result = pipeline(ahead, tracker=_PressesCtrlC()).run(room)
+    assert isinstance(result.stopped_by, KeyboardInterrupt)
+    assert (result.frames, len(mapped(result).vertices)) == (4, 4)
+    assert signal.getsignal(signal.SIGINT) is handler
+    assert threading.active_count() == threads
+
+
+def test_a_second_ctrl_c_ends_it_at_once(room: CornerRoom) -> None:
+    result = pipeline(tracker=_PressesCtrlC(times=2)).run(room)
+    assert isinstance(result.stopped_by, KeyboardInterrupt)
+    assert len(mapped(result).vertices) == 3
+
+
+def test_runs_outside_the_main_thread(room: CornerRoom) -> None:
+    results: list[RunResult] = []
+    thread = threading.Thread(target=lambda: results.append(pipeline().run(room)))
+    thread.start()
+    thread.join()
+    assert results[0].frames == 6
+
+
+def test_map_ahead_is_bounded_and_ordered() -> None:
+    begun: list[int] = []
+
+    def square(k: int) -> int:
+        begun.append(k)
+        return k * k
+
+    outcomes = map_ahead(square, range(10), ahead=2)
+    assert next(outcomes) == 0
+    assert max(begun, default=0) <= 2
+    assert list(outcomes) == [k * k for k in range(1, 10)]
+    assert begun == list(range(10))
+
+
+def test_detection_of_the_next_frame_overlaps_with_this_one() -> None:
+    """Each side waits for the other: without a worker thread this would never end."""
+    fusing, detected = threading.Event(), threading.Event()
+
+    def detect(k: int) -> int:
+        if k == 1:
+            assert fusing.wait(10)
+            detected.set()
+        return k
+
+    for k in map_ahead(detect, range(2), ahead=1):
+        if k == 0:
+            fusing.set()
+            assert detected.wait(10)
+
+
+def test_ahead_is_checked() -> None:
+    with pytest.raises(ConfigError, match="ahead"):
+        pipeline(ahead=-1)
+
+
+def test_quiet_when_not_a_terminal(room: CornerRoom, capfd: pytest.CaptureFixture[str]) -> None:
+    logging.getLogger("framework").setLevel(logging.INFO)
+    pipeline().run(room)
+    assert capfd.readouterr() == ("", "")

@@ -1,0 +1,117 @@
+"""What the README shows works."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from framework.build import STAGES, build
+from framework.command_line import CONF
+from framework.data import Camera, Frame
+from framework.geometry import lift
+from framework.interfaces import Detector
+from tests import registered
+from tests.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
+
+CHECKOUT = Path(__file__).resolve().parent.parent
+README = (CHECKOUT / "README.md").read_text()
+COMMANDS = [
+    line
+    for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL)
+    for line in block.splitlines()
+    if line.startswith("python -m framework ")
+]
+
+
+def block(language: str, containing: str) -> str:
+    """The one code block of the README with these words in it."""
+    [found] = [code for code in re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL) if containing in code]
+    return str(found)
+
+
+def test_the_loop_maps_a_sequence() -> None:
+    fuser = GridFuser()
+    stages = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": fuser}
+    exec(block("python", "for frame in sequence"), {"sequence": CornerRoom(), "lift": lift, **stages})
+    assert len(fuser.scene.vertices) == 6
+    assert set(fuser.scene.instances()) == {1, 2}
+
+
+@pytest.fixture
+def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The README's detector, saved where it says."""
+    (tmp_path / "my_plugins").mkdir()
+    (tmp_path / "my_plugins" / "color_blobs.py").write_text(block("python", "class ColorBlobs"))
+    (tmp_path / "my_conf" / "detector").mkdir(parents=True)
+    (tmp_path / "my_conf" / "detector" / "color_blobs.yaml").write_text(block("yaml", "color_blobs.ColorBlobs"))
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    return tmp_path
+
+
+def test_the_detector_finds_what_it_says(my_plugins: Path) -> None:
+    node = OmegaConf.load(my_plugins / "my_conf" / "detector" / "color_blobs.yaml")
+    detector = build(Detector, OmegaConf.create({"detector": node}).detector)
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    color = np.full((48, 64, 3), 200, np.uint8)
+    color[10:30, 5:25] = (220, 20, 30)  # a red square
+    color[35:40, 40:45] = (220, 20, 30)  # red too, but too small
+    color[10:30, 40:60] = (20, 220, 30)  # green
+    found = detector.detect(Frame(0, 0.0, color, np.ones((48, 64), np.float32), camera))
+    assert len(found) == 1
+    np.testing.assert_array_equal(found.boxes, [[5, 10, 25, 30]])
+    assert found.masks[0].sum() == 400
+    assert found.masks[0, 10:30, 5:25].all()
+    assert found.classes[0] == "cup"
+    blank = Frame(0, 0.0, np.zeros_like(color), np.ones((48, 64), np.float32), camera)
+    assert len(detector.detect(blank)) == 0
+
+
+def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
+    """The README's command, with the other stages faked for speed."""
+    fakes = [f"{stage}._target_=tests.corner_room.{name}" for stage, name in FAKES.items()]
+    chosen = [f"{stage}=fake" for stage in FAKES]
+    (my_plugins / "my_conf").joinpath("dataset").mkdir()
+    for stage in FAKES:
+        group = my_plugins / "my_conf" / stage
+        group.mkdir(exist_ok=True)
+        (group / "fake.yaml").write_text("_target_: null\n")
+    command = "-m framework --config-dir my_conf detector=color_blobs detector.hue=120 hydra.run.dir=run"
+    done = subprocess.run(
+        [sys.executable, *command.split(), *chosen, *fakes],
+        cwd=my_plugins,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{CHECKOUT}:{my_plugins}", "HOME": str(my_plugins)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (my_plugins / "run" / "metrics.json").exists()
+
+
+FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", "fuser": "GridFuser"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_composes(command: str) -> None:
+    overrides = [word for word in shlex.split(command)[3:] if "=" in word]
+    if not all(registered.names(stage) for stage in STAGES):
+        pytest.skip("some stage has no plugin yet")
+    choices = [override.split("=")[1].split(",") for override in overrides if override.split("=")[0] in STAGES]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for k in range(max(map(len, choices), default=1)):
+            compose("config", overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides])
+
+
+def _kth(override: str, k: int) -> str:
+    values = override.split("=")[1].split(",")
+    return values[k % len(values)]
