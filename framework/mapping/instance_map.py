@@ -15,7 +15,7 @@ import numpy.typing as npt
 import open3d as o3d
 
 from framework.atomic_files import written_whole
-from framework.data import Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, View
+from framework.data import Bool, Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.evidence import Evidence, EvidenceRows
@@ -67,6 +67,11 @@ class InstanceMap(SceneMap):
     def byte_count(self) -> int:
         return self.voxels.byte_count + self.labels.byte_count
 
+    @property
+    def instance_count(self) -> int:
+        """Without the condition on vertices, which takes a mesh."""
+        return int(self._counts().sum())
+
     def changed(self) -> None:
         """To be called after the map was written: what was derived from it is out of date."""
         self.__dict__.pop("_surface", None)
@@ -84,11 +89,7 @@ class InstanceMap(SceneMap):
 
     @cached_property
     def _surface(self) -> InstanceMesh:
-        counts = np.zeros(self.table.last_id + 1, np.bool_)
-        for record in self.table.records.values():
-            counts[record.id] = (
-                record.observations >= self.min_observations and record.confidence >= self.min_confidence
-            )
+        counts = self._counts()
         vertices, triangles, colors, instance_ids, class_ids = extract_mesh(
             self.voxels.grid, self.voxels.block_count, self.labels.evidence, counts
         )
@@ -96,6 +97,14 @@ class InstanceMap(SceneMap):
         instance_ids[sizes[instance_ids] < self.min_vertices] = 0
         class_ids[instance_ids == 0] = -1  # what belongs to no object has no class, whatever mask once bled over it
         return InstanceMesh(vertices, triangles, colors, instance_ids, class_ids, self.classes)
+
+    def _counts(self) -> Bool:
+        """(ids + 1,) whether an instance has been observed often enough, by id."""
+        counts = np.zeros(self.table.last_id + 1, np.bool_)
+        for record in self.table.records.values():
+            enough = record.observations >= self.min_observations
+            counts[record.id] = enough and record.confidence >= self.min_confidence
+        return counts
 
     def instances(self) -> Mapping[int, Instance]:
         mesh = self.mesh()
