@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 import numpy.typing as npt
@@ -95,7 +96,7 @@ class BayesianTsdf(MapFuser):
             self.min_vertices,
         )
         self._integrator = Integrator(self.scene.voxels, sensor)
-        self._together: Counter[tuple[int, int]] = Counter()  # frames in which two instances looked like one object
+        self._together: Counter[tuple[int, int]] = Counter()  # frames that see two instances as one, less those as two
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self._agree_on_classes(clusters.classes)
@@ -175,17 +176,15 @@ class BayesianTsdf(MapFuser):
         )
 
     def _merge_instances(self, overlaps: Overlaps, instance_ids: Int32) -> None:
-        """Merges two instances that keep lying under one cluster while no frame sees them as two (after Voxblox++)."""
-        matched_elsewhere = set(instance_ids[instance_ids > 0].tolist())
+        """Merges two instances that keep lying under one cluster and are hardly ever seen as two (after Voxblox++)."""
+        matched = sorted(set(instance_ids[instance_ids > 0].tolist()))
+        self._together.subtract(combinations(matched, 2))
         for k, row in enumerate(overlaps.over_smaller):
             kept = int(instance_ids[k])
-            if kept == 0:
-                continue
-            for other in overlaps.instance_ids[row > self.merge_overlap].tolist():
-                if other == kept:
-                    continue
+            covered = overlaps.instance_ids[row > self.merge_overlap].tolist() if kept else []
+            for other in set(covered) - set(matched):
                 pair = (min(kept, other), max(kept, other))
-                self._together[pair] += -1 if other in matched_elsewhere else 1
+                self._together[pair] += 1
                 if self._together[pair] >= self.merge_frames:
                     self.scene.merge(*pair)
                     self._forget(pair[1])
