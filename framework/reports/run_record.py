@@ -100,20 +100,21 @@ class RunRecord:
             log.warning("partial run, %s: its figures are in %s", reason(result.stopped_by), PARTIAL_METRICS)
 
 
+_FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped"}
+_QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
+
+
 def headline(metrics: Mapping[str, Any]) -> str:
     """The main figures of a run in one line."""
-    told = [
-        str(metrics["sequence"]),
-        f"{metrics['frames']} frames at {metrics['fps']:.1f}/s",
-        *(f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics[key]),
-        f"{metrics['instances.count']} instances",
-        *(form.format(metrics[key]) for key, form in _QUALITY.items() if metrics.get(key) is not None),
-    ]
+    told = [str(metrics["sequence"]), f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
+    told += [f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics[key]]
+    if metrics["pose_source"] == "ground_truth":
+        told.append("given poses")
+    elif metrics.get("trajectory.ate_rmse_m") is not None:
+        told.append(f"ATE {metrics['trajectory.ate_rmse_m']:.3f} m")
+    told.append(f"{metrics['instances.count']} instances")
+    told += [f"{word} {metrics[key]:.2f}" for key, word in _QUALITY.items() if metrics.get(key) is not None]
     return " | ".join(told)
-
-
-_FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped"}
-_QUALITY = {"trajectory.ate_rmse_m": "ATE {:.3f} m", "instances.ap50": "AP50 {:.2f}", "instances.ap25": "AP25 {:.2f}"}
 
 
 def reason(stopped_by: BaseException) -> str:

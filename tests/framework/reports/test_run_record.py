@@ -202,8 +202,11 @@ def test_pose_source_is_what_the_poses_are(room: CornerRoom) -> None:
 
 def test_the_headline_tells_what_matters() -> None:
     metrics = {"sequence": "room0", "frames": 9, "fps": 3.21, "frames_lost": 2, "frames_skipped": 0}
-    metrics |= {"instances.count": 4, "trajectory.ate_rmse_m": 0.0123, "instances.ap50": None}
-    assert headline(metrics) == "room0 | 9 frames at 3.2/s | 2 lost | 4 instances | ATE 0.012 m"
+    metrics |= {"instances.count": 4, "trajectory.ate_rmse_m": 0.0123, "instances.ap50": 0.5, "instances.ap25": None}
+    told = headline(metrics | {"pose_source": "tracked"})
+    assert told == "room0 | 9 frames at 3.2/s | 2 lost | ATE 0.012 m | 4 instances | AP50 0.50"
+    told = headline(metrics | {"pose_source": "ground_truth"})
+    assert told == "room0 | 9 frames at 3.2/s | 2 lost | given poses | 4 instances | AP50 0.50"
 
 
 # Provenance
