@@ -14,15 +14,23 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Float64, Int32
+from framework.refinement.gaussian import (
+    ABSENT,
+    add_moments,
+    add_point,
+    add_to,
+    constant_exponential,
+    exponentials,
+    floor_eigenvalues,
+    log_densities,
+    raise_to,
+    set_coefficients,
+)
 
 Int64 = npt.NDArray[np.int64]
 
-LOG_2PI = float(np.log(2 * np.pi))
 MIN_SUPPORT = 4.0  # points that a component needs to have a covariance of its own in 3D; with fewer it is dropped
-JACOBI_SWEEPS = 6  # of a 3x3 matrix: converges quadratically, 4 suffice for double precision
 BLOCK = 256  # points that a kernel handles at once: their densities stay in the first-level cache
-ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are
-SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
 
 
 @dataclass(frozen=True)
@@ -132,7 +140,7 @@ def _fit_one(
     outlier[0], outlier[1] = outlier_fraction, 1.0 / volume
     moments = np.zeros((components, 10))
     for i in range(count):
-        _add(moments[labels[i]], points[i], center, 1.0 - outlier_fraction)
+        add_point(moments[labels[i]], points[i], center, 1.0 - outlier_fraction)
     _maximize(moments, center, count, variance_floor, weights, means, covariances)
     xyz = np.empty((3, count), np.float32)  # centered, so that single precision suffices
     for i in range(count):
@@ -144,7 +152,7 @@ def _fit_one(
         if weights.sum() == 0.0:
             return
         for j in range(components):
-            _set_coefficients(weights[j], means[j], covariances[j], rows[j])
+            set_coefficients(weights[j], means[j], covariances[j], rows[j])
             for a in range(3):
                 rows[j, 1 + a] = means[j, a] - center[a]
         log_outlier = np.float32(math.log(outlier[0] * outlier[1])) if outlier[0] > 0 else ABSENT
@@ -172,116 +180,21 @@ def _expect(
         n = len(x)
         largest[:n] = log_outlier
         for j in range(components):
-            _log_densities(x, y, z, rows[j], densities[j])
+            log_densities(x, y, z, rows[j], densities[j])
             if j < own_components:
-                _add_to(densities[j], odds[first : first + n])
-            _raise_to(largest, densities[j], n)
-        _constant_exponential(log_outlier, largest, evidence, n)
+                add_to(densities[j], odds[first : first + n])
+            raise_to(largest, densities[j], n)
+        constant_exponential(log_outlier, largest, evidence, n)
         outliers_before = evidence[:n].copy()
         for j in range(components):
-            _exponentials(densities[j], largest, evidence, n)
+            exponentials(densities[j], largest, evidence, n)
         for i in range(n):
             total += largest[i] + math.log(evidence[i])
             evidence[i] = np.float32(1.0) / evidence[i]
             outliers += outliers_before[i] * evidence[i]
         for j in range(components):
-            _add_moments(x, y, z, densities[j], evidence, moments[j])
+            add_moments(x, y, z, densities[j], evidence, moments[j])
     return total, outliers
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
-    """out[i] = log(pi_k N(x_i | mu_k, Sigma_k))."""
-    c, mx, my, mz, w00, w10, w11, w20, w21, w22 = row
-    half = np.float32(-0.5)
-    for i in range(len(x)):
-        dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
-        a, b, d = w00 * dx, w10 * dx + w11 * dy, w20 * dx + w21 * dy + w22 * dz
-        out[i] = c + half * (a * a + b * b + d * d)
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _add_to(values: Float32, summands: Float32) -> None:
-    for i in range(len(summands)):
-        values[i] += summands[i]
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _raise_to(values: Float32, others: Float32, n: int) -> None:
-    """values = max(values, others), of the first n; a comparison vectorizes where max() does not."""
-    for i in range(n):
-        values[i] = others[i] if others[i] > values[i] else values[i]
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _exp(t: np.float32) -> np.float32:
-    """exp(t) for t <= 0 with a relative error of 3e-7, in steps that vectorize: 2^k * 2^r with |r| <= 1/2.
-
-    Below exp(-50) = 2e-22 it stays there: products with denormal numbers are a hundred times slower.
-    """
-    t = max(t, np.float32(-50.0)) * np.float32(1.4426950408889634)
-    k = math.floor(t + np.float32(0.5))
-    r = t - np.float32(k)
-    p = np.float32(1.3398874e-3)
-    p = p * r + np.float32(9.6184373e-3)
-    p = p * r + np.float32(5.5503324e-2)
-    p = p * r + np.float32(2.4022648e-1)
-    p = p * r + np.float32(6.9314720e-1)
-    p = p * r + np.float32(1.0)
-    return p * np.int32((np.int32(k) + np.int32(127)) << np.int32(23)).view(np.float32)
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _constant_exponential(log_density: np.float32, largest: Float32, evidence: Float32, n: int) -> None:
-    for i in range(n):
-        evidence[i] = _exp(log_density - largest[i])
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """densities = exp(densities - largest), added to the evidence; of the first n."""
-    for i in range(n):
-        densities[i] = _exp(densities[i] - largest[i])
-        evidence[i] += densities[i]
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Adds sum_i gamma_i (1, x_i, x_i x_i^T); single precision suffices within a block."""
-    zero = np.float32(0.0)
-    s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
-    for i in range(len(x)):
-        gamma = densities[i] * scale[i]
-        gx, gy, gz = gamma * x[i], gamma * y[i], gamma * z[i]
-        s += gamma
-        sx += gx
-        sy += gy
-        sz += gz
-        sxx += gx * x[i]
-        sxy += gx * y[i]
-        sxz += gx * z[i]
-        syy += gy * y[i]
-        syz += gy * z[i]
-        szz += gz * z[i]
-    for a, value in enumerate((s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz)):
-        moment[a] += value
-
-
-@njit(cache=True, nogil=True)
-def _add(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Adds gamma * (1, x, x x^T) of the centered point; of the symmetric matrix the upper triangle."""
-    x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
-    gx, gy, gz = gamma * x, gamma * y, gamma * z
-    moment[0] += gamma
-    moment[1] += gx
-    moment[2] += gy
-    moment[3] += gz
-    moment[4] += gx * x
-    moment[5] += gx * y
-    moment[6] += gx * z
-    moment[7] += gy * y
-    moment[8] += gy * z
-    moment[9] += gz * z
 
 
 @njit(cache=True, nogil=True)
@@ -305,59 +218,7 @@ def _maximize(
         Sigma[1, 1] = moments[j, 7] / N_k - y * y
         Sigma[1, 2] = Sigma[2, 1] = moments[j, 8] / N_k - y * z
         Sigma[2, 2] = moments[j, 9] / N_k - z * z
-        _floor_eigenvalues(Sigma, variance_floor)
-
-
-@njit(cache=True, nogil=True)
-def _floor_eigenvalues(Sigma: Float64, floor: float) -> None:
-    """Raises the eigenvalues of a symmetric (3, 3) matrix to at least `floor`, in place (cyclic Jacobi)."""
-    A, V = Sigma.copy(), np.eye(3)
-    for _ in range(JACOBI_SWEEPS):
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
-                t = 1.0 / (abs(theta) + math.sqrt(theta * theta + 1.0))
-                t = t if theta >= 0 else -t
-                c = 1.0 / math.sqrt(t * t + 1.0)
-                s = t * c
-                for r in range(3):
-                    A[r, p], A[r, q] = c * A[r, p] - s * A[r, q], s * A[r, p] + c * A[r, q]
-                for r in range(3):
-                    A[p, r], A[q, r] = c * A[p, r] - s * A[q, r], s * A[p, r] + c * A[q, r]
-                for r in range(3):
-                    V[r, p], V[r, q] = c * V[r, p] - s * V[r, q], s * V[r, p] + c * V[r, q]
-    if min(A[0, 0], A[1, 1], A[2, 2]) >= floor:
-        return
-    for r in range(3):
-        for c in range(3):
-            Sigma[r, c] = 0.0
-            for k in range(3):
-                Sigma[r, c] += V[r, k] * max(A[k, k], floor) * V[c, k]
-
-
-@njit(cache=True, nogil=True)
-def _set_coefficients(weight: float, mean: Float64, Sigma: Float64, row: Float32) -> None:
-    """row = log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
-
-    Whitening by L^-1 keeps single precision accurate where the entries of Sigma^-1 would cancel.
-    """
-    if weight <= 0.0:
-        row[:] = 0.0
-        row[0] = ABSENT
-        return
-    l00 = math.sqrt(Sigma[0, 0])
-    l10, l20 = Sigma[1, 0] / l00, Sigma[2, 0] / l00
-    l11 = math.sqrt(Sigma[1, 1] - l10 * l10)
-    l21 = (Sigma[2, 1] - l20 * l10) / l11
-    l22 = math.sqrt(Sigma[2, 2] - l20 * l20 - l21 * l21)
-    row[0] = math.log(weight) - 1.5 * LOG_2PI - math.log(l00 * l11 * l22)
-    row[1], row[2], row[3] = mean[0], mean[1], mean[2]
-    row[4] = 1.0 / l00
-    row[5], row[6] = -l10 / (l00 * l11), 1.0 / l11
-    row[7] = (l10 * l21 / l11 - l20) / (l00 * l22)
-    row[8], row[9] = -l21 / (l11 * l22), 1.0 / l22
+        floor_eigenvalues(Sigma, variance_floor)
 
 
 @njit(cache=True, nogil=True)
@@ -382,7 +243,7 @@ def _coefficients(weights: Float64, means: Float64, covariances: Float64) -> Flo
     rows = np.zeros((*weights.shape, 10), np.float32)
     for k in range(weights.shape[0]):
         for j in range(weights.shape[1]):
-            _set_coefficients(weights[k, j], means[k, j], covariances[k, j], rows[k, j])
+            set_coefficients(weights[k, j], means[k, j], covariances[k, j], rows[k, j])
     return rows
 
 
@@ -417,14 +278,14 @@ def _claim_block(
             xyz[a, i] = points[i, a]
     largest, own, others = np.full(n, log_outlier), np.zeros(n, np.float32), np.empty(n, np.float32)
     for j in range(components):
-        _log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
+        log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
         if j < own_components:
-            _add_to(densities[j], odds[:n])
-        _raise_to(largest, densities[j], n)
-    _constant_exponential(log_outlier, largest, others, n)
+            add_to(densities[j], odds[:n])
+        raise_to(largest, densities[j], n)
+    constant_exponential(log_outlier, largest, others, n)
     for j in range(own_components):
-        _exponentials(densities[j], largest, own, n)
+        exponentials(densities[j], largest, own, n)
     for j in range(own_components, components):
-        _exponentials(densities[j], largest, others, n)
+        exponentials(densities[j], largest, others, n)
     for i in range(n):
         claimed[i] = own[i] > min_posterior * (own[i] + others[i])
