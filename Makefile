@@ -53,7 +53,7 @@ PIP_INSTALL = PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_USE_PEP517=1 $(BIN)/python -m 
 # torch by its exact version first: pip then takes a local CPU wheel where the machine offers one.
 $(INSTALLED): pyproject.toml
 	@$(MAKE) --no-print-directory system-libraries
-	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv --clear $(VENV)
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv $(VENV)
 	@echo "installing the libraries into $(VENV)"
 	@$(PIP_INSTALL) 'torch==2.13.0'
 	@$(PIP_INSTALL) --editable '.[dev]'
