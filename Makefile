@@ -18,7 +18,8 @@ PYTHON ?= $(shell for python in python3 python3.13 python3.12 python3.11; do \
 
 .PHONY: help
 help: ## this list
-	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | column -t -s $$'\t'
+	@sed -nE 's/^([a-z-]+):.*## (.*)/\1\t\2/p' $(MAKEFILE_LIST) | while IFS=$$'\t' read -r target says; do \
+		printf '%-18s%s\n' "$$target" "$$says"; done
 
 .PHONY: demo
 demo: $(INSTALLED) ## map the synthetic room, leave the record in outputs/demo
@@ -44,12 +45,18 @@ clean: ## remove the environment and all caches; outputs stay
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis
 	find framework plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
+# The first time pip shows its downloads, which are large; later, after a change of pyproject.toml, only what is wrong.
+# PIP_USE_PEP517 spares the older pips a warning about one of Hydra's libraries.
+PIP_INSTALL = PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_USE_PEP517=1 $(BIN)/python -m pip install \
+	$(if $(wildcard $(INSTALLED)),--quiet)
+
 # torch by its exact version first: pip then takes a local CPU wheel where the machine offers one.
 $(INSTALLED): pyproject.toml
 	@$(MAKE) --no-print-directory system-libraries
-	@test -x $(BIN)/python || "$(or $(PYTHON),python3)" -m venv $(VENV)
-	$(BIN)/python -m pip install 'torch==2.13.0'
-	$(BIN)/python -m pip install --editable '.[dev]'
+	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv $(VENV)
+	@echo "installing the libraries into $(VENV)"
+	@$(PIP_INSTALL) 'torch==2.13.0'
+	@$(PIP_INSTALL) --editable '.[dev]'
 	@touch $(INSTALLED)
 
 # What is missing of: Python with venv, git (for the commit in the run records), Open3D's shared libraries.
@@ -72,9 +79,9 @@ system-libraries: ## install the system packages that are missing, with apt
 	if ! command -v apt-get >/dev/null; then \
 		echo "missing:$$missing; install what your system calls them" >&2; exit 1; \
 	elif test "$$(id -u)" = 0; then \
-		echo "installing$$missing"; DEBIAN_FRONTEND=noninteractive bash -c "$$apt"; \
+		echo "installing$$missing"; DEBIAN_FRONTEND=noninteractive bash -c "$$apt" >/dev/null; \
 	elif sudo -n true 2>/dev/null || { test -t 0 && command -v sudo >/dev/null; }; then \
-		echo "installing$$missing"; sudo DEBIAN_FRONTEND=noninteractive bash -c "$$apt"; \
+		echo "installing$$missing"; sudo DEBIAN_FRONTEND=noninteractive bash -c "$$apt" >/dev/null; \
 	else \
 		echo "as root: $$apt" >&2; exit 1; \
 	fi

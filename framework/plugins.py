@@ -10,6 +10,7 @@ import dataclasses
 import importlib.resources
 import inspect
 import re
+import signal
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -126,4 +127,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it silently
     main()
