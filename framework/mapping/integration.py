@@ -71,7 +71,7 @@ def _surface_blocks(depth, view, sensor, block_size, stride, found, counts):
             ray_y = (np.float32(v) - view.cy) / view.fy
             for u in range(0, width, stride):
                 d = depth[v, u]
-                if d <= sensor.min_depth or d >= sensor.max_depth:
+                if d < sensor.min_depth or d > sensor.max_depth:
                     continue
                 ray_x = (np.float32(u) - view.cx) / view.fx
                 dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]
@@ -109,7 +109,7 @@ def _free_blocks(grid, depth, view, sensor, block_size, stride, found, counts):
             ray_y = (np.float32(v) - view.cy) / view.fy
             for u in range(0, width, stride):
                 d = depth[v, u]
-                if d <= sensor.min_depth or d >= sensor.max_depth:
+                if d < sensor.min_depth or d > sensor.max_depth:
                     continue
                 ray_x = (np.float32(u) - view.cx) / view.fx
                 dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]

@@ -91,7 +91,7 @@ def test_rounding_does_not_wrap_round(frame_number: int) -> None:
     assert (grid.color[active][near >= 0] == 255).all()
 
 
-@pytest.mark.parametrize("depth", [SENSOR.min_depth, SENSOR.max_depth, 0.0, 7.0])
+@pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
 def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float) -> None:
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, depth, np.float32), CAMERA)
     integrator = new_integrator()
