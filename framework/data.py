@@ -103,6 +103,9 @@ class Frame:
             raise DataError(f"{where}depth must be 0 or positive, found {self.depth.min()} m")
         if self.T_world_camera is not None:
             check_rigid(where + "T_world_camera", self.T_world_camera)
+        # the kernels are compiled for this layout; a view such as bgr[..., ::-1] is copied into it
+        object.__setattr__(self, "color", np.ascontiguousarray(self.color))
+        object.__setattr__(self, "depth", np.ascontiguousarray(self.depth))
         if self.truth is not None:
             _check(where + "truth.instance_ids", self.truth.instance_ids, self.camera.shape, np.int32)
 

@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Camera, Detections, Float32, Float64, Frame, Int32, PointClusters, Pose
+from framework.errors import DataError
 
 
 def inverse(T_a_b: Float64) -> Float64:
@@ -71,12 +72,13 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
     """Each mask's pixels that have a depth reading, as points in the world: eq. [5] of the paper.
 
     Overlapping masks give overlapping clusters. A mask without any reading gives an empty cluster, so that cluster k
-    always is detection k.
+    always is detection k. Raises DataError for masks of another size than the frame.
     """
     height, width = frame.depth.shape
-    found = np.flatnonzero(
-        detections.masks & (frame.depth > 0)
-    )  # several times faster than nonzero in three dimensions
+    if detections.masks.shape[1:] != (height, width):
+        raise DataError(f"frame {frame.index}: masks must be {(height, width)}, found {detections.masks.shape[1:]}")
+    # several times faster than nonzero in three dimensions
+    found = np.flatnonzero(detections.masks & (frame.depth > 0))
     cluster, pixel = np.divmod(found.astype(np.int32), np.int32(height * width))
     v, u = np.divmod(pixel, np.int32(width))
     pixels = np.stack([u, v], axis=1).astype(np.int32)

@@ -15,6 +15,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, PointClusters
+from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance
 from framework.mapping.sensor import Pinhole
 from framework.mapping.voxel_grid import Grid, find_block
@@ -54,7 +55,16 @@ def _link_points(pixels, cluster, first, following):
 
 
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """The points of `clusters` by the pixel of the (height, width) image that they were seen at, in order."""
+    """The points of `clusters` by the pixel of the (height, width) image that they were seen at, in order.
+
+    Raises DataError when a pixel lies outside the image: a refiner made it up, and kernels do not check bounds.
+    """
+    u, v = clusters.pixels.T
+    if len(u) and (min(u.min(), v.min()) < 0 or u.max() >= shape[1] or v.max() >= shape[0]):
+        raise DataError(
+            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
+            f"v in [{v.min()}, {v.max()}]"
+        )
     lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
     _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next)
     return lists
@@ -91,23 +101,37 @@ def look_up_instances(grid: Grid, evidence: Evidence, depth: Float32, view: Pinh
                 instance_ids[v, u] = best_instance(evidence, grid.label_row[block], voxel_number(i, j, k))
 
 
+@njit(cache=True, nogil=True)
+def _count_visible(instance_ids, visible):
+    """Adds to visible (ids + 1,) the pixels of each instance."""
+    for v in range(instance_ids.shape[0]):
+        for u in range(instance_ids.shape[1]):
+            visible[instance_ids[v, u]] += 1
+
+
+@njit(cache=True, nogil=True)
+def _count_votes(pixels, cluster, instance_ids, column, votes):
+    """Adds to votes (N, M + 1) the points of each cluster that fall on the instance of each column."""
+    for p in range(pixels.shape[0]):
+        if cluster[p] >= 0:
+            votes[cluster[p], column[instance_ids[pixels[p, 1], pixels[p, 0]]]] += 1
+
+
 def count_overlaps(clusters: PointClusters, instance_ids: Int32) -> Overlaps:
     """Votes of the clusters' pixels on `instance_ids` (H, W), the instances seen in the frame."""
-    visible = np.bincount(instance_ids.ravel())
+    visible = np.zeros(instance_ids.max() + 1, np.int32)
+    _count_visible(instance_ids, visible)
     visible[0] = 0
     seen = np.flatnonzero(visible)
-    column = np.full(len(visible), len(seen))  # of each id in the table of votes; the last one stands for no instance
-    column[seen] = np.arange(len(seen))
-    members = clusters.cluster >= 0
-    cluster = clusters.cluster[members].astype(np.int64)
-    u, v = clusters.pixels[members].T
-    n, m = len(clusters), len(seen) + 1
-    votes = np.bincount(cluster * m + column[instance_ids[v, u]], minlength=n * m).reshape(n, m)
+    column = np.full(len(visible), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
+    column[seen] = np.arange(len(seen), dtype=np.int32)
+    votes = np.zeros((len(clusters), len(seen) + 1), np.int32)
+    _count_votes(clusters.pixels, clusters.cluster, instance_ids, column, votes)
     return Overlaps(
         instance_ids=seen.astype(np.int32),
-        visible=visible[seen].astype(np.int32),
-        sizes=votes.sum(axis=1).astype(np.int32),
-        votes=votes[:, :-1].astype(np.int32),
+        visible=visible[seen],
+        sizes=votes.sum(axis=1, dtype=np.int32),
+        votes=votes[:, :-1],
     )
 
 

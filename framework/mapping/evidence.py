@@ -158,13 +158,16 @@ def update_voxel(evidence, row, n, measurement, point):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _find_blocks_under_clusters(grid, active, near_pixel, first_point, wants_row):
-    """Notes in wants_row (A,) the blocks without a row that have a voxel under some cluster."""
+def _find_blocks_under_clusters(grid, active, near_pixel, measurement, first_point, wants_row):
+    """Notes in wants_row (A,) the blocks without a row that have a voxel under some cluster with an instance."""
     for a in prange(active.shape[0]):
         wants_row[a] = False
         if grid.label_row[active[a]] < 0:
             for n in range(BLOCK_VOXELS):
-                if near_pixel[a, n] >= 0 and first_point[near_pixel[a, n]] >= 0:
+                p = first_point[near_pixel[a, n]] if near_pixel[a, n] >= 0 else np.int32(-1)
+                while p >= 0 and measurement.instance_id[measurement.cluster[p]] == 0:
+                    p = measurement.next_point[p]
+                if p >= 0:
                     wants_row[a] = True
                     break
 
@@ -222,10 +225,12 @@ class EvidenceRows:
         """Updates the voxels near the measured surface: `active` (A,) and `near_pixel` (A, 512) of
         Integrator.integrate.
         """
+        if not measurement.instance_id.any():
+            return  # the frame says nothing, neither for an instance nor against one
         first_point = measurement.first_point.ravel()
         wants_row = np.empty(len(active), np.bool_)
         evicted = np.empty(len(active), np.int32)
-        _find_blocks_under_clusters(self.voxels.grid, active, near_pixel, first_point, wants_row)
+        _find_blocks_under_clusters(self.voxels.grid, active, near_pixel, measurement, first_point, wants_row)
         self._add_rows(active[wants_row])
         _update(self.voxels.grid, active, near_pixel, self.evidence, measurement, first_point, evicted)
         self.evicted += int(evicted.sum())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
@@ -26,6 +27,8 @@ from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
 
 FORMAT = 1  # of the saved file; a change of meaning counts it up
+BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
+ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
 
 
 class InstanceMap(SceneMap):
@@ -138,11 +141,7 @@ class InstanceMap(SceneMap):
         }
         arrays: dict[str, npt.NDArray[Any]] = {
             "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
-            "block_coords": grid.block_coords[:b],
-            "tsdf": grid.tsdf[:b],
-            "weight": grid.weight[:b],
-            "color": grid.color[:b],
-            "label_row": grid.label_row[:b],
+            **{name: getattr(grid, name)[:b] for name in BLOCK_ARRAYS},
             **{name: array[:r] for name, array in evidence._asdict().items()},
         }
         with written_whole(path) as temporary, temporary.open("wb") as file:
@@ -162,7 +161,7 @@ class InstanceMap(SceneMap):
         scene.classes = tuple(header["classes"])
         scene.voxels.allocate(arrays["block_coords"])
         b = scene.voxels.block_count
-        for name in ("tsdf", "weight", "color", "label_row"):
+        for name in BLOCK_ARRAYS:
             getattr(scene.voxels.grid, name)[:b] = arrays[name]
         scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
         scene.labels.row_count = len(scene.labels.evidence.instance_ids)
@@ -183,9 +182,9 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
         if damaged is not None:
             raise DataError(f"{path}: the checksum of {damaged} does not hold; the file is damaged, map again")
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+            arrays = {name: file[name] for name in ("header", *ARRAYS)}
         header = json.loads(arrays.pop("header").tobytes())
-    except (OSError, ValueError, KeyError, zipfile.BadZipFile, NotImplementedError) as error:
+    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{path} is not a map that can be read: {error}") from error
     if header.get("format") != FORMAT:
         raise DataError(f"{path} has map format {header.get('format')}, this version reads {FORMAT}")
@@ -207,7 +206,8 @@ def _instance(record: InstanceRecord, vertices: Int32, points: Float32) -> Insta
 
 def _oriented_box(points: Float32) -> Box:
     """The box along the principal axes of the points' convex hull (Open3D); `robust` lets flat and thin sets pass."""
+    four = np.resize(points, (max(len(points), 4), 3))  # Qhull refuses fewer; repeated points change nothing
     box = o3d.geometry.OrientedBoundingBox.create_from_points(
-        o3d.utility.Vector3dVector(points.astype(np.float64)), robust=True
+        o3d.utility.Vector3dVector(four.astype(np.float64)), robust=True
     )
     return Box(np.asarray(box.center), np.asarray(box.extent), np.asarray(box.R))

@@ -18,7 +18,16 @@ from numba import njit, prange
 from framework.data import Float64, Frame, Int32
 from framework.geometry import inverse
 from framework.mapping.sensor import Sensor, pinhole
-from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, REGION_SIDE, WEIGHT_ONE, VoxelGrid, find_block, grown
+from framework.mapping.voxel_grid import (
+    BLOCK_SIDE,
+    BLOCK_VOXELS,
+    REGION_SIDE,
+    TSDF_MAX,
+    WEIGHT_ONE,
+    VoxelGrid,
+    find_block,
+    grown,
+)
 from framework.mapping.voxel_walk import inverses, leave_cell
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
@@ -164,6 +173,8 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
+    most = np.float32(TSDF_MAX)
+    white = np.float32(255.0)
     right = np.float32(width) - half
     bottom = np.float32(height) - half
     for a in prange(active.shape[0]):
@@ -207,7 +218,9 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
             stored = np.float32(tsdf[n])
             target = min(sdf, band) * to_units
             value = stored + portion * (target - stored) if w_old > zero else target
-            tsdf[n] = np.int16(np.floor(value + rounding)) if seen else tsdf[n]
+            # near 1, rounding lifts the widest distance to 32768, which would wrap round to UNSEEN
+            value = max(-most, min(np.floor(value + rounding), most))
+            tsdf[n] = np.int16(value) if seen else tsdf[n]
             weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
             near[n] = pixel[n] if seen & (abs(sdf) <= near_band) else np.int32(-1)
             share[n] = portion if sdf < band else zero  # colour belongs to the surface, not to the air before it
@@ -215,7 +228,8 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
             if share[n] > zero:
                 for c in range(3):
                     old = np.float32(rgb[n, c])
-                    rgb[n, c] = np.uint8(old + share[n] * (np.float32(color[pixel[n], c]) - old) + rounding)
+                    mean = old + share[n] * (np.float32(color[pixel[n], c]) - old)
+                    rgb[n, c] = np.uint8(min(mean + rounding, white))
 
 
 class Integrator:

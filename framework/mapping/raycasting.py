@@ -80,7 +80,8 @@ def _first_surface(grid, origin, dx, dy, dz, near, far):
     shifted = (origin[0] + half * voxel, origin[1] + half * voxel, origin[2] + half * voxel)
     inverse_length = one / np.sqrt(dx * dx + dy * dy + dz * dz)
     one_voxel = voxel * inverse_length  # in units of z, as is all that follows
-    hair = np.float32(1e-3) * one_voxel
+    # past a border by a thousandth of a voxel, and by more than z can be rounded, or the ray would stand still
+    hair = max(np.float32(1e-3) * one_voxel, np.float32(2.5e-7) * far)
     key = np.int64(-2)
     region = np.int32(-1)
     z = near
@@ -124,7 +125,7 @@ def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_f
     block_size = np.float32(BLOCK_SIDE) * voxel
     region_size = np.float32(REGION_SIDE) * block_size
     block_radius = np.float32(0.8661) * block_size + voxel
-    region_radius = np.float32(0.8661) * region_size
+    region_radius = np.float32(0.8661) * region_size + voxel
     half = np.float32(0.5)
     for region in range(region_count):
         x = (np.float32(grid.region_coords[region, 0]) + half) * region_size

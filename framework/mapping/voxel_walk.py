@@ -10,8 +10,9 @@ from framework.mapping.voxel_grid import BLOCK_SIDE, UNSEEN, find_block
 
 @njit(cache=True, nogil=True, forceinline=True)
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
+    """leave_cell() along one axis."""
     cell = np.floor((start + z * d) * inverse_size)
-    if d > np.float32(0.0):
+    if inverse_d > np.float32(0.0):  # not d: a ray along the slab has inverse_d huge and leaves it far ahead
         cell += np.float32(1.0)
     return (cell * size - start) * inverse_d
 

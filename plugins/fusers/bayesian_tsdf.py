@@ -151,9 +151,7 @@ class BayesianTsdf(MapFuser):
             self.scene.table.records[instance_id].visible += 1
 
     def _log_probabilities(self, clusters: PointClusters) -> Float64:
-        """(N, C) log P(O_u = c | I_t), with the uniform distribution mixed in so that no zero kills a class for good.
-        (N, C) log P(O_u = c | I_t), with the uniform distribution mixed in so that no zero kills a class for good.
-        """
+        """(N, C) log P(O_u = c | I_t), the uniform distribution mixed in so that no zero kills a class for good."""
         p = clusters.class_probabilities.astype(np.float64)
         return np.asarray(np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)))
 

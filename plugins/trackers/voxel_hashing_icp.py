@@ -9,7 +9,7 @@ import numpy as np
 from framework.data import Float64, Frame, Pose, View
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
-from framework.parameters import check_bounds
+from framework.parameters import check_bounds, require
 from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearise
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
@@ -55,6 +55,7 @@ class VoxelHashingIcp(PoseTracker):
             min_matched=(0.0, 1.0),
             min_information=(0.0, 1.0),
         )
+        require(np.log2(self.finest) % 1 == 0, "VoxelHashingIcp.finest", self.finest, "1, 1/2, 1/4, ...")
         self._weights = Weights(
             max_distance=np.float32(self.max_distance),
             min_normal_dot=np.float32(self.min_normal_dot),
@@ -69,8 +70,11 @@ class VoxelHashingIcp(PoseTracker):
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         if self._T_world_last is None:
-            self._T_world_last = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
-            return Pose(self._T_world_last)
+            T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
+            if not frame.depth.any():  # a world that starts with nothing in it would have nothing to be tracked by
+                return Pose(T_world_camera, lost=True, reason="the frame has no depth")
+            self._T_world_last = T_world_camera
+            return Pose(T_world_camera)
         T_world_view = self._T_world_last @ self._T_last_next
         frame_levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, levels=3)
         view = scene.render(frame_levels[0].camera, T_world_view)

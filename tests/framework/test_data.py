@@ -120,6 +120,16 @@ def test_unsound_data_are_refused_in_one_line(make: Callable[..., object], chang
     assert "\n" not in str(caught.value)
 
 
+def test_a_frame_takes_views_of_images_and_hands_out_whole_ones() -> None:
+    """bgr[..., ::-1] is a view that the kernels could not read."""
+    bgr = np.arange(36, dtype=np.uint8).reshape(3, 4, 3)
+    depth = np.ones((4, 3), np.float32).T
+    made = frame(color=bgr[..., ::-1], depth=depth)
+    assert made.color.flags.c_contiguous
+    assert made.depth.flags.c_contiguous
+    assert np.array_equal(made.color, bgr[..., ::-1])
+
+
 @pytest.mark.parametrize("wrong", [{"width": 0}, {"fx": 0.0}, {"fy": -3.0}, {"cx": np.nan}, {"cy": np.inf}])
 def test_a_camera_checks_itself(wrong: dict[str, float]) -> None:
     numbers = {"width": 4, "height": 3, "fx": 5.0, "fy": 5.0, "cx": 1.5, "cy": 1.0}

@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from framework import geometry
 from framework.data import Camera, Detections, Frame, Pose
+from framework.errors import DataError
 from tests.corner_room import CornerRoom, pose_at
 
 twists = arrays(np.float64, 6, elements=st.floats(-3, 3, width=32))
@@ -130,3 +131,11 @@ def test_lift_leaves_out_pixels_without_a_reading(room: CornerRoom) -> None:
     clusters = geometry.lift(detections, blind, Pose(np.eye(4)))
     assert (len(clusters), len(clusters.points_world)) == (1, 0)
     assert len(geometry.lift(Detections.none(frame.camera.shape, ("a",)), frame, Pose(np.eye(4)))) == 0
+
+
+def test_lift_refuses_masks_of_another_size(room: CornerRoom) -> None:
+    frame, shape = room[0], (1, 1)  # which numpy would stretch over the image without a word
+    masks = np.ones((1, *shape), np.bool_)
+    one = np.ones((1, 1), np.float32)
+    with pytest.raises(DataError, match=r"frame 0: masks must be \(72, 96\), found \(1, 1\)"):
+        geometry.lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("a",)), frame, Pose(np.eye(4)))

@@ -1,10 +1,12 @@
 """Exact small cases of association."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.data import PointClusters
+from framework.errors import DataError
 from framework.mapping.association import count_overlaps, cover_another, list_points_by_pixel, match_one_to_one
 
 SHAPE = (4, 5)
@@ -75,3 +77,25 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 def test_a_second_detection_of_an_object_is_told_by_its_overlap() -> None:
     clusters = clusters_of([columns(0, 3), columns(0, 2), columns(3, 5)], [0.5, 0.9, 0.4])
     assert cover_another(clusters, list_points_by_pixel(clusters, SHAPE), 0.6).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
+def test_a_pixel_outside_the_image_is_refused(pixel: tuple[int, int]) -> None:
+    clusters = clusters_of([columns(0, 2)], [1])
+    clusters.pixels[3] = pixel
+    with pytest.raises(DataError, match="image of 5x4"):
+        list_points_by_pixel(clusters, SHAPE)
+
+
+def test_points_of_no_cluster_have_no_say() -> None:
+    clusters = clusters_of([columns(0, 3), columns(1, 4)], [1, 0.5])
+    clusters.cluster[clusters.pixels[:, 0] == 1] = -1
+    seen = np.full(SHAPE, 4, np.int32)
+    overlaps = count_overlaps(clusters, seen)
+    assert overlaps.sizes.tolist() == [8, 8]
+    assert overlaps.votes.tolist() == [[8], [8]]
+    points = list_points_by_pixel(clusters, SHAPE)
+    assert (points.first >= 0).any(axis=0).tolist() == [True, False, True, True, False]
+    # 4 of the 8 pixels of each are shared: columns 0, 2 against 2, 3
+    assert cover_another(clusters, points, 0.49).tolist() == [False, True]
+    assert cover_another(clusters, points, 0.5).tolist() == [False, False]

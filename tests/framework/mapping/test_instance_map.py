@@ -8,7 +8,8 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import lift
-from framework.mapping.instance_map import InstanceMap
+from framework.mapping.instance_map import InstanceMap, _oriented_box
+from framework.mapping.integration import Integrator
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.analytic_scene import Scene, room, walk
 
@@ -25,11 +26,15 @@ def true_detections(frame: Frame) -> Detections:
     return Detections(masks, boxes, np.full(len(ids), 0.9, np.float32), probabilities, CLASSES)
 
 
+def fused(fuser: BayesianTsdf, scene: Scene, k: int, T: np.ndarray) -> None:
+    frame = scene.frame(T, k)
+    fuser.fuse(frame, Pose(T), lift(true_detections(frame), frame, Pose(T)))
+
+
 def mapped(scene: Scene, frames: int = 12) -> BayesianTsdf:
     fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
     for k, T in enumerate(walk(frames)):
-        frame = scene.frame(T, k)
-        fuser.fuse(frame, Pose(T), lift(true_detections(frame), frame, Pose(T)))
+        fused(fuser, scene, k, T)
     return fuser
 
 
@@ -110,11 +115,42 @@ def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> No
         path.write_bytes(damaged)
         with pytest.raises(DataError, match=r"map\.npz"):
             InstanceMap.load(path)
+    entry = whole.rindex(b"tsdf.npy") - 46  # of that array in the archive's directory, which no checksum covers
+    for place, bit in ((entry + 8, 0x01), (entry + 33, 0x08), (entry + 46, 0x08)):  # "encrypted", comment length, name
+        damaged = bytearray(whole)
+        damaged[place] ^= bit
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"map\.npz"):
+            InstanceMap.load(path)
     path.write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DataError, match=r"map\.npz"):
         InstanceMap.load(path)
     with pytest.raises(DataError, match="absent"):
         InstanceMap.load(tmp_path / "absent.npz")
+
+
+@pytest.mark.parametrize("points", [1, 2, 3])
+def test_an_instance_of_a_few_vertices_has_a_box(points: int) -> None:
+    corners = np.float32([[0, 0, 1], [2, 0, 1], [0, 0, 1]])[:points]
+    box = _oriented_box(corners)
+    assert np.allclose(np.sort(box.extent), [0, 0, 2 if points > 1 else 0], atol=1e-5)
+
+
+def test_mapping_goes_on_after_loading(tmp_path: Path) -> None:
+    """A map that was saved, loaded and mapped into further equals the one that was never saved."""
+    whole, resumed = (BayesianTsdf(voxel_size=0.02, max_depth=4.0) for _ in range(2))
+    for k, T in enumerate(walk(4)):
+        if k == 2:
+            resumed.scene.save(tmp_path / "map.npz")
+            resumed.scene = InstanceMap.load(tmp_path / "map.npz")
+            resumed._integrator = Integrator(resumed.scene.voxels, resumed.scene.sensor)
+            resumed._integrator.frames = k  # on which the rounding of averages depends
+        fused(whole, room(), k, T)
+        fused(resumed, room(), k, T)
+    ours, theirs = whole.scene.mesh(), resumed.scene.mesh()
+    assert len(whole.scene.instances()) == 3
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        assert np.array_equal(getattr(ours, name), getattr(theirs, name))
 
 
 def test_an_empty_map_has_an_empty_mesh(tmp_path: Path) -> None:

@@ -73,6 +73,32 @@ def test_averages_have_no_rounding_bias() -> None:
     assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
 
 
+@pytest.mark.parametrize("frame_number", [987, 2584, 121393])
+def test_rounding_does_not_wrap_round(frame_number: int) -> None:
+    """At these frames frac(k * GOLDEN) is all but 1; air at the widest truncation stays air and white stays white."""
+    assert (frame_number * GOLDEN) % 1.0 > 0.9995
+    scene = room()
+    frame = scene.frame(pose())
+    frame.color[:] = 255
+    integrator = Integrator(VoxelGrid(VOXEL, 0.08, 100_000), SENSOR._replace(truncation_slope=np.float32(0.0)))
+    for number in (1, frame_number):
+        integrator.frames = number - 1
+        active, near = integrator.integrate(frame, np.eye(4), VOXEL)
+    grid = integrator.voxels.grid
+    seen = grid.weight[active] > 0
+    assert (grid.tsdf[active][seen] != UNSEEN).all()
+    assert (grid.tsdf[active][seen] == TSDF_MAX).sum() > 10_000
+    assert (grid.color[active][near >= 0] == 255).all()
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
+def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float) -> None:
+    frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, depth, np.float32), CAMERA)
+    integrator = new_integrator()
+    integrator.integrate(frame, np.eye(4), VOXEL)
+    assert integrator.voxels.block_count == 0
+
+
 def test_noise_averages_out() -> None:
     """40 frames with 10 mm noise leave about 10 / sqrt(40) mm in the voxels at the surface."""
     frame = room().frame(pose())

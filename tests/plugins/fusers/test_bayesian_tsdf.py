@@ -173,3 +173,15 @@ def test_nothing_changes_where_the_scene_is_empty() -> None:
     fused(fuser, frame, [np.ones(CAMERA.shape, np.bool_)], [0.9])
     assert fuser.scene.voxel_count == 0
     assert len(fuser.scene.table.records) == 0
+
+
+def test_only_what_becomes_an_instance_takes_rows_of_evidence(frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    first, second, _ = masks_of(frames[0])
+    fused(fuser, frames[0], [second], [0.2])
+    assert fuser.scene.labels.row_count == 0
+    fused(fuser, frames[0], [first], [0.9])
+    alone = fuser.scene.labels.row_count
+    assert alone > 0
+    fused(fuser, frames[0], [first, second], [0.9, 0.2])
+    assert fuser.scene.labels.row_count == alone

@@ -5,7 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from framework.data import Frame, PointClusters, Pose
+from framework.data import Camera, Frame, PointClusters, Pose
+from framework.errors import ConfigError
 from framework.geometry import inverse, rotation_angle
 from framework.interfaces import SceneMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -87,3 +88,27 @@ def test_garbage_is_lost() -> None:
     garbage = dataclasses.replace(frames[-1], depth=rng.uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32))
     poses, _ = run(VoxelHashingIcp(finest=1.0), [*frames[:4], garbage])
     assert poses[-1].lost
+
+
+def test_a_video_that_begins_covered_is_tracked_from_its_first_reading() -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
+    covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[:3]]
+    poses, _ = run(VoxelHashingIcp(finest=1.0), covered + frames[3:])
+    assert [pose.lost for pose in poses] == [True] * 3 + [False] * 5
+    assert drift(poses[-1], frames[-1])[0] < 0.004
+
+
+@pytest.mark.parametrize("size", [(161, 119), (163, 121)])
+def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
+    camera = Camera(*size, 131.0, 131.0, 80.0, 60.5)
+    frames = [room().frame(T, k, camera) for k, T in enumerate(walk(10))]
+    for finest in (1.0, 0.5):
+        poses, _ = run(VoxelHashingIcp(finest=finest), frames)
+        assert not any(pose.lost for pose in poses)
+        assert drift(poses[-1], frames[-1])[0] < 0.006
+
+
+@pytest.mark.parametrize("finest", [0.3, 0.75, 2.0])
+def test_the_finest_resolution_is_a_power_of_a_half(finest: float) -> None:
+    with pytest.raises(ConfigError, match=r"VoxelHashingIcp\.finest"):
+        VoxelHashingIcp(finest=finest)
