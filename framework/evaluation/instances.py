@@ -293,7 +293,8 @@ def _carry(points: Float32, labels: Int32, targets: Float32, max_distance: float
     tree = cKDTree(points, balanced_tree=False)
     # the bound is exclusive in SciPy
     _, nearest = tree.query(targets, distance_upper_bound=np.nextafter(max_distance, np.inf), workers=-1)
-    return np.append(labels, np.int32(0))[nearest]  # SciPy answers "none" with the index after the last
+    carried: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy answers "none" with the index after the last
+    return carried
 
 
 def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
