@@ -17,7 +17,7 @@ from numba import njit, prange
 from framework.data import Bool, Float32, Int32, PointClusters
 from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance
-from framework.mapping.sensor import Pinhole
+from framework.mapping.sensor import Pinhole, seen_point
 from framework.mapping.voxel_grid import Grid, find_block
 from framework.mapping.voxel_walk import voxel_number
 
@@ -81,7 +81,6 @@ def look_up_instances(grid: Grid, evidence: Evidence, depth: Float32, view: Pinh
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
     for v in prange(height):
-        ray_y = (np.float32(v) - view.cy) / view.fy
         key = np.int64(-2)
         region = np.int32(-1)
         for u in range(width):
@@ -89,10 +88,7 @@ def look_up_instances(grid: Grid, evidence: Evidence, depth: Float32, view: Pinh
             z = depth[v, u]
             if z <= np.float32(0.0):
                 continue
-            ray_x = (np.float32(u) - view.cx) / view.fx
-            x = view.t[0] + z * (view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2])
-            y = view.t[1] + z * (view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2])
-            w = view.t[2] + z * (view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2])
+            x, y, w = seen_point(view, u, v, z)
             i = int(np.floor(x * scale + half))
             j = int(np.floor(y * scale + half))
             k = int(np.floor(w * scale + half))

@@ -17,7 +17,7 @@ from numba import njit, prange
 
 from framework.data import Float64, Frame, Int32
 from framework.geometry import inverse
-from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.sensor import Sensor, pinhole, ray_direction
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
@@ -68,18 +68,14 @@ def _surface_blocks(depth, view, sensor, block_size, stride, found, counts):
         n = 0
         for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
             v = row * stride
-            ray_y = (np.float32(v) - view.cy) / view.fy
             for u in range(0, width, stride):
                 d = depth[v, u]
                 if d < sensor.min_depth or d > sensor.max_depth:
                     continue
-                ray_x = (np.float32(u) - view.cx) / view.fx
-                dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]
-                dy = view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2]
-                dz = view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2]
+                dx, dy, dz = ray_direction(view, u, v)
                 band = sensor.truncation + sensor.truncation_slope * d
                 # samples at most half a block apart along the ray
-                length = np.sqrt(ray_x * ray_x + ray_y * ray_y + np.float32(1.0))
+                length = np.sqrt(dx * dx + dy * dy + dz * dz)
                 steps = int(np.ceil(np.float32(4.0) * band * length * inverse_size))
                 for s in range(steps + 1):
                     z = d - band + np.float32(2.0) * band * np.float32(s) / np.float32(steps)
@@ -106,16 +102,12 @@ def _free_blocks(grid, depth, view, sensor, block_size, stride, found, counts):
         region_size = block_size * np.float32(REGION_SIDE)
         for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
             v = row * stride
-            ray_y = (np.float32(v) - view.cy) / view.fy
             for u in range(0, width, stride):
                 d = depth[v, u]
                 if d < sensor.min_depth or d > sensor.max_depth:
                     continue
-                ray_x = (np.float32(u) - view.cx) / view.fx
-                dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]
-                dy = view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2]
-                dz = view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2]
-                length = np.sqrt(ray_x * ray_x + ray_y * ray_y + np.float32(1.0))
+                dx, dy, dz = ray_direction(view, u, v)
+                length = np.sqrt(dx * dx + dy * dy + dz * dz)
                 step = np.float32(0.75) * block_size / length
                 z = sensor.min_depth
                 stop = d - sensor.truncation - sensor.truncation_slope * d

@@ -14,7 +14,7 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
-from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
 from framework.mapping.voxel_grid import BLOCK_SIDE, REGION_BLOCKS, REGION_SIDE, UNSEEN, VoxelGrid, find_block
 from framework.mapping.voxel_walk import distance_at, inverses, leave_cell, trilinear, trilinear_color, voxel_number
 
@@ -190,12 +190,8 @@ def cast(grid, view, tile_near, tile_far, depth, normals):
         key = np.int64(-2)
         region = np.int32(-1)
         for v in range(tile // tiles_x * TILE, min(height, (tile // tiles_x + 1) * TILE)):
-            ray_y = (np.float32(v) - view.cy) / view.fy
             for u in range(tile % tiles_x * TILE, min(width, (tile % tiles_x + 1) * TILE)):
-                ray_x = (np.float32(u) - view.cx) / view.fx
-                dx = view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2]
-                dy = view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2]
-                dz = view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2]
+                dx, dy, dz = ray_direction(view, u, v)
                 z = _first_surface(grid, origin, dx, dy, dz, near, far)
                 depth[v, u] = z
                 nx = ny = nz = np.float32(0.0)
@@ -225,17 +221,13 @@ def paint(grid, view, depth, color):
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     for v in prange(height):
-        ray_y = (np.float32(v) - view.cy) / view.fy
         key = np.int64(-2)
         region = np.int32(-1)
         for u in range(width):
             z = depth[v, u]
             if z > np.float32(0.0):
-                ray_x = (np.float32(u) - view.cx) / view.fx
-                x = (view.t[0] + z * (view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2])) * scale
-                y = (view.t[1] + z * (view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2])) * scale
-                w = (view.t[2] + z * (view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2])) * scale
-                key, region = trilinear_color(grid, x, y, w, key, region, color[v, u])
+                x, y, w = seen_point(view, u, v, z)
+                key, region = trilinear_color(grid, x * scale, y * scale, w * scale, key, region, color[v, u])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -245,7 +237,6 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
     for v in prange(height):
-        ray_y = (np.float32(v) - view.cy) / view.fy
         key = np.int64(-2)
         region = np.int32(-1)
         for u in range(width):
@@ -253,10 +244,7 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
             class_ids[v, u] = -1
             z = depth[v, u]
             if z > np.float32(0.0):
-                ray_x = (np.float32(u) - view.cx) / view.fx
-                x = view.t[0] + z * (view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2])
-                y = view.t[1] + z * (view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2])
-                w = view.t[2] + z * (view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2])
+                x, y, w = seen_point(view, u, v, z)
                 i = int(np.floor(x * scale + half))
                 j = int(np.floor(y * scale + half))
                 k = int(np.floor(w * scale + half))

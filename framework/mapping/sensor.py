@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from numba import njit
 
 from framework.data import Camera, Float32, Float64
 
@@ -46,3 +47,22 @@ def pinhole(camera: Camera, T: Float64) -> Pinhole:
         R=np.ascontiguousarray(T[:3, :3], np.float32),
         t=np.ascontiguousarray(T[:3, 3], np.float32),
     )
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def ray_direction(view, u, v):
+    """(dx, dy, dz), in the world, m for each m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
+    ray_x = (np.float32(u) - view.cx) / view.fx
+    ray_y = (np.float32(v) - view.cy) / view.fy
+    return (
+        view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2],
+        view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2],
+        view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2],
+    )
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def seen_point(view, u, v, z):
+    """(x, y, z), in the world, m: the point that pixel (u, v) sees at depth z (m). `view` holds T_world_camera."""
+    dx, dy, dz = ray_direction(view, u, v)
+    return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz

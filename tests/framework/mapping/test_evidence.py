@@ -1,6 +1,7 @@
 """The compact Bayesian update against the two recursions written out over all labels."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -8,11 +9,15 @@ from framework.mapping.evidence import (
     NEW_CLASSES,
     SLOTS,
     Evidence,
+    EvidenceRows,
     Measurement,
+    add_evidence,
     best_class,
+    best_counted_instance,
     best_instance,
     update_voxel,
 )
+from framework.mapping.voxel_grid import VoxelGrid
 from plugins.fusers.bayesian_tsdf import _class_gains
 
 FLOOR = 0.05
@@ -145,3 +150,44 @@ def test_class_gains_are_relative_to_the_classes_not_named() -> None:
     assert NEW_CLASSES == 4
     rest = (0.04 + 0.03 + 0.03) / 3
     assert np.allclose(gains, np.log(p / rest), atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("ids", "logs", "merged_ids", "merged_logs"),
+    [
+        ([1, 2, 3, 0], [5, 4, 3, 0], [3, 1, 0, 0], [7, 5, 0, 0]),  # both there: the sum becomes the best
+        ([2, 1, 4, 5], [5, 4, 3, 2], [3, 1, 4, 5], [5, 4, 3, 2]),  # only the dropped one there: it is renamed
+        ([1, 2, 3, 4], [5, 4, -6, 1], [1, 4, 3, 0], [5, 1, -2, 0]),  # evidence against either counts too
+        ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # the dropped one not there: nothing changes
+    ],
+)
+def test_merging_adds_evidence_and_keeps_the_best_first(
+    ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
+) -> None:
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
+    rows.row_count = 1
+    rows.evidence.instance_ids[0, 7], rows.evidence.instance_log[0, 7] = ids, logs
+    rows.merge_instances(3, 2)
+    found = dict(zip(rows.evidence.instance_ids[0, 7].tolist(), rows.evidence.instance_log[0, 7].tolist(), strict=True))
+    assert found == dict(zip(merged_ids, merged_logs, strict=True))
+    assert rows.evidence.instance_ids[0, 7, 0] == merged_ids[0]
+    assert ((rows.evidence.instance_ids[0, 7] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
+
+
+def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
+    labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5)) == 1
+    assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5)) == 1
+    assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
+
+
+def test_the_likeliest_instance_that_counts_need_not_be_the_likeliest() -> None:
+    evidence = blank()
+    evidence.instance_ids[0, 0], evidence.instance_log[0, 0] = [1, 5, 3, 2], [9, 4, 7, -1]
+    counts = np.ones(6, np.bool_)
+    assert best_counted_instance(evidence, 0, 0, counts) == 1
+    counts[1] = False
+    assert best_counted_instance(evidence, 0, 0, counts) == 3
+    counts[[3, 5]] = False
+    assert best_counted_instance(evidence, 0, 0, counts) == 0, "the rest is likelier than 2"

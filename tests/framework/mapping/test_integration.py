@@ -23,7 +23,7 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     """Every voxel of the active blocks, in double precision and plain numpy."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
-    active, _ = integrator.integrate(frame, frame.T_world_camera, VOXEL)
+    active, near_pixel = integrator.integrate(frame, frame.T_world_camera, VOXEL)
     grid = integrator.voxels.grid
     i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
     offsets = np.stack([i, j, k], axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
@@ -48,6 +48,9 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     assert both.sum() > 20_000
     unit = SENSOR.max_truncation / TSDF_MAX
     assert np.abs(stored * unit - distance)[both].max() < 2e-5
+    near = np.where(seen & (np.abs(d - p[..., 2]) <= VOXEL), row * CAMERA.width + column, -1)
+    clear_band = clear & (np.abs(np.abs(d - p[..., 2]) - VOXEL) > 1e-4)
+    assert (near_pixel == near)[clear_band].all()
     expected_weight = np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
     assert np.abs(grid.weight[active] - expected_weight)[both].max() <= 1
 
@@ -97,6 +100,30 @@ def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float)
     integrator = new_integrator()
     integrator.integrate(frame, np.eye(4), VOXEL)
     assert integrator.voxels.block_count == 0
+
+
+def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
+    frame = room().frame(pose())
+    frame.color[:] = (10, 200, 90)
+    sensor = SENSOR._replace(truncation_slope=np.float32(0.0))
+    integrator = Integrator(VoxelGrid(VOXEL, sensor.max_truncation, 100_000), sensor)
+    active, near = integrator.integrate(frame, np.eye(4), VOXEL)
+    grid = integrator.voxels.grid
+    assert np.abs(grid.color[active][near >= 0].astype(int) - (10, 200, 90)).max() <= 1
+    air = grid.tsdf[active] == TSDF_MAX
+    assert air.sum() > 1000
+    assert (grid.color[active][air] == 0).all()
+
+
+def test_old_surfaces_give_way_at_the_greatest_weight() -> None:
+    """The weight stops at max_weight, in the stored unit, at the highest that may be set too."""
+    frame = room().frame(pose())
+    for most in (3.0, 255.0):
+        sensor = SENSOR._replace(max_weight=np.float32(most), full_weight_depth=np.float32(100.0))
+        integrator = Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), sensor)
+        for _ in range(int(most) + 3):
+            integrator.integrate(frame, np.eye(4), VOXEL)
+        assert integrator.voxels.grid.weight.max() == most * WEIGHT_ONE
 
 
 def test_noise_averages_out() -> None:
