@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 import zlib
@@ -144,8 +145,8 @@ class InstanceMap(SceneMap):
             **{name: getattr(grid, name)[:b] for name in BLOCK_ARRAYS},
             **{name: array[:r] for name, array in evidence._asdict().items()},
         }
-        with written_whole(path) as temporary, temporary.open("wb") as file:
-            np.savez(file, allow_pickle=False, **arrays)
+        with written_whole(path) as temporary:
+            _write(temporary, arrays)
 
     @classmethod
     def load(cls, path: Path) -> InstanceMap:
@@ -172,6 +173,19 @@ class InstanceMap(SceneMap):
             record = InstanceRecord(class_log=class_log, observed_in=observed_in, **entry)
             scene.table.records[record.id] = record
         return scene
+
+
+def _write(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
+    """Writes an .npz as np.load reads it: the same arrays give the same bytes, and light compression.
+
+    Label rows are mostly zeros and distances far from the surface all alike: level 1 makes a map a fifth of its size, at
+    about the speed of a disk.
+    """
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, array in arrays.items():
+            file = io.BytesIO()
+            np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), file.getbuffer(), zipfile.ZIP_DEFLATED, compresslevel=1)
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:

@@ -104,6 +104,12 @@ def test_save_and_load_round_trip(scene_map: InstanceMap, tmp_path: Path) -> Non
     assert np.array_equal(scene_map.render(camera, T).instance_ids, loaded.render(camera, T).instance_ids)
 
 
+def test_the_same_map_is_the_same_file(scene_map: InstanceMap, tmp_path: Path) -> None:
+    scene_map.save(tmp_path / "map.npz")
+    InstanceMap.load(tmp_path / "map.npz").save(tmp_path / "again.npz")
+    assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+
+
 def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     scene_map.save(path)
