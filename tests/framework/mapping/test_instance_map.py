@@ -135,6 +135,23 @@ def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> No
         InstanceMap.load(tmp_path / "absent.npz")
 
 
+@pytest.mark.parametrize("threshold", [{"min_observations": 13}, {"min_confidence": 0.95}, {"min_vertices": 10_000}])
+def test_what_is_below_a_threshold_does_not_count(
+    scene_map: InstanceMap, tmp_path: Path, threshold: dict[str, float]
+) -> None:
+    scene_map.save(tmp_path / "map.npz")
+    loaded = InstanceMap.load(tmp_path / "map.npz")
+    assert len(loaded.instances()) == 3
+    for name, value in threshold.items():
+        setattr(loaded, name, value)
+    loaded.changed()
+    assert not loaded.instances()
+    assert not loaded.mesh().instance_ids.any()
+    assert (loaded.mesh().class_ids == -1).all()
+    T = walk(12)[3]
+    assert loaded.render(room().frame(T).camera, T).instance_ids.any(), "association still needs it"
+
+
 @pytest.mark.parametrize("points", [1, 2, 3])
 def test_an_instance_of_a_few_vertices_has_a_box(points: int) -> None:
     corners = np.float32([[0, 0, 1], [2, 0, 1], [0, 0, 1]])[:points]

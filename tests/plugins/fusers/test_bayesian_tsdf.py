@@ -86,6 +86,7 @@ def test_two_halves_become_one_when_they_are_seen_as_one(frames: list[Frame]) ->
         fused(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.5])
     [instance] = fuser.scene.instances().values()
     assert instance.observations == 12, "a frame that saw both halves counts once"
+    assert fuser.scene.table.records[instance.id].visible == 12, "so does a frame that had both in view"
     assert set(np.unique(fuser.scene.mesh().instance_ids)) == {0, instance.id}
 
 
@@ -185,3 +186,18 @@ def test_only_what_becomes_an_instance_takes_rows_of_evidence(frames: list[Frame
     assert alone > 0
     fused(fuser, frames[0], [first, second], [0.9, 0.2])
     assert fuser.scene.labels.row_count == alone
+
+
+def test_an_instance_of_which_a_few_pixels_show_is_not_in_view(frames: list[Frame]) -> None:
+    """Else its confidence would fall in every frame at whose border or behind whose objects a bit of it shows."""
+    fuser = new_fuser(create_points=50)
+    mask = masks_of(frames[0])[0]
+    fused(fuser, frames[0], [mask], [0.9])
+    [record] = fuser.scene.table.records.values()
+    v, u = np.nonzero(mask)
+    middle = (abs(v - int(np.median(v))) <= 2) & (abs(u - int(np.median(u))) <= 2)
+    for rows, visible in (((v[middle], u[middle]), 1), ((v, u), 2)):
+        depth = np.zeros_like(frames[0].depth)
+        depth[rows] = frames[0].depth[rows]
+        fused(fuser, dataclasses.replace(frames[0], index=1, depth=depth), [], [])
+        assert record.visible == visible

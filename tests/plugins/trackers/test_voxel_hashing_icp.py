@@ -112,3 +112,25 @@ def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
 def test_the_finest_resolution_is_a_power_of_a_half(finest: float) -> None:
     with pytest.raises(ConfigError, match=r"VoxelHashingIcp\.finest"):
         VoxelHashingIcp(finest=finest)
+
+
+def test_the_map_is_seen_from_where_a_steady_motion_leads(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(6))]
+    tracker = VoxelHashingIcp(finest=1.0)
+    poses, scene = run(tracker, frames[:5])
+    seen_from = []
+    render = scene.render
+    monkeypatch.setattr(scene, "render", lambda camera, T: seen_from.append(T) or render(camera, T))
+    tracker.track(frames[5], scene)
+    last, before = poses[4].T_world_camera, poses[3].T_world_camera
+    np.testing.assert_allclose(seen_from, [last @ inverse(before) @ last], atol=1e-9)
+
+
+@pytest.mark.parametrize("bound", [{"max_step": 0.002}, {"max_turn": 0.001}])
+def test_a_step_beyond_what_is_plausible_is_lost(bound: dict[str, float]) -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(2)[:1] + walk(60)[4:5])]
+    assert not any(pose.lost for pose in run(VoxelHashingIcp(finest=1.0), frames)[0])
+    poses, _ = run(VoxelHashingIcp(finest=1.0, **bound), frames)
+    assert poses[1].lost
+    assert "not plausible" in poses[1].reason
+    assert np.array_equal(poses[1].T_world_camera, poses[0].T_world_camera)

@@ -1,0 +1,36 @@
+"""Halved images."""
+
+import numpy as np
+
+from framework.data import Camera
+from framework.geometry import back_project
+from framework.tracking.pyramid import build_pyramid
+
+
+def test_halving_does_not_mix_two_surfaces_or_holes_into_the_depth() -> None:
+    depth = np.float32([[1.0, 1.02, 1.0, 3.0], [0.0, 1.01, 3.0, 3.0], [0.0, 0.0, 2.0, 2.0], [0.0, 0.0, 2.0, 2.0]])
+    color = np.zeros((4, 4, 3), np.uint8)
+    _, half, _ = build_pyramid(Camera(4, 4, 4.0, 4.0, 1.5, 1.5), depth, color, 1.0, 3)
+    np.testing.assert_allclose(half.depth, [[1.01, 1.0], [0.0, 2.0]], rtol=1e-6)
+
+
+def test_a_halved_pixel_looks_between_its_four() -> None:
+    camera = Camera(9, 7, 8.0, 8.5, 3.7, 3.1)  # odd: the last row and column are dropped
+    depth = np.ones(camera.shape, np.float32)
+    color = np.zeros((*camera.shape, 3), np.uint8)
+    _, half, quarter = build_pyramid(camera, depth, color, 1.0, 3)
+    for level, side in ((half, 2), (quarter, 4)):
+        assert level.camera.shape == (7 // side, 9 // side) == level.depth.shape
+        v, u = np.mgrid[:side, :side].reshape(2, -1)
+        ones = np.ones(side * side, np.float32)
+        four = back_project(camera, np.stack([u, v], axis=1).astype(np.int32), ones).mean(axis=0)
+        one = back_project(level.camera, np.zeros((1, 2), np.int32), ones[:1])[0]
+        np.testing.assert_allclose(one, four, atol=1e-6)
+
+
+def test_finest_chooses_the_first_level() -> None:
+    camera = Camera(16, 8, 8.0, 8.0, 7.5, 3.5)
+    images = np.ones(camera.shape, np.float32), np.full((*camera.shape, 3), 255, np.uint8)
+    levels = build_pyramid(camera, *images, 0.5, 3)
+    assert [level.camera.width for level in levels] == [8, 4, 2]
+    np.testing.assert_allclose(levels[2].intensity, 1, atol=1e-6)
