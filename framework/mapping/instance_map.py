@@ -178,8 +178,8 @@ class InstanceMap(SceneMap):
 def _write(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     """Writes an .npz as np.load reads it: the same arrays give the same bytes, and light compression.
 
-    Label rows are mostly zeros and distances far from the surface all alike: level 1 makes a map a fifth of its size, at
-    about the speed of a disk.
+    Label rows are mostly zeros and distances far from the surface all alike: level 1 makes a map a fifth of its size,
+    at about the speed of a disk.
     """
     with zipfile.ZipFile(path, "w") as archive:
         for name, array in arrays.items():
