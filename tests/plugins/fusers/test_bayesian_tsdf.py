@@ -86,8 +86,30 @@ def test_two_halves_become_one_when_they_are_seen_as_one(frames: list[Frame]) ->
         fused(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.5])
     [instance] = fuser.scene.instances().values()
     assert instance.observations == 12, "a frame that saw both halves counts once"
-    assert fuser.scene.table.records[instance.id].visible == 12, "so does a frame that had both in view"
     assert set(np.unique(fuser.scene.mesh().instance_ids)) == {0, instance.id}
+
+
+def test_two_instances_that_keep_lying_under_one_cluster_are_merged(frames: list[Frame]) -> None:
+    """Weak detections of the whole, which would take long to outvote the voxels of the other half."""
+    fuser = new_fuser(merge_frames=3)
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
+    fused(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
+    for k in range(1, 4):
+        fused(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
+    assert len(fuser.scene.table.records) == 2, "once apart and three times together is not yet three more"
+    fused(fuser, dataclasses.replace(frames[0], index=4), [whole], [0.1])
+    [record] = fuser.scene.table.records.values()
+    assert record.id == 1
+    assert record.observations == 5
+    assert record.visible == 5, "a frame that had both in view counts once"
+    assert record.detections == 6
+    assert record.score_sum == pytest.approx(0.9 + 0.8 + 4 * 0.1)
+    assert record.class_probabilities[0] == pytest.approx(0.68**6 / (0.68**6 + 0.32**6), abs=1e-4)
+    assert set(np.unique(fuser.scene.labels.evidence.instance_ids)) == {0, 1}
+    fused(fuser, dataclasses.replace(frames[0], index=5), [whole], [0.9])
+    assert record.observations == 6
 
 
 def test_two_objects_seen_apart_stay_two_under_a_mask_that_covers_both(frames: list[Frame]) -> None:
