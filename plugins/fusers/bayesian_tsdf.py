@@ -103,9 +103,9 @@ class BayesianTsdf(MapFuser):
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self._look_up(frame, pose, clusters)
         instance_ids = self._associate(overlaps, clusters, points, frame)
-        self._observe(overlaps, clusters, instance_ids, frame)
         band = self.label_band * self.voxel_size
         active, near_pixel = self._integrator.integrate(frame, pose.T_world_camera, band)
+        self._observe(overlaps, clusters, instance_ids, frame)
         self.scene.labels.update(active, near_pixel, self._measurement(clusters, points, instance_ids))
         self._merge_instances(overlaps, instance_ids)
         self.scene.changed()
