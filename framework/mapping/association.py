@@ -31,10 +31,13 @@ class Overlaps:
     sizes: Int32  # (N,) pixels of each cluster
     votes: Int32  # (N, M) pixels of both
 
-    @property
-    def over_smaller(self) -> npt.NDArray[np.float64]:
-        """(N, M) shared pixels over the smaller of cluster and visible instance, in [0, 1]."""
-        return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), 1)
+    def over_smaller(self, least: int) -> npt.NDArray[np.float64]:
+        """(N, M) shared pixels over the smaller of cluster and visible instance, in [0, 1].
+
+        The smaller one counts for at least `least` pixels: a few stray voxels of an instance under a cluster would
+        otherwise overlap it completely, and win it from the instance that it belongs to.
+        """
+        return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), least)
 
 
 class PixelLists(NamedTuple):

@@ -43,7 +43,7 @@ class BayesianTsdf(MapFuser):
     label_band: float = 2.0  # voxels, >= 1: label evidence goes to voxels within this distance of the measured surface
     overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap over the smaller of the two
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
-    create_points: int = 50  # pixels, >= 1: and this many
+    create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
     duplicate_overlap: float = 0.6  # in (0, 1]: a cluster that shares this with a better one creates nothing
     merge_overlap: float = 0.5  # in (0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
@@ -129,7 +129,7 @@ class BayesianTsdf(MapFuser):
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame: Frame) -> Int32:
         """(N,) the instance of each cluster, an old or a new one; 0 = none."""
-        match = match_one_to_one(overlaps.over_smaller, self.overlap)
+        match = match_one_to_one(overlaps.over_smaller(self.create_points), self.overlap)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (
             (instance_ids == 0)
@@ -177,7 +177,7 @@ class BayesianTsdf(MapFuser):
         """Merges two instances that keep lying under one cluster and are hardly ever seen as two (after Voxblox++)."""
         matched = sorted(set(instance_ids[instance_ids > 0].tolist()))
         self._together.subtract(combinations(matched, 2))
-        for k, row in enumerate(overlaps.over_smaller):
+        for k, row in enumerate(overlaps.over_smaller(self.create_points)):
             kept = int(instance_ids[k])
             covered = overlaps.instance_ids[row > self.merge_overlap].tolist() if kept else []
             for other in set(covered) - set(matched):

@@ -40,7 +40,8 @@ def test_votes_are_pixels_shared() -> None:
     assert overlaps.visible.tolist() == [4, 8]
     assert overlaps.sizes.tolist() == [12, 8, 4]
     assert overlaps.votes.tolist() == [[0, 8], [4, 0], [0, 0]]
-    assert overlaps.over_smaller.tolist() == [[0, 1], [1, 0], [0, 0]]
+    assert overlaps.over_smaller(least=1).tolist() == [[0, 1], [1, 0], [0, 0]]
+    assert overlaps.over_smaller(least=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
 
 
 def test_nothing_seen_and_nothing_detected() -> None:
@@ -55,7 +56,7 @@ def test_nothing_seen_and_nothing_detected() -> None:
         ("a", "b"),
     )
     assert count_overlaps(empty, seen).votes.shape == (0, 0)
-    assert len(match_one_to_one(count_overlaps(empty, seen + 1).over_smaller, 0.3)) == 0
+    assert len(match_one_to_one(count_overlaps(empty, seen + 1).over_smaller(least=1), 0.3)) == 0
     assert len(cover_another(empty, list_points_by_pixel(empty, SHAPE), 0.5)) == 0
 
 
@@ -63,6 +64,15 @@ def test_the_best_overlap_goes_first_and_each_instance_goes_once() -> None:
     overlap = np.array([[0.6, 0.9], [0.0, 0.8], [0.3, 0.2]])
     assert match_one_to_one(overlap, 0.35).tolist() == [1, -1, -1]
     assert match_one_to_one(overlap, 0.25).tolist() == [1, -1, 0]
+
+
+def test_stray_pixels_of_an_instance_do_not_win_a_cluster() -> None:
+    seen = np.zeros(SHAPE, np.int32)
+    seen[:, :3] = 1  # the object, of which the cluster sees most
+    seen[0, 0] = 2  # a stray voxel of another one
+    overlaps = count_overlaps(clusters_of([columns(0, 2)], [1]), seen)
+    assert match_one_to_one(overlaps.over_smaller(least=1), 0.35).tolist() == [1], "7/8 of 1 lose against 1/1 of 2"
+    assert match_one_to_one(overlaps.over_smaller(least=4), 0.35).tolist() == [0]
 
 
 @settings(max_examples=100, deadline=None)
