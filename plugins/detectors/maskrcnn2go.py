@@ -21,7 +21,7 @@ from framework.detection.boxes import anchor_grid, clip, decode, to_original_ima
 from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
 from framework.detection.nms import suppress_boxes
 from framework.detection.roi_align import roi_align
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
 from framework.parameters import require
@@ -223,7 +223,7 @@ def _find_weights(folder: Path) -> Path:
         if place.is_dir():
             return place
     looked = " and ".join(str(place.resolve()) for place in dict.fromkeys(places))
-    raise ConfigError(f"detector.weights: there is no folder {looked}; put {' and '.join(SHA256)} there")
+    raise DataError(f"detector.weights: there is no folder {looked}; put {' and '.join(SHA256)} there")
 
 
 def _read_network(folder: Path) -> tuple[Graph, Tensors]:

@@ -239,7 +239,7 @@ def test_a_relative_path_works_from_any_folder(tmp_path, monkeypatch):
 
 def test_absent_weights_are_one_line_that_says_where_they_were_looked_for(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ConfigError) as caught:
+    with pytest.raises(DataError) as caught:
         MaskRCNN2Go(weights=Path("no/such/folder"), device="cpu")
     message = str(caught.value)
     assert message.startswith("detector.weights: there is no folder")
