@@ -25,6 +25,7 @@ from framework.mapping.voxel_grid import (
     TSDF_MAX,
     WEIGHT_ONE,
     VoxelGrid,
+    device,
     find_block,
     grown,
 )
@@ -35,7 +36,7 @@ RECENT = 1024  # block keys that a chunk remembers, to pass on each block about 
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _remember(recent, bx, by, bz):
     """True when the block was passed to `recent` (RECENT, 4) lately; remembers it otherwise."""
     slot = (bx * 73856093 ^ by * 19349669 ^ bz * 83492791) & (RECENT - 1)
@@ -48,7 +49,7 @@ def _remember(recent, bx, by, bz):
     return False
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _note(found, n, bx, by, bz):
     """Writes a block into `found` (M, 3) if there is room; the caller counts on, and asks again with more room."""
     if n < found.shape[0]:
