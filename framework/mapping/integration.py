@@ -28,6 +28,7 @@ from framework.mapping.voxel_grid import (
     device,
     find_block,
     grown,
+    is_solid,
 )
 from framework.mapping.voxel_walk import inverses, leave_cell
 
@@ -158,6 +159,7 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
     height, width = depth.shape
     depth = depth.ravel()
     color = color.reshape(-1, 3)
+    solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     to_units = np.float32(1.0) / grid.tsdf_unit
     one = np.float32(1.0)
     half = np.float32(0.5)
@@ -217,6 +219,7 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
             weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
             near[n] = pixel[n] if seen & (abs(sdf) <= near_band) else np.int32(-1)
             share[n] = portion if sdf < band else zero  # colour belongs to the surface, not to the air before it
+        solid[block] = is_solid(tsdf)
         for n in range(BLOCK_VOXELS):
             if share[n] > zero:
                 for c in range(3):

@@ -57,6 +57,7 @@ class Grid(NamedTuple):
     tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
     weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
     color: UInt8  # (B, 512, 3) RGB
+    solid: UInt8  # (B,) 1 where a voxel of it lies behind a surface: rays skip the others until they come near one
     label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
 
 
@@ -164,6 +165,23 @@ def _link_neighbors(grid, block):
             grid.neighbors[before, c] = block
 
 
+@device
+def is_solid(tsdf):
+    """Whether a voxel of a block, tsdf (512,), was seen to lie behind a surface."""
+    lowest = np.int16(0)
+    for n in range(BLOCK_VOXELS):
+        stored = tsdf[n]
+        lowest = min(lowest, stored if stored != UNSEEN else np.int16(0))
+    return lowest < 0
+
+
+@njit(cache=True, nogil=True)
+def find_solid_blocks(grid, block_count):
+    """Fills grid.solid of the first blocks from their distances."""
+    for block in range(block_count):
+        grid.solid[block] = is_solid(grid.tsdf[block])
+
+
 @njit(cache=True, nogil=True)
 def _rehash(old_keys, old_regions, keys, regions):
     size = keys.shape[0]
@@ -196,6 +214,7 @@ class VoxelGrid:
             tsdf=np.full((first, BLOCK_VOXELS), UNSEEN, np.int16),
             weight=np.zeros((first, BLOCK_VOXELS), np.uint16),
             color=np.zeros((first, BLOCK_VOXELS, 3), np.uint8),
+            solid=np.zeros(first, np.uint8),
             label_row=np.full(first, -1, np.int32),
         )
 
@@ -233,6 +252,7 @@ class VoxelGrid:
                 tsdf=grown(grid.tsdf, more, UNSEEN),
                 weight=grown(grid.weight, more, 0),
                 color=grown(grid.color, more, 0),
+                solid=grown(grid.solid, more, 0),
                 label_row=grown(grid.label_row, more, -1),
             )
         if self.region_count == len(grid.region_blocks):
