@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import cv2
 import numpy as np
 from numba import njit, prange
 
@@ -29,11 +30,14 @@ from framework.mapping.voxel_grid import (
     find_block,
     grown,
     is_solid,
+    pack_color,
+    unpack_color,
 )
 from framework.mapping.voxel_walk import inverses, leave_cell
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
+FAR = 1e9  # m
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
 
 
@@ -146,86 +150,120 @@ def _number_blocks(grid, coords, stamp, frame, active):
     return n
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_pixel):
-    """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
+@device
+def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
+    """The pixel number that sees each voxel of a block into pixel (512,), its depth (m) into scratch[:512].
 
-    `camera` holds T_camera_world. `rounding` in [0, 1) is added before values are truncated to integers. near_pixel
-    (A, 512) gets the number of the pixel that sees each voxel within near_band m of the measured surface, -1 for the
-    others.
-
-    A block is done in passes over its 512 voxels that hold no branches, so that the compiler vectorises them.
+    Voxels outside the image get pixel 0 and a depth beyond any reading.
     """
-    height, width = depth.shape
-    depth = depth.ravel()
-    color = color.reshape(-1, 3)
-    solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
-    to_units = np.float32(1.0) / grid.tsdf_unit
-    one = np.float32(1.0)
-    half = np.float32(0.5)
-    zero = np.float32(0.0)
+    one, half = np.float32(1.0), np.float32(0.5)
+    seven, three, six = np.int32(7), np.int32(3), np.int32(6)
+    right, bottom = np.float32(shape[1]) - half, np.float32(shape[0]) - half
+    width = np.int32(shape[1])
+    x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE)
+    y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE)
+    z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE)
     voxel = grid.voxel_size
+    R00, R01, R02, t0 = camera.R[0, 0] * voxel, camera.R[0, 1] * voxel, camera.R[0, 2] * voxel, camera.t[0]
+    R10, R11, R12, t1 = camera.R[1, 0] * voxel, camera.R[1, 1] * voxel, camera.R[1, 2] * voxel, camera.t[1]
+    R20, R21, R22, t2 = camera.R[2, 0] * voxel, camera.R[2, 1] * voxel, camera.R[2, 2] * voxel, camera.t[2]
+    for n in range(BLOCK_VOXELS):
+        m = np.int32(n)
+        x, y, z = x0 + np.float32(m & seven), y0 + np.float32((m >> three) & seven), z0 + np.float32(m >> six)
+        px = R00 * x + R01 * y + R02 * z + t0
+        py = R10 * x + R11 * y + R12 * z + t1
+        pz = R20 * x + R21 * y + R22 * z + t2
+        w = one / max(pz, min_depth)
+        u = camera.fx * px * w + camera.cx
+        v = camera.fy * py * w + camera.cy
+        inside = (pz > min_depth) & (u > -half) & (v > -half) & (u < right) & (v < bottom)
+        column = np.int32(u + half) if inside else np.int32(0)
+        line = np.int32(v + half) if inside else np.int32(0)
+        pixel[n] = line * width + column
+        scratch[n] = pz if inside else np.float32(FAR)
+
+
+@device
+def _average_distances(tsdf, weight, to_units, sensor, rounding, scratch):
+    """The running average of the distances and weights (512,) of a block.
+
+    scratch[512:] holds each voxel's reading (m) and gets the new observation's share in the average of the colour, 0
+    where there is none; scratch[:512] holds the depth (m) and gets the distance to the measured surface, m.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
     most = np.float32(TSDF_MAX)
-    white = np.float32(255.0)
-    right = np.float32(width) - half
-    bottom = np.float32(height) - half
+    for n in range(BLOCK_VOXELS):
+        d = scratch[n + BLOCK_VOXELS]
+        band = sensor.truncation + sensor.truncation_slope * d
+        sdf = d - scratch[n]
+        seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
+        w_new = weight_one * min(one, full2 / max(d * d, np.float32(1e-6)))
+        w_old = np.float32(weight[n])
+        portion = w_new / (w_old + w_new) if seen else zero
+        stored = np.float32(tsdf[n])
+        target = min(sdf, band) * to_units
+        value = stored + portion * (target - stored) if w_old > zero else target
+        # near 1, rounding lifts the widest distance to 32768, which would wrap round to UNSEEN
+        value = max(-most, min(np.floor(value + rounding), most))
+        tsdf[n] = np.int16(value) if seen else tsdf[n]
+        weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
+        scratch[n] = sdf if seen else np.float32(FAR)
+        # colour belongs to the surface, not to the air before it
+        scratch[n + BLOCK_VOXELS] = portion if sdf < band else zero
+
+
+@device
+def _average_colors(packed, seen, rounding, scratch):
+    """The running average of the packed colours (512,) of a block with those seen (512,), RGBA in their bytes."""
+    byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
+    four, brightest = np.float32(4.0), np.float32(4 * 255)
+    for n in range(BLOCK_VOXELS):
+        share = scratch[n + BLOCK_VOXELS]
+        new = np.int32(seen[n])
+        red, green, blue = unpack_color(packed[n])
+        red += share * (four * np.float32(new & byte) - red)
+        green += share * (four * np.float32((new >> one_byte) & byte) - green)
+        blue += share * (four * np.float32((new >> two_bytes) & byte) - blue)
+        packed[n] = pack_color(
+            min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
+        )
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_pixel):
+    """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
+
+    `color` (H, W) holds a pixel's RGBA in its bytes, `camera` T_camera_world. `rounding` in [0, 1) is added before
+    values are truncated to integers. near_pixel (A, 512) gets the number of the pixel that sees each voxel within
+    near_band m of the measured surface, -1 for the others.
+
+    A block is done in passes over its 512 voxels that the compiler vectorises: they hold no branches, read images only
+    in loops of their own, and share one scratch array, so that few arrays have to be proved not to overlap.
+    """
+    shape = depth.shape
+    depth = depth.ravel()
+    color = color.ravel()
+    solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
+    to_units = np.float32(1.0) / grid.tsdf_unit
     for a in prange(active.shape[0]):
         block = active[a]
-        tsdf = grid.tsdf[block]
-        weight = grid.weight[block]
-        rgb = grid.color[block]
-        near = near_pixel[a]
+        tsdf, weight, packed, near = grid.tsdf[block], grid.weight[block], grid.color[block], near_pixel[a]
         pixel = np.empty(BLOCK_VOXELS, np.int32)
-        distance = np.empty(BLOCK_VOXELS, np.float32)
-        share = np.empty(BLOCK_VOXELS, np.float32)
-        x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE) * voxel
-        y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE) * voxel
-        z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE) * voxel
+        seen = np.empty(BLOCK_VOXELS, np.uint32)
+        scratch = np.empty(2 * BLOCK_VOXELS, np.float32)
+        _project_voxels(grid, block, camera, sensor.min_depth, shape, pixel, scratch)
         for n in range(BLOCK_VOXELS):
-            m = np.int32(n)
-            x = x0 + np.float32(m & 7) * voxel
-            y = y0 + np.float32((m >> 3) & 7) * voxel
-            z = z0 + np.float32(m >> 6) * voxel
-            px = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
-            py = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
-            pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
-            w = one / max(pz, sensor.min_depth)
-            u = camera.fx * px * w + camera.cx
-            v = camera.fy * py * w + camera.cy
-            inside = (pz > sensor.min_depth) & (u > -half) & (v > -half) & (u < right) & (v < bottom)
-            # outside the image the pixel is 0, whose reading then must not count: the share is 0
-            column = np.int32(u + half) if inside else np.int32(0)
-            line = np.int32(v + half) if inside else np.int32(0)
-            pixel[n] = line * np.int32(width) + column
-            distance[n] = pz
-            share[n] = one if inside else zero
+            scratch[n + BLOCK_VOXELS] = depth[np.uint32(pixel[n])]
         for n in range(BLOCK_VOXELS):
-            d = depth[np.uint32(pixel[n])]
-            band = sensor.truncation + sensor.truncation_slope * d
-            sdf = d - distance[n]
-            seen = (share[n] > zero) & (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-            w_new = weight_one * min(one, full2 / max(d * d, np.float32(1e-6)))
-            w_old = np.float32(weight[n])
-            portion = w_new / (w_old + w_new) if seen else zero
-            stored = np.float32(tsdf[n])
-            target = min(sdf, band) * to_units
-            value = stored + portion * (target - stored) if w_old > zero else target
-            # near 1, rounding lifts the widest distance to 32768, which would wrap round to UNSEEN
-            value = max(-most, min(np.floor(value + rounding), most))
-            tsdf[n] = np.int16(value) if seen else tsdf[n]
-            weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
-            near[n] = pixel[n] if seen & (abs(sdf) <= near_band) else np.int32(-1)
-            share[n] = portion if sdf < band else zero  # colour belongs to the surface, not to the air before it
+            seen[n] = color[np.uint32(pixel[n])]
+        _average_distances(tsdf, weight, to_units, sensor, rounding, scratch)
+        _average_colors(packed, seen, rounding, scratch)
+        for n in range(BLOCK_VOXELS):
+            near[n] = pixel[n] if abs(scratch[n]) <= near_band else np.int32(-1)
         solid[block] = is_solid(tsdf)
-        for n in range(BLOCK_VOXELS):
-            if share[n] > zero:
-                for c in range(3):
-                    old = np.float32(rgb[n, c])
-                    mean = old + share[n] * (np.float32(color[pixel[n], c]) - old)
-                    rgb[n, c] = np.uint8(min(mean + rounding, white))
 
 
 class Integrator:
@@ -259,7 +297,7 @@ class Integrator:
             self.voxels.grid,
             active,
             frame.depth,
-            frame.color,
+            cv2.cvtColor(frame.color, cv2.COLOR_RGB2RGBA).view(np.uint32),
             view,
             self.sensor,
             rounding,

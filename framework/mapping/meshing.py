@@ -13,7 +13,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, UInt8
 from framework.mapping.evidence import Evidence, best_class, best_counted_instance
-from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid, find_block
+from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid, find_block, unpack_color
 from framework.mapping.voxel_walk import voxel_number
 
 NO_VERTEX = -1
@@ -115,7 +115,8 @@ def _place_vertices(grid, evidence, counts, first, cell_vertex, vertices, colors
             vertices[target, 0] = (grid.block_coords[block, 0] * BLOCK_SIDE + x + place[0]) * grid.voxel_size
             vertices[target, 1] = (grid.block_coords[block, 1] * BLOCK_SIDE + y + place[1]) * grid.voxel_size
             vertices[target, 2] = (grid.block_coords[block, 2] * BLOCK_SIDE + z + place[2]) * grid.voxel_size
-            colors[target] = grid.color[nearest, m]
+            red, green, blue = unpack_color(grid.color[nearest, m])
+            colors[target, 0], colors[target, 1], colors[target, 2] = red / 4, green / 4, blue / 4
             row = grid.label_row[nearest]
             instance_ids[target] = best_counted_instance(evidence, row, m, counts) if row >= 0 else 0
             class_ids[target] = best_class(evidence, row, m) if row >= 0 else -1

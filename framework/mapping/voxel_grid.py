@@ -8,7 +8,7 @@ at a time.
 Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest:
 voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
 
-Bytes: 7 a voxel (distance 2, weight 2, colour 3), so 3.5 KiB a block, plus 2 KiB of block numbers a region (at most
+Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block, plus 2 KiB of block numbers a region (at most
 512 blocks).
 """
 
@@ -56,7 +56,7 @@ class Grid(NamedTuple):
     neighbors: Int32  # (B, 8) the blocks at +0 or +1 along x (bit 0), y (bit 1), z (bit 2); -1 = not allocated
     tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
     weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
-    color: UInt8  # (B, 512, 3) RGB
+    color: npt.NDArray[np.uint32]  # (B, 512) packed, see pack_color()
     solid: UInt8  # (B,) 1 where a voxel of it lies behind a surface: rays skip the others until they come near one
     label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
 
@@ -165,6 +165,29 @@ def _link_neighbors(grid, block):
             grid.neighbors[before, c] = block
 
 
+# numpy's numbers, because with a literal numba computes in 64 bits
+_CHANNEL = np.int32(1023)
+_GREEN = np.int32(10)
+_BLUE = np.int32(20)
+
+
+@device
+def pack_color(red, green, blue):
+    """A voxel's colour from quarters of a level, 0 to 1020 each: ten bits a channel, so that averages do not stall."""
+    return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE)
+
+
+@device
+def unpack_color(packed):
+    """(red, green, blue) float32 in quarters of a level."""
+    bits = np.int32(packed)
+    return (
+        np.float32(bits & _CHANNEL),
+        np.float32((bits >> _GREEN) & _CHANNEL),
+        np.float32((bits >> _BLUE) & _CHANNEL),
+    )
+
+
 @device
 def is_solid(tsdf):
     """Whether a voxel of a block, tsdf (512,), was seen to lie behind a surface."""
@@ -213,7 +236,7 @@ class VoxelGrid:
             neighbors=np.full((first, 8), -1, np.int32),
             tsdf=np.full((first, BLOCK_VOXELS), UNSEEN, np.int16),
             weight=np.zeros((first, BLOCK_VOXELS), np.uint16),
-            color=np.zeros((first, BLOCK_VOXELS, 3), np.uint8),
+            color=np.zeros((first, BLOCK_VOXELS), np.uint32),
             solid=np.zeros(first, np.uint8),
             label_row=np.full(first, -1, np.int32),
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.mapping.voxel_grid import UNSEEN, device
+from framework.mapping.voxel_grid import UNSEEN, device, unpack_color
 
 
 @device
@@ -124,9 +124,10 @@ def trilinear_color(grid, block, x, y, z):
         if there < 0 or grid.tsdf[np.uint32(there), n] == UNSEEN:
             continue
         share = (fx if a else one - fx) * (fy if b else one - fy) * (fz if c else one - fz)
-        red += share * np.float32(grid.color[np.uint32(there), n, 0])
-        green += share * np.float32(grid.color[np.uint32(there), n, 1])
-        blue += share * np.float32(grid.color[np.uint32(there), n, 2])
+        channels = unpack_color(grid.color[np.uint32(there), n])
+        red += share * channels[0]
+        green += share * channels[1]
+        blue += share * channels[2]
         total += share
-    scale = one / max(total, np.float32(1e-6))
+    scale = np.float32(0.25) / max(total, np.float32(1e-6))
     return red * scale, green * scale, blue * scale
