@@ -1,16 +1,10 @@
-"""From a depth image to the map: which blocks it touches, and the running averages of their voxels.
+"""From a depth image to the map: the running averages of the voxels that a frame sees.
 
 The signed distance is projective, along z; its running average is the TSDF of Curless and Levoy (1996). The truncation
 distance widens with depth as the sensor's noise does, and the weight of an observation falls with depth squared.
-
-All kernels are parallel over independent rows or blocks; candidates are gathered in chunks whose number does not
-depend on the number of threads, and blocks are numbered in a serial pass, so that the map is the same with any number
-of threads.
 """
 
 from __future__ import annotations
-
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -18,136 +12,22 @@ from numba import njit, prange
 
 from framework.data import Float64, Frame, Int32
 from framework.geometry import inverse
-from framework.mapping.sensor import Sensor, pinhole, ray_direction
+from framework.mapping.allocation import Allocator
+from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
-    REGION_SIDE,
     TSDF_MAX,
     WEIGHT_ONE,
     VoxelGrid,
     device,
-    find_block,
-    grown,
     is_solid,
     pack_color,
     unpack_color,
 )
-from framework.mapping.voxel_walk import inverses, leave_cell
 
-CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
-RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
 FAR = 1e9  # m
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
-
-
-@device
-def _remember(recent, bx, by, bz):
-    """True when the block was passed to `recent` (RECENT, 4) lately; remembers it otherwise."""
-    slot = (bx * 73856093 ^ by * 19349669 ^ bz * 83492791) & (RECENT - 1)
-    if recent[slot, 3] == 1 and recent[slot, 0] == bx and recent[slot, 1] == by and recent[slot, 2] == bz:
-        return True
-    recent[slot, 0] = bx
-    recent[slot, 1] = by
-    recent[slot, 2] = bz
-    recent[slot, 3] = 1
-    return False
-
-
-@device
-def _note(found, n, bx, by, bz):
-    """Writes a block into `found` (M, 3) if there is room; the caller counts on, and asks again with more room."""
-    if n < found.shape[0]:
-        found[n, 0] = bx
-        found[n, 1] = by
-        found[n, 2] = bz
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _surface_blocks(depth, view, sensor, block_size, stride, found, counts):
-    """Blocks along the truncation band of every stride-th reading, chunk by chunk, into `found` (CHUNKS, M, 3)."""
-    height, width = depth.shape
-    rows = (height + stride - 1) // stride
-    inverse_size = np.float32(1.0) / block_size
-    for chunk in prange(CHUNKS):
-        recent = np.zeros((RECENT, 4), np.int32)
-        n = 0
-        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
-            v = row * stride
-            for u in range(0, width, stride):
-                d = depth[v, u]
-                if d < sensor.min_depth or d > sensor.max_depth:
-                    continue
-                dx, dy, dz = ray_direction(view, u, v)
-                band = sensor.truncation + sensor.truncation_slope * d
-                # samples at most half a block apart along the ray
-                length = np.sqrt(dx * dx + dy * dy + dz * dz)
-                steps = int(np.ceil(np.float32(4.0) * band * length * inverse_size))
-                for s in range(steps + 1):
-                    z = d - band + np.float32(2.0) * band * np.float32(s) / np.float32(steps)
-                    bx = int(np.floor((view.t[0] + z * dx) * inverse_size))
-                    by = int(np.floor((view.t[1] + z * dy) * inverse_size))
-                    bz = int(np.floor((view.t[2] + z * dz) * inverse_size))
-                    if not _remember(recent, bx, by, bz):
-                        _note(found[chunk], n, bx, by, bz)
-                        n += 1
-        counts[chunk] = n
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _free_blocks(grid, depth, view, sensor, block_size, stride, found, counts):
-    """Allocated blocks that lie between the camera and the readings, to be carved. Same output as _surface_blocks."""
-    height, width = depth.shape
-    rows = (height + stride - 1) // stride
-    inverse_size = np.float32(1.0) / block_size
-    for chunk in prange(CHUNKS):
-        recent = np.zeros((RECENT, 4), np.int32)
-        n = 0
-        key = np.int64(-2)
-        region = np.int32(-1)
-        region_size = block_size * np.float32(REGION_SIDE)
-        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
-            v = row * stride
-            for u in range(0, width, stride):
-                d = depth[v, u]
-                if d < sensor.min_depth or d > sensor.max_depth:
-                    continue
-                dx, dy, dz = ray_direction(view, u, v)
-                length = np.sqrt(dx * dx + dy * dy + dz * dz)
-                step = np.float32(0.75) * block_size / length
-                z = sensor.min_depth
-                stop = d - sensor.truncation - sensor.truncation_slope * d
-                while z < stop:
-                    bx = int(np.floor((view.t[0] + z * dx) * inverse_size))
-                    by = int(np.floor((view.t[1] + z * dy) * inverse_size))
-                    bz = int(np.floor((view.t[2] + z * dz) * inverse_size))
-                    block, key, region = find_block(grid, bx, by, bz, key, region)
-                    if block >= 0 and not _remember(recent, bx, by, bz):
-                        _note(found[chunk], n, bx, by, bz)
-                        n += 1
-                    if region >= 0:
-                        z += step
-                    else:
-                        d_world = (dx, dy, dz)
-                        z = np.float32(0.1) * step + leave_cell(
-                            z, view.t, d_world, inverses(d_world), region_size, np.float32(1.0) / region_size
-                        )
-        counts[chunk] = n
-
-
-@njit(cache=True, nogil=True)
-def _number_blocks(grid, coords, stamp, frame, active):
-    """The blocks at `coords`, each once, in order of first mention, into `active`; returns how many."""
-    n = 0
-    key = np.int64(-2)
-    region = np.int32(-1)
-    for i in range(coords.shape[0]):
-        block, key, region = find_block(grid, coords[i, 0], coords[i, 1], coords[i, 2], key, region)
-        if block >= 0 and stamp[block] != frame:
-            stamp[block] = frame
-            active[n] = block
-            n += 1
-    return n
 
 
 @device
@@ -273,9 +153,8 @@ class Integrator:
         self.voxels = voxels
         self.sensor = sensor
         self.frames = 0
-        self._stamp = np.zeros(0, np.int32)  # (B,) the last frame, counted from 1, in which a block was active
+        self._allocator = Allocator(voxels, sensor)
         self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
-        self._found = np.empty((CHUNKS, 4096, 3), np.int32)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> tuple[Int32, Int32]:
         """Integrates one frame.
@@ -287,7 +166,7 @@ class Integrator:
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
         self.frames += 1
-        active = self._find_blocks(frame, T_world_camera)
+        active = self._allocator.active_blocks(frame, T_world_camera)
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
         if len(self._near_pixel) < len(active):
@@ -305,31 +184,3 @@ class Integrator:
             near_pixel,
         )
         return active, near_pixel
-
-    def _find_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """The blocks around the surface that the frame sees (allocated here) and those that it sees through."""
-        view = pinhole(frame.camera, T_world_camera)
-        block_size = np.float32(BLOCK_SIDE * self.voxels.grid.voxel_size)
-        # readings this far apart are at most a quarter of a block apart at the greatest depth
-        footprint = float(self.sensor.max_depth) / frame.camera.fx
-        stride = max(1, min(8, int(0.25 * block_size / footprint)))
-        surface = self._gathered(_surface_blocks, frame.depth, view, self.sensor, block_size, stride)
-        self.voxels.allocate(surface)
-        seen_through = self._gathered(
-            _free_blocks, self.voxels.grid, frame.depth, view, self.sensor, block_size, 2 * stride
-        )
-        coords = np.concatenate([surface, seen_through])
-        capacity = len(self.voxels.grid.block_coords)
-        if len(self._stamp) < capacity:
-            self._stamp = grown(self._stamp, capacity, 0)
-        active = np.empty(len(coords), np.int32)
-        return active[: _number_blocks(self.voxels.grid, coords, self._stamp, self.frames, active)]
-
-    def _gathered(self, kernel: Callable[..., None], *arguments: object) -> Int32:
-        """What `kernel` finds, chunk after chunk, (N, 3); more room is made until it fits."""
-        counts = np.zeros(CHUNKS, np.int32)
-        while True:
-            kernel(*arguments, self._found, counts)
-            if counts.max() <= self._found.shape[1]:
-                return np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])
-            self._found = np.empty((CHUNKS, 2 * int(counts.max()), 3), np.int32)

@@ -20,6 +20,7 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
+from framework.mapping.frustum import bounds, extent
 from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
@@ -131,14 +132,14 @@ def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_f
     voxel = grid.voxel_size
     block_size = np.float32(BLOCK_SIDE) * voxel
     region_size = np.float32(REGION_SIDE) * block_size
-    block_extent = _extent(camera, block_size, voxel)
-    region_extent = _extent(camera, region_size, voxel)
+    block_extent = extent(camera, block_size, voxel)
+    region_extent = extent(camera, region_size, voxel)
     half = np.float32(0.5)
     for region in range(region_count):
         x = (np.float32(grid.region_coords[region, 0]) + half) * region_size
         y = (np.float32(grid.region_coords[region, 1]) + half) * region_size
         z = (np.float32(grid.region_coords[region, 2]) + half) * region_size
-        if not _bounds(camera, x, y, z, region_extent, near, far, shape)[0]:
+        if not bounds(camera, x, y, z, region_extent, near, far, shape)[0]:
             continue
         for child in range(REGION_BLOCKS):
             block = grid.region_blocks[region, child]
@@ -147,47 +148,13 @@ def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_f
             x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
             y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
             z = (np.float32(grid.block_coords[block, 2]) + half) * block_size
-            visible, z0, z1, u0, u1, v0, v1 = _bounds(camera, x, y, z, block_extent, near, far, shape)
+            visible, z0, z1, u0, u1, v0, v1 = bounds(camera, x, y, z, block_extent, near, far, shape)
             if not visible:
                 continue
             for ty in range(v0 // TILE, v1 // TILE + 1):
                 for tx in range(u0 // TILE, u1 // TILE + 1):
                     tile_near[ty, tx] = min(tile_near[ty, tx], z0)
                     tile_far[ty, tx] = max(tile_far[ty, tx], z1)
-
-
-@device
-def _extent(camera, size, margin):
-    """Half the sides, along the camera's axes, of the box around a cube of the world; m."""
-    half = np.float32(0.5) * size
-    return (
-        half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
-        half * (abs(camera.R[1, 0]) + abs(camera.R[1, 1]) + abs(camera.R[1, 2])) + margin,
-        half * (abs(camera.R[2, 0]) + abs(camera.R[2, 1]) + abs(camera.R[2, 2])) + margin,
-    )
-
-
-@device
-def _bounds(camera, x, y, z, extent, near, far, shape):
-    """(visible, z0, z1, u0, u1, v0, v1): depths (m) and pixels, inclusive, of the box around a point of the world."""
-    height, width = shape
-    pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
-    z0, z1 = max(pz - extent[2], near), min(pz + extent[2], far)
-    if z0 > z1:
-        return False, z0, z1, 0, 0, 0, 0
-    px = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
-    py = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
-    left, right = px - extent[0], px + extent[0]
-    top, bottom = py - extent[1], py + extent[1]
-    u0 = camera.fx * min(left / z0, left / z1) + camera.cx
-    u1 = camera.fx * max(right / z0, right / z1) + camera.cx
-    v0 = camera.fy * min(top / z0, top / z1) + camera.cy
-    v1 = camera.fy * max(bottom / z0, bottom / z1) + camera.cy
-    if u1 < 0 or v1 < 0 or u0 > width - 1 or v0 > height - 1:
-        return False, z0, z1, 0, 0, 0, 0
-    u0, v0 = max(u0, np.float32(0.0)), max(v0, np.float32(0.0))
-    u1, v1 = min(u1, np.float32(width - 2)), min(v1, np.float32(height - 2))
-    return True, z0, z1, int(u0), int(u1) + 1, int(v0), int(v1) + 1
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")

@@ -38,7 +38,7 @@ NO_KEY = -1
 # Grid up and down at each call wait for each other.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
-_KEY_BITS = 21  # of each region coordinate in a 63-bit key: +-2^20 regions, 670 km at 1 cm voxels
+_KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
 _KEY_OFFSET = 1 << (_KEY_BITS - 1)
 _KEY_MASK = (1 << _KEY_BITS) - 1
 
@@ -62,12 +62,22 @@ class Grid(NamedTuple):
 
 
 @device
-def region_key(rx, ry, rz):
-    """The packed key of region coordinates."""
+def pack_key(x, y, z):
+    """The key of the coordinates of a region or a block, never negative."""
     return (
-        ((np.int64(rx) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
-        | ((np.int64(ry) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
-        | ((np.int64(rz) + _KEY_OFFSET) & _KEY_MASK)
+        ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
+        | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
+        | ((np.int64(z) + _KEY_OFFSET) & _KEY_MASK)
+    )
+
+
+@device
+def unpack_key(key):
+    """The coordinates that pack_key() was given."""
+    return (
+        np.int32((key >> (2 * _KEY_BITS)) - _KEY_OFFSET),
+        np.int32(((key >> _KEY_BITS) & _KEY_MASK) - _KEY_OFFSET),
+        np.int32((key & _KEY_MASK) - _KEY_OFFSET),
     )
 
 
@@ -104,7 +114,7 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 
     `last_key` and `last_region` are what the previous call returned: the cache that makes neighbouring look-ups cheap.
     """
-    key = region_key(bx >> 3, by >> 3, bz >> 3)
+    key = pack_key(bx >> 3, by >> 3, bz >> 3)
     if key != last_key:
         last_region = find_region(grid, key)
     if last_region < 0:
@@ -122,7 +132,7 @@ def insert_blocks(grid, coords, start, region_count, block_count):
     size = grid.table_keys.shape[0]
     for i in range(start, coords.shape[0]):
         bx, by, bz = coords[i, 0], coords[i, 1], coords[i, 2]
-        key = region_key(bx >> 3, by >> 3, bz >> 3)
+        key = pack_key(bx >> 3, by >> 3, bz >> 3)
         region = find_region(grid, key)
         if region < 0:
             if region_count == grid.region_blocks.shape[0] or 2 * (region_count + 1) > size:

@@ -1,0 +1,223 @@
+"""The blocks that a frame updates: along the truncation band of its readings, and those that it sees through.
+
+Candidates are gathered in chunks of image rows whose number does not depend on the number of threads, and blocks are
+numbered in a serial pass, so that the map is the same with any number of threads.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Camera, Float64, Frame, Int32
+from framework.geometry import inverse
+from framework.mapping.frustum import bounds, extent
+from framework.mapping.sensor import Sensor, pinhole, ray_direction
+from framework.mapping.voxel_grid import (
+    BLOCK_SIDE,
+    NO_KEY,
+    REGION_BLOCKS,
+    REGION_SIDE,
+    VoxelGrid,
+    device,
+    find_block,
+    grown,
+    pack_key,
+    unpack_key,
+)
+
+Int64 = npt.NDArray[np.int64]
+
+CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
+RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
+PROBES = 4  # pixels along each side of a block in the image, to tell whether the frame sees through it
+
+
+@device
+def _remembered(recent, key):
+    """True when the key was passed to `recent` (RECENT,) lately; remembers it otherwise."""
+    slot = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(54)
+    if recent[slot] == key:
+        return True
+    recent[slot] = key
+    return False
+
+
+@device
+def _band_keys(depth, v, view, sensor, inverse_size, stride, samples, keys):
+    """The keys of the blocks at `samples` places along the truncation band of the readings of row v, (samples, W)."""
+    for s in range(samples):
+        place = np.float32(2.0) * np.float32(s) / np.float32(samples - 1) - np.float32(1.0)
+        for n in range(keys.shape[1]):
+            d = depth[v, n * stride]
+            dx, dy, dz = ray_direction(view, np.int32(n * stride), v)
+            z = d + place * (sensor.truncation + sensor.truncation_slope * d)
+            bx = np.int32(np.floor((view.t[0] + z * dx) * inverse_size))
+            by = np.int32(np.floor((view.t[1] + z * dy) * inverse_size))
+            bz = np.int32(np.floor((view.t[2] + z * dz) * inverse_size))
+            valid = (d >= sensor.min_depth) & (d <= sensor.max_depth)
+            keys[s, n] = pack_key(bx, by, bz) if valid else np.int64(NO_KEY)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _surface_blocks(depth, view, sensor, block_size, stride, samples, found, counts):
+    """Keys of blocks along the band of every stride-th reading, chunk by chunk, into `found` (CHUNKS, M).
+
+    Counts (CHUNKS,) above M mean that there was no room for all.
+    """
+    height, width = depth.shape
+    rows, columns = (height + stride - 1) // stride, (width + stride - 1) // stride
+    inverse_size = np.float32(1.0) / block_size
+    for chunk in prange(CHUNKS):
+        recent = np.full(RECENT, NO_KEY, np.int64)
+        keys = np.empty((samples, columns), np.int64)
+        n = 0
+        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
+            _band_keys(depth, row * stride, view, sensor, inverse_size, stride, samples, keys)
+            for s in range(samples):
+                last = np.int64(NO_KEY)
+                for column in range(columns):
+                    key = keys[s, column]
+                    if key != last:
+                        last = key
+                        if key != NO_KEY and not _remembered(recent, key):
+                            if n < found.shape[1]:
+                                found[chunk, n] = key
+                            n += 1
+        counts[chunk] = n
+
+
+@njit(cache=True, nogil=True)
+def _unpack(keys, coords):
+    for i in range(keys.shape[0]):
+        coords[i, 0], coords[i, 1], coords[i, 2] = unpack_key(keys[i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sees_through(depth, sensor, z0, u0, u1, v0, v1):
+    """Whether one of some readings within the block's part of the image lies behind the block's front, at depth z0."""
+    for row in range(PROBES):
+        v = v0 + (v1 - v0) * row // (PROBES - 1)
+        for column in range(PROBES):
+            d = depth[v, u0 + (u1 - u0) * column // (PROBES - 1)]
+            if sensor.min_depth <= d <= sensor.max_depth and d > z0:
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _number_blocks(grid, coords, region_count, depth, camera, sensor, stamp, frame, active):
+    """The blocks at `coords` and those that the frame sees through, each once, into `active`; returns how many.
+
+    `camera` holds T_camera_world. Like the ray-caster's bounds, it costs a test a region of the map and one a block of
+    those in view.
+    """
+    n = 0
+    key = np.int64(-2)
+    last_region = np.int32(-1)
+    for i in range(coords.shape[0]):
+        block, key, last_region = find_block(grid, coords[i, 0], coords[i, 1], coords[i, 2], key, last_region)
+        if stamp[block] != frame:
+            stamp[block] = frame
+            active[n] = block
+            n += 1
+    voxel = grid.voxel_size
+    block_size = np.float32(BLOCK_SIDE) * voxel
+    region_size = np.float32(REGION_SIDE) * block_size
+    block_extent = extent(camera, block_size, voxel)
+    region_extent = extent(camera, region_size, voxel)
+    near, far = sensor.min_depth, sensor.max_depth
+    half = np.float32(0.5)
+    for region in range(region_count):
+        x = (np.float32(grid.region_coords[region, 0]) + half) * region_size
+        y = (np.float32(grid.region_coords[region, 1]) + half) * region_size
+        z = (np.float32(grid.region_coords[region, 2]) + half) * region_size
+        if not bounds(camera, x, y, z, region_extent, near, far, depth.shape)[0]:
+            continue
+        for child in range(REGION_BLOCKS):
+            block = grid.region_blocks[region, child]
+            if block < 0 or stamp[block] == frame:
+                continue
+            x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
+            y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
+            z = (np.float32(grid.block_coords[block, 2]) + half) * block_size
+            visible, z0, _, u0, u1, v0, v1 = bounds(camera, x, y, z, block_extent, near, far, depth.shape)
+            if visible and _sees_through(depth, sensor, z0, u0, u1, v0, v1):
+                stamp[block] = frame
+                active[n] = block
+                n += 1
+    return n
+
+
+class Allocator:
+    """Finds the blocks that a frame updates and allocates those that do not exist yet."""
+
+    def __init__(self, voxels: VoxelGrid, sensor: Sensor) -> None:
+        self.voxels = voxels
+        self.sensor = sensor
+        self._frames = 0
+        self._stamp = np.zeros(0, np.int32)  # (B,) the last frame, counted from 1, in which a block was active
+        self._found = np.empty((CHUNKS, 4096), np.int64)
+
+    def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
+        """(A,) the blocks around the surface that the frame sees, allocated here, and those that it sees through.
+
+        Raises MapFullError when the block budget is reached.
+        """
+        self._frames += 1
+        coords = self._surface_coords(frame, T_world_camera)
+        self.voxels.allocate(coords)
+        capacity = len(self.voxels.grid.block_coords)
+        if len(self._stamp) < capacity:
+            self._stamp = grown(self._stamp, capacity, 0)
+        active = np.empty(self.voxels.block_count, np.int32)
+        count = _number_blocks(
+            self.voxels.grid,
+            coords,
+            self.voxels.region_count,
+            frame.depth,
+            pinhole(frame.camera, inverse(T_world_camera)),
+            self.sensor,
+            self._stamp,
+            self._frames,
+            active,
+        )
+        return active[:count].copy()
+
+    def _surface_coords(self, frame: Frame, T_world_camera: Float64) -> Int32:
+        """(N, 3) coordinates of the blocks along the truncation band of the frame's readings."""
+        block_size = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
+        # readings this far apart are at most a quarter of a block apart at the greatest depth
+        footprint = float(self.sensor.max_depth) / frame.camera.fx
+        stride = max(1, min(8, int(0.25 * block_size / footprint)))
+        # samples at most half a block apart along the ray of a corner, at the frame's greatest depth
+        farthest = min(float(frame.depth.max()), float(self.sensor.max_depth))
+        band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
+        samples = 1 + int(np.ceil(4 * band * _longest_ray(frame.camera) / block_size))
+        counts = np.zeros(CHUNKS, np.int32)
+        while True:
+            _surface_blocks(
+                frame.depth,
+                pinhole(frame.camera, T_world_camera),
+                self.sensor,
+                np.float32(block_size),
+                stride,
+                samples,
+                self._found,
+                counts,
+            )
+            if counts.max() <= self._found.shape[1]:
+                break
+            self._found = np.empty((CHUNKS, 2 * int(counts.max())), np.int64)
+        keys = np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])
+        coords = np.empty((len(keys), 3), np.int32)
+        _unpack(keys, coords)
+        return coords
+
+
+def _longest_ray(camera: Camera) -> float:
+    """The length of the ray to depth 1 through the corner of the image farthest from the principal point."""
+    x = max(camera.cx, camera.width - camera.cx) / camera.fx
+    y = max(camera.cy, camera.height - camera.cy) / camera.fy
+    return float(np.sqrt(1 + x * x + y * y))
