@@ -5,9 +5,8 @@ zero crossings on its edges; an edge that changes sign joins the vertices of the
 Compared with marching cubes: no table, half the vertices, better shaped triangles, and every vertex lies within its
 cell.
 
-Few voxels are near the surface, so the search runs on bits: a word is a slice of a block, 8 x 8 voxels or cells, of
-which (x, y) is bit 8 y + x. Shifted words compare 64 voxels with their neighbours at once; only cells with a vertex are
-ever visited one by one, and a vertex is numbered by counting the bits before its own.
+Few voxels are near the surface, so the search runs on bits, 64 voxels at once; only cells with a vertex are ever
+visited one by one, and a vertex is numbered by counting the bits before its own.
 
 Bytes: 192 a block of words, 16 a vertex, kept between updates. A block is extracted again when one of its voxels or of
 the voxels that its cells share with the next blocks changed; what it gives does not depend on when that happens.
@@ -22,6 +21,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, UInt8
+from framework.mapping.bit_slices import ONE, ahead_x, ahead_y, behind_x, behind_y, count_bits, lowest_bit
 from framework.mapping.evidence import Evidence, best_class, best_counted_instance
 from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid, VoxelGrid, find_block, grown
 from framework.mapping.voxel_walk import voxel_number
@@ -33,13 +33,6 @@ Words = npt.NDArray[np.uint64]
 # bound is wide.
 MAX_JUMP = 8.0
 
-_ONE = np.uint64(1)
-_EIGHT = np.uint64(8)
-_TO_LAST_COLUMN = np.uint64(7)
-_TO_LAST_ROW = np.uint64(56)
-_FIRST_COLUMN = np.uint64(0x0101010101010101)
-_LAST_COLUMN = np.uint64(0x8080808080808080)
-
 
 class Surface(NamedTuple):
     """A mesh without colours and labels: those of a vertex are its nearest voxel's, to be looked up there."""
@@ -47,43 +40,6 @@ class Surface(NamedTuple):
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3), facing the side that the surface was seen from
     voxels: Int32  # (V,) block * 512 + number within the block
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _count_bits(word):
-    """How many bits are set; LLVM knows this idiom and makes it one instruction."""
-    word -= (word >> _ONE) & np.uint64(0x5555555555555555)
-    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
-    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
-    return np.int32((word * _FIRST_COLUMN) >> _TO_LAST_ROW)
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _lowest_bit(word):
-    """The place of the lowest bit set."""
-    return _count_bits((word & (~word + _ONE)) - _ONE)
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _next_x(word, beyond):
-    """The bits (x + 1, y) of a slice, where `beyond` is the slice of the next block along x."""
-    return ((word & ~_FIRST_COLUMN) >> _ONE) | ((beyond & _FIRST_COLUMN) << _TO_LAST_COLUMN)
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _next_y(word, beyond):
-    return (word >> _EIGHT) | (beyond << _TO_LAST_ROW)
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _last_x(word, before):
-    """The bits (x - 1, y) of a slice, where `before` is the slice of the block before along x."""
-    return ((word & ~_LAST_COLUMN) << _ONE) | ((before & _LAST_COLUMN) >> _TO_LAST_COLUMN)
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def _last_y(word, before):
-    return (word << _EIGHT) | (before >> _TO_LAST_ROW)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -130,12 +86,11 @@ def _any_and_all(words, around, z):
     """Which cells of slice z have any of their four corners in that slice set, and which have all."""
     up = 4 * (z >> 3)
     z &= 7
-    here, along_x = words[around[up], z], words[around[up + 1], z]
-    along_y, diagonal = words[around[up + 2], z], words[around[up + 3], z]
-    next_x = _next_x(here, along_x)
-    next_y = _next_y(here, along_y)
-    next_xy = _next_x(next_y, _next_y(along_x, diagonal))
-    return here | next_x | next_y | next_xy, here & next_x & next_y & next_xy
+    here, block_x = words[around[up], z], words[around[up + 1], z]
+    block_y, block_xy = words[around[up + 2], z], words[around[up + 3], z]
+    right, below = ahead_x(here, block_x), ahead_y(here, block_y)
+    across = ahead_x(below, ahead_y(block_x, block_xy))
+    return here | right | below | across, here & right & below & across
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -147,8 +102,9 @@ def _cell_corners(tsdf, around, x, y, z, corners):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _find_cells(grid, tsdf, blocks, inside, seen, most_jump, cells):
+def _find_cells(grid, blocks, inside, seen, most_jump, cells):
     """Packs the cells of the blocks that have a vertex into `cells` (B + 1, 8)."""
+    tsdf = grid.tsdf
     for b in prange(len(blocks)):
         block = blocks[b]
         around = np.empty(8, np.int32)
@@ -162,11 +118,11 @@ def _find_cells(grid, tsdf, blocks, inside, seen, most_jump, cells):
             candidates = (any_low | any_high) & ~(all_low & all_high) & seen_low & seen_high
             found = candidates
             while candidates:
-                n = _lowest_bit(candidates)
-                candidates &= candidates - _ONE
+                n = lowest_bit(candidates)
+                candidates &= candidates - ONE
                 _cell_corners(tsdf, around, n & 7, n >> 3, z, corners)
                 if corners.max() - corners.min() > most_jump:
-                    found ^= _ONE << np.uint64(n)
+                    found ^= ONE << np.uint64(n)
             cells[block, z] = found
             any_low, all_low, seen_low = any_high, all_high, seen_high
 
@@ -178,7 +134,7 @@ def _number_slices(cells, first):
     for block in range(len(first)):
         for z in range(BLOCK_SIDE):
             first[block, z] = total
-            total += _count_bits(cells[block, z])
+            total += count_bits(cells[block, z])
     return total
 
 
@@ -203,18 +159,18 @@ def _cell_vertex(corners, out):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _place_vertices(
-    grid, tsdf, block_coords, voxel_size, stale, cells, first, old_first, old, old_voxels, vertices, voxels
-):
-    """Places the vertices of the stale blocks, and copies those of the others from the `old` ones."""
+def _place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels):
+    """Places the vertices of the stale blocks, and copies those of the others from the `old` surface."""
+    tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
+    old_vertices, old_voxels = old.vertices, old.voxels
     for block in prange(len(first)):
         if not stale[block]:
             start, stop, source = first[block, 0], first[block, 0], old_first[block, 0]
             for z in range(BLOCK_SIDE):
-                stop += _count_bits(cells[block, z])
+                stop += count_bits(cells[block, z])
             for v in range(stop - start):
                 for c in range(3):
-                    vertices[start + v, c] = old[source + v, c]
+                    vertices[start + v, c] = old_vertices[source + v, c]
                 voxels[start + v] = old_voxels[source + v]
             continue
         around = np.empty(8, np.int32)
@@ -225,8 +181,8 @@ def _place_vertices(
         for z in range(BLOCK_SIDE):
             left = cells[block, z]
             while left:
-                n = _lowest_bit(left)
-                left &= left - _ONE
+                n = lowest_bit(left)
+                left &= left - ONE
                 x, y = n & 7, n >> 3
                 _cell_corners(tsdf, around, x, y, z, corners)
                 _cell_vertex(corners, place)
@@ -251,23 +207,23 @@ def _find_quads(inside, cells, around, before, z):
     block = around[0]
     here = inside[block, z]
     above = inside[block, z + 1] if z < 7 else inside[around[4], 0]
-    change_x = here ^ _next_x(here, inside[around[1], z])
-    change_y = here ^ _next_y(here, inside[around[2], z])
+    change_x = here ^ ahead_x(here, inside[around[1], z])
+    change_y = here ^ ahead_y(here, inside[around[2], z])
     change_z = here ^ above
     down, below = (0, z - 1) if z > 0 else (4, 7)
     cell, cell_x = cells[block, z], cells[before[1], z]
     cell_y, cell_xy = cells[before[2], z], cells[before[3], z]
     low, low_x = cells[before[down], below], cells[before[down + 1], below]
     low_y = cells[before[down + 2], below]
-    pair_x = cell & _last_x(cell, cell_x)
-    pair_y = cell & _last_y(cell, cell_y)
-    low_pair_x = low & _last_x(low, low_x)
-    low_pair_y = low & _last_y(low, low_y)
-    pair_y_before = cell_x & _last_y(cell_x, cell_xy)
+    pair_x = cell & behind_x(cell, cell_x)
+    pair_y = cell & behind_y(cell, cell_y)
+    low_pair_x = low & behind_x(low, low_x)
+    low_pair_y = low & behind_y(low, low_y)
+    pair_y_before = cell_x & behind_y(cell_x, cell_xy)
     return (
         change_x & pair_y & low_pair_y,
         change_y & pair_x & low_pair_x,
-        change_z & pair_y & _last_x(pair_y, pair_y_before),
+        change_z & pair_y & behind_x(pair_y, pair_y_before),
     )
 
 
@@ -287,7 +243,7 @@ def _count_quads(grid, inside, cells, counts):
         _neighbours(grid, block, -1, before)
         for z in range(BLOCK_SIDE):
             along_x, along_y, along_z = _find_quads(inside, cells, around, before, z)
-            counts[block] += _count_bits(along_x) + _count_bits(along_y) + _count_bits(along_z)
+            counts[block] += count_bits(along_x) + count_bits(along_y) + count_bits(along_z)
 
 
 @njit(cache=True, nogil=True, forceinline=True)
@@ -295,7 +251,7 @@ def _vertex(cells, first, before, x, y, z):
     """The number of the vertex of a cell, which may lie one cell before the block."""
     block = before[(x < 0) + 2 * (y < 0) + 4 * (z < 0)]
     n = np.uint64((y & 7) * 8 + (x & 7))
-    return first[block, z & 7] + _count_bits(cells[block, z & 7] & ((_ONE << n) - _ONE))
+    return first[block, z & 7] + count_bits(cells[block, z & 7] & ((ONE << n) - ONE))
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -317,14 +273,14 @@ def _write_triangles(grid, inside, cells, first, quad_first, counts, triangles):
                 bx, by, bz = axis == 2, axis == 0, axis == 1
                 cx, cy, cz = axis == 1, axis == 2, axis == 0
                 while left:
-                    n = _lowest_bit(left)
-                    left &= left - _ONE
+                    n = lowest_bit(left)
+                    left &= left - ONE
                     x, y = n & 7, n >> 3
                     p = _vertex(cells, first, before, x, y, z)
                     q = _vertex(cells, first, before, x - bx, y - by, z - bz)
                     r = _vertex(cells, first, before, x - bx - cx, y - by - cy, z - bz - cz)
                     s = _vertex(cells, first, before, x - cx, y - cy, z - cz)
-                    if not (inside[block, z] >> np.uint64(n)) & _ONE:
+                    if not (inside[block, z] >> np.uint64(n)) & ONE:
                         q, s = s, q
                     triangles[t, 0], triangles[t, 1], triangles[t, 2] = p, q, r
                     triangles[t + 1, 0], triangles[t + 1, 1], triangles[t + 1, 2] = p, r, s
@@ -384,25 +340,12 @@ class SurfaceNets:
         _mark_stale(grid, changed, stale)
         most_jump = np.int32(MAX_JUMP * grid.voxel_size / grid.tsdf_unit)
         blocks = np.flatnonzero(stale).astype(np.int32)
-        _find_cells(grid, grid.tsdf, blocks, inside, seen, most_jump, cells)
+        _find_cells(grid, blocks, inside, seen, most_jump, cells)
         first = np.empty((count, BLOCK_SIDE), np.int32)
         total = _number_slices(cells, first)
         vertices = np.empty((total, 3), np.float32)
         voxels = np.empty(total, np.int32)
-        _place_vertices(
-            grid,
-            grid.tsdf,
-            grid.block_coords,
-            grid.voxel_size,
-            stale,
-            cells,
-            first,
-            old_first,
-            old.vertices,
-            old.voxels,
-            vertices,
-            voxels,
-        )
+        _place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels)
         quads = np.empty(count, np.int32)
         _count_quads(grid, inside, cells, quads)
         ends = np.cumsum(quads)
