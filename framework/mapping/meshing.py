@@ -139,29 +139,34 @@ def _number_slices(cells, first):
 
 
 @njit(cache=True, nogil=True, forceinline=True)
-def _cell_vertex(corners, out):
-    """The mean zero crossing of the twelve edges of a cell, in voxels from its first corner, into `out` (3,)."""
-    out[:] = 0
-    crossings = 0
-    for axis in range(3):
-        bit = 1 << axis
-        for corner in range(8):
-            if corner & bit:
-                continue
-            a, b = corners[corner], corners[corner | bit]
-            if (a < 0) != (b < 0):
-                for c in range(3):
-                    out[c] += np.float32((corner >> c) & 1)
-                out[axis] += np.float32(a) / np.float32(a - b)
-                crossings += 1
-    for c in range(3):
-        out[c] /= np.float32(crossings)
+def _crossing(a, b):
+    """(1, where) on an edge whose ends have the distances a and b of different sign, else (0, 0). Without a branch."""
+    crosses = (a ^ b) < 0
+    where = np.float32(a) / np.float32(a - b if crosses else 1)
+    return (np.float32(1.0), where) if crosses else (np.float32(0.0), np.float32(0.0))
+
+
+@njit(cache=True, nogil=True, forceinline=True)
+def _cell_vertex(corners):
+    """(x, y, z), in voxels from the first corner: the mean zero crossing of the twelve edges of a cell."""
+    x = y = z = crossings = np.float32(0.0)
+    for edge in range(4):  # along each axis, at (u, v) of the two others
+        u, v = np.float32(edge & 1), np.float32(edge >> 1)
+        crosses, where = _crossing(corners[2 * edge], corners[2 * edge + 1])
+        x, y, z, crossings = x + where, y + crosses * u, z + crosses * v, crossings + crosses
+        low = (edge & 1) + 4 * (edge >> 1)
+        crosses, where = _crossing(corners[low], corners[low + 2])
+        x, y, z, crossings = x + crosses * u, y + where, z + crosses * v, crossings + crosses
+        crosses, where = _crossing(corners[edge], corners[edge + 4])
+        x, y, z, crossings = x + crosses * u, y + crosses * v, z + where, crossings + crosses
+    return x / crossings, y / crossings, z / crossings
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels):
     """Places the vertices of the stale blocks, and copies those of the others from the `old` surface."""
     tsdf, block_coords, voxel_size = grid.tsdf, grid.block_coords, grid.voxel_size
+    half = np.float32(0.5)
     old_vertices, old_voxels = old.vertices, old.voxels
     for block in prange(len(first)):
         if not stale[block]:
@@ -175,7 +180,6 @@ def _place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels)
             continue
         around = np.empty(8, np.int32)
         corners = np.empty(8, np.int32)
-        place = np.empty(3, np.float32)
         _neighbours(grid, block, 1, around)
         v = first[block, 0]
         for z in range(BLOCK_SIDE):
@@ -185,13 +189,11 @@ def _place_vertices(grid, stale, cells, first, old_first, old, vertices, voxels)
                 left &= left - ONE
                 x, y = n & 7, n >> 3
                 _cell_corners(tsdf, around, x, y, z, corners)
-                _cell_vertex(corners, place)
-                i = x + int(place[0] + np.float32(0.5))
-                j = y + int(place[1] + np.float32(0.5))
-                k = z + int(place[2] + np.float32(0.5))
-                vertices[v, 0] = (np.float32(block_coords[block, 0] * BLOCK_SIDE + x) + place[0]) * voxel_size
-                vertices[v, 1] = (np.float32(block_coords[block, 1] * BLOCK_SIDE + y) + place[1]) * voxel_size
-                vertices[v, 2] = (np.float32(block_coords[block, 2] * BLOCK_SIDE + z) + place[2]) * voxel_size
+                px, py, pz = _cell_vertex(corners)
+                vertices[v, 0] = (np.float32(block_coords[block, 0] * BLOCK_SIDE + x) + px) * voxel_size
+                vertices[v, 1] = (np.float32(block_coords[block, 1] * BLOCK_SIDE + y) + py) * voxel_size
+                vertices[v, 2] = (np.float32(block_coords[block, 2] * BLOCK_SIDE + z) + pz) * voxel_size
+                i, j, k = x + int(px + half), y + int(py + half), z + int(pz + half)
                 nearest = around[(i >> 3) + 2 * (j >> 3) + 4 * (k >> 3)]
                 voxels[v] = nearest * BLOCK_VOXELS + voxel_number(i, j, k)
                 v += 1
