@@ -3,13 +3,16 @@
 A cell is the cube between eight neighbouring voxels. A cell whose corners change sign gets one vertex, the mean of the
 zero crossings on its edges; an edge that changes sign joins the vertices of the four cells around it in a quad.
 Compared with marching cubes: no table, half the vertices, better shaped triangles, and every vertex lies within its
-cell.
+cell. Compared with dual contouring, which looks for the corner that the crossings' normals meet in: the mean is farther
+from the surface at edges (95th percentile 0.28 of a voxel, not 0.23, in an exact room), and nearer everywhere once the
+depth has a Kinect's noise (median 0.085, not 0.107).
 
 Few voxels are near the surface, so the search runs on bits, 64 voxels at once; only cells with a vertex are ever
 visited one by one, and a vertex is numbered by counting the bits before its own.
 
-Bytes: 192 a block of words, 16 a vertex, kept between updates. A block is extracted again when one of its voxels or of
-the voxels that its cells share with the next blocks changed; what it gives does not depend on when that happens.
+Bytes: 192 a block of words and 32 of numbers, 16 a vertex and 12 a triangle, kept between updates. The vertices of a
+block are placed again when one of its voxels, or of those that its cells share with the next blocks, changed; the
+others are copied. What comes out depends on the grid alone, not on when it was asked for.
 """
 
 from __future__ import annotations
@@ -17,7 +20,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, UInt8
@@ -25,8 +27,6 @@ from framework.mapping.bit_slices import ONE, ahead_x, ahead_y, behind_x, behind
 from framework.mapping.evidence import Evidence, best_class, best_counted_instance
 from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, Grid, VoxelGrid, find_block, grown
 from framework.mapping.voxel_walk import voxel_number
-
-Words = npt.NDArray[np.uint64]
 
 # A cell whose corners differ by more voxels of distance than this lies on a silhouette seen from one side, between a
 # truncated free voxel and a truncated hidden one. Surfaces reach 1 / cos of the slant at which they were seen, so the

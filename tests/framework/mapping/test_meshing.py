@@ -191,7 +191,7 @@ def equal(ours: InstanceMesh, theirs: InstanceMesh) -> bool:
 
 def test_updates_equal_extraction_from_scratch() -> None:
     """After every frame and every merge, to the last bit, while blocks, instances and what counts keep changing."""
-    updated, asked_late = (BayesianTsdf(voxel_size=0.03, max_depth=4.0) for _ in range(2))
+    updated, asked_late = (BayesianTsdf(voxel_size=0.019, max_depth=4.0) for _ in range(2))
     sizes, named = [], []
     for k, T in enumerate(walk(40)[::4]):
         fuse(updated, T, k)
@@ -203,7 +203,7 @@ def test_updates_equal_extraction_from_scratch() -> None:
         assert np.array_equal(mesh.triangles, reference.triangles)
         sizes.append(updated.scene.voxels.block_count)
         named.append(len(np.unique(mesh.instance_ids)))
-    assert sizes[-1] > 1.1 * sizes[0], "the map grew"
+    assert sizes[0] < 1024 < sizes[-1], "the grid's arrays grew"
     assert named[0] == 1, "nothing counts yet"
     assert named[-1] > 2
     ours = updated.scene.mesh()
