@@ -110,9 +110,10 @@ class InstanceMap(SceneMap):
         vertices, triangles, voxels = self._surface.extract()
         counts = self._counts()
         colors, instance_ids, class_ids = look_up(self.voxels.grid, self.labels.evidence, counts, voxels)
-        sizes = np.bincount(instance_ids, minlength=len(counts))
-        instance_ids[sizes[instance_ids] < self.min_vertices] = 0
-        class_ids[instance_ids == 0] = -1  # what belongs to no object has no class, whatever mask once bled over it
+        too_small = np.bincount(instance_ids, minlength=len(counts)) < self.min_vertices
+        dropped = too_small[instance_ids]
+        instance_ids[dropped] = 0
+        class_ids[dropped] = -1
         return InstanceMesh(vertices, triangles, colors, instance_ids, class_ids, self.classes)
 
     def _counts(self) -> Bool:

@@ -297,13 +297,14 @@ def _look_up(grid, evidence, counts, voxels, colors, instance_ids, class_ids):
         for c in range(3):
             colors[v, c] = grid.color[block, n, c]
         instance_ids[v] = best_counted_instance(evidence, row, n, counts) if row >= 0 else 0
-        class_ids[v] = best_class(evidence, row, n) if row >= 0 else -1
+        class_ids[v] = best_class(evidence, row, n) if instance_ids[v] > 0 else -1
 
 
 def look_up(grid: Grid, evidence: Evidence, counts: Bool, voxels: Int32) -> tuple[UInt8, Int32, Int32]:
     """(colors (V, 3), instance ids (V,), class ids (V,)) of voxels, numbered as in Surface.
 
-    Only instances with counts[id] are named; where another one is likelier, the likeliest that counts is.
+    Only instances with counts[id] are named; where another one is likelier, the likeliest that counts is. What belongs
+    to no object has no class, whatever mask once bled over it.
     """
     colors = np.empty((len(voxels), 3), np.uint8)
     instance_ids, class_ids = np.empty(len(voxels), np.int32), np.empty(len(voxels), np.int32)
