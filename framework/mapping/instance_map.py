@@ -22,13 +22,14 @@ from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.evidence import Evidence, EvidenceRows
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
-from framework.mapping.meshing import extract_mesh
+from framework.mapping.meshing import SurfaceNets, look_up
 from framework.mapping.raycasting import render
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
 FORMAT = 1  # of the saved file; a change of meaning counts it up
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
+NO_BLOCKS = np.zeros(0, np.int32)
 ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
 
 
@@ -76,30 +77,43 @@ class InstanceMap(SceneMap):
         """Without the condition on vertices, which takes a mesh."""
         return int(self._counts().sum())
 
-    def changed(self) -> None:
-        """To be called after the map was written: what was derived from it is out of date."""
-        self.__dict__.pop("_surface", None)
+    def changed(self, blocks: Int32 | None = None) -> None:
+        """To be called after the map was written: what was derived from it is out of date.
+
+        `blocks` (A,) are the numbers of those whose voxels were written; None = perhaps all.
+        """
+        self.__dict__.pop("_mesh", None)
+        if blocks is None:
+            self.__dict__.pop("_surface", None)
+        elif "_surface" in self.__dict__:
+            self._surface.changed(blocks)
 
     def merge(self, kept: int, dropped: int) -> None:
         """Makes instance `dropped` a part of `kept`, in the table and in every voxel."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
+        self.changed(NO_BLOCKS)
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         return render(self.voxels, self.labels.evidence, self.sensor, camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:
-        return self._surface
+        return self._mesh
 
     @cached_property
-    def _surface(self) -> InstanceMesh:
+    def _surface(self) -> SurfaceNets:
+        """Made when a mesh is first asked for: who never asks pays nothing."""
+        return SurfaceNets(self.voxels)
+
+    @cached_property
+    def _mesh(self) -> InstanceMesh:
+        vertices, triangles, voxels = self._surface.extract()
         counts = self._counts()
-        vertices, triangles, colors, instance_ids, class_ids = extract_mesh(
-            self.voxels.grid, self.voxels.block_count, self.labels.evidence, counts
-        )
-        sizes = np.bincount(instance_ids, minlength=len(counts))
-        instance_ids[sizes[instance_ids] < self.min_vertices] = 0
-        class_ids[instance_ids == 0] = -1  # what belongs to no object has no class, whatever mask once bled over it
+        colors, instance_ids, class_ids = look_up(self.voxels.grid, self.labels.evidence, counts, voxels)
+        too_small = np.bincount(instance_ids, minlength=len(counts)) < self.min_vertices
+        dropped = too_small[instance_ids]
+        instance_ids[dropped] = 0
+        class_ids[dropped] = -1
         return InstanceMesh(vertices, triangles, colors, instance_ids, class_ids, self.classes)
 
     def _counts(self) -> Bool:

@@ -108,7 +108,7 @@ class BayesianTsdf(MapFuser):
         self._observe(overlaps, clusters, instance_ids, frame)
         self.scene.labels.update(active, near_pixel, self._measurement(clusters, points, instance_ids))
         self._merge_instances(overlaps, instance_ids)
-        self.scene.changed()
+        self.scene.changed(active)
 
     def _agree_on_classes(self, classes: tuple[str, ...]) -> None:
         """The first frame's label space becomes the map's."""
