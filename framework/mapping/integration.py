@@ -27,6 +27,7 @@ from framework.mapping.voxel_grid import (
 )
 
 FAR = 1e9  # m
+LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
 
 
@@ -64,7 +65,7 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 
 
 @device
-def _average_distances(tsdf, weight, to_units, sensor, rounding, scratch):
+def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, scratch):
     """The running average of the distances and weights (512,) of a block.
 
     scratch[512:] holds each voxel's reading (m) and gets the new observation's share in the average of the colour, 0
@@ -74,13 +75,15 @@ def _average_distances(tsdf, weight, to_units, sensor, rounding, scratch):
     full2 = sensor.full_weight_depth * sensor.full_weight_depth
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
-    most = np.float32(TSDF_MAX)
+    most, least = np.float32(TSDF_MAX), np.float32(LEAST_BEHIND)
     for n in range(BLOCK_VOXELS):
         d = scratch[n + BLOCK_VOXELS]
         band = sensor.truncation + sensor.truncation_slope * d
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-        w_new = weight_one * min(one, full2 / max(d * d, np.float32(1e-6)))
+        # behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind
+        behind = max(least, min((band + sdf) / max(band - voxel, np.float32(1e-6)), one))
+        w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])
         portion = w_new / (w_old + w_new) if seen else zero
         stored = np.float32(tsdf[n])
@@ -139,7 +142,7 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
             scratch[n + BLOCK_VOXELS] = depth[np.uint32(pixel[n])]
         for n in range(BLOCK_VOXELS):
             seen[n] = color[np.uint32(pixel[n])]
-        _average_distances(tsdf, weight, to_units, sensor, rounding, scratch)
+        _average_distances(tsdf, weight, grid.voxel_size, to_units, sensor, rounding, scratch)
         _average_colors(packed, seen, rounding, scratch)
         for n in range(BLOCK_VOXELS):
             near[n] = pixel[n] if abs(scratch[n]) <= near_band else np.int32(-1)
