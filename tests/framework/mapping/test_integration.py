@@ -6,7 +6,7 @@ import pytest
 
 from framework.data import Frame
 from framework.geometry import inverse
-from framework.mapping.integration import LEAST_BEHIND, Integrator
+from framework.mapping.integration import GOLDEN, LEAST_BEHIND, Integrator
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
 from tests.analytic_scene import CAMERA, pose, room, walk
