@@ -45,19 +45,29 @@ def _remembered(recent, key):
 
 
 @device
-def _band_keys(depth, v, view, sensor, inverse_size, stride, samples, keys):
-    """The keys of the blocks at `samples` places along the truncation band of the readings of row v, (samples, W)."""
+def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
+    """The keys of the blocks at `samples` places along the truncation band of a row's readings, (samples * W,).
+
+    All that the loop reads stands in local variables, so that the compiler vectorises it.
+    """
+    width = readings.shape[0]
+    first_x, first_y, first_z = ray_direction(view, 0, v)
+    second_x, second_y, second_z = ray_direction(view, stride, v)
+    step_x, step_y, step_z = second_x - first_x, second_y - first_y, second_z - first_z
+    tx, ty, tz = view.t[0], view.t[1], view.t[2]
+    nearest, farthest = sensor.min_depth, sensor.max_depth
+    truncation, slope = sensor.truncation, sensor.truncation_slope
     for s in range(samples):
         place = np.float32(2.0) * np.float32(s) / np.float32(samples - 1) - np.float32(1.0)
-        for n in range(keys.shape[1]):
-            d = depth[v, n * stride]
-            dx, dy, dz = ray_direction(view, np.int32(n * stride), v)
-            z = d + place * (sensor.truncation + sensor.truncation_slope * d)
-            bx = np.int32(np.floor((view.t[0] + z * dx) * inverse_size))
-            by = np.int32(np.floor((view.t[1] + z * dy) * inverse_size))
-            bz = np.int32(np.floor((view.t[2] + z * dz) * inverse_size))
-            valid = (d >= sensor.min_depth) & (d <= sensor.max_depth)
-            keys[s, n] = pack_key(bx, by, bz) if valid else np.int64(NO_KEY)
+        for n in range(width):
+            column = np.float32(np.int32(n))
+            d = readings[n]
+            z = d + place * (truncation + slope * d)
+            bx = np.int32(np.floor((tx + z * (first_x + column * step_x)) * inverse_size))
+            by = np.int32(np.floor((ty + z * (first_y + column * step_y)) * inverse_size))
+            bz = np.int32(np.floor((tz + z * (first_z + column * step_z)) * inverse_size))
+            valid = (d >= nearest) & (d <= farthest)
+            keys[s * width + n] = pack_key(bx, by, bz) if valid else np.int64(NO_KEY)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -71,20 +81,22 @@ def _surface_blocks(depth, view, sensor, block_size, stride, samples, found, cou
     inverse_size = np.float32(1.0) / block_size
     for chunk in prange(CHUNKS):
         recent = np.full(RECENT, NO_KEY, np.int64)
-        keys = np.empty((samples, columns), np.int64)
+        readings = np.empty(columns, np.float32)
+        keys = np.empty(samples * columns, np.int64)
         n = 0
         for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
-            _band_keys(depth, row * stride, view, sensor, inverse_size, stride, samples, keys)
-            for s in range(samples):
-                last = np.int64(NO_KEY)
-                for column in range(columns):
-                    key = keys[s, column]
-                    if key != last:
-                        last = key
-                        if key != NO_KEY and not _remembered(recent, key):
-                            if n < found.shape[1]:
-                                found[chunk, n] = key
-                            n += 1
+            for column in range(columns):
+                readings[column] = depth[row * stride, column * stride]
+            _band_keys(readings, row * stride, view, sensor, inverse_size, stride, samples, keys)
+            last = np.int64(NO_KEY)
+            for i in range(samples * columns):
+                key = keys[i]
+                if key != last:
+                    last = key
+                    if key != NO_KEY and not _remembered(recent, key):
+                        if n < found.shape[1]:
+                            found[chunk, n] = key
+                        n += 1
         counts[chunk] = n
 
 
