@@ -74,30 +74,32 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def look_up_instances(grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, instance_ids: Int32) -> None:
-    """Fills instance_ids (H, W) with the instance of the voxel nearest to each reading of `depth`; 0 = none.
+def look_up_instances(
+    grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
+) -> None:
+    """Fills instance_ids (ceil(H / stride), ceil(W / stride)) with the instance of the voxel nearest to every stride-th
+    reading of every stride-th row of `depth` (H, W); 0 = none.
 
     This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
     that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
     """
-    height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
     half = np.float32(0.5)
-    for v in prange(height):
+    for row in prange(instance_ids.shape[0]):
         key = np.int64(-2)
         region = np.int32(-1)
-        for u in range(width):
-            instance_ids[v, u] = 0
-            z = depth[v, u]
+        for column in range(instance_ids.shape[1]):
+            instance_ids[row, column] = 0
+            z = depth[row * stride, column * stride]
             if z <= np.float32(0.0):
                 continue
-            x, y, w = seen_point(view, u, v, z)
+            x, y, w = seen_point(view, column * stride, row * stride, z)
             i = int(np.floor(x * scale + half))
             j = int(np.floor(y * scale + half))
             k = int(np.floor(w * scale + half))
             block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
             if block >= 0 and grid.label_row[block] >= 0:
-                instance_ids[v, u] = best_instance(evidence, grid.label_row[block], voxel_number(i, j, k))
+                instance_ids[row, column] = best_instance(evidence, grid.label_row[block], voxel_number(i, j, k))
 
 
 @njit(cache=True, nogil=True)
@@ -109,15 +111,19 @@ def _count_visible(instance_ids, visible):
 
 
 @njit(cache=True, nogil=True)
-def _count_votes(pixels, cluster, instance_ids, column, votes):
+def _count_votes(pixels, cluster, instance_ids, stride, column, votes):
     """Adds to votes (N, M + 1) the points of each cluster that fall on the instance of each column."""
     for p in range(pixels.shape[0]):
-        if cluster[p] >= 0:
-            votes[cluster[p], column[instance_ids[pixels[p, 1], pixels[p, 0]]]] += 1
+        u, v = pixels[p, 0], pixels[p, 1]
+        if cluster[p] >= 0 and u % stride == 0 and v % stride == 0:
+            votes[cluster[p], column[instance_ids[v // stride, u // stride]]] += 1
 
 
-def count_overlaps(clusters: PointClusters, instance_ids: Int32) -> Overlaps:
-    """Votes of the clusters' pixels on `instance_ids` (H, W), the instances seen in the frame."""
+def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1) -> Overlaps:
+    """Votes of the clusters' pixels on `instance_ids` (h, w), the instances seen at every stride-th pixel.
+
+    Each sample counts for the stride^2 pixels that it stands for.
+    """
     visible = np.zeros(instance_ids.max() + 1, np.int32)
     _count_visible(instance_ids, visible)
     visible[0] = 0
@@ -125,12 +131,12 @@ def count_overlaps(clusters: PointClusters, instance_ids: Int32) -> Overlaps:
     column = np.full(len(visible), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
     column[seen] = np.arange(len(seen), dtype=np.int32)
     votes = np.zeros((len(clusters), len(seen) + 1), np.int32)
-    _count_votes(clusters.pixels, clusters.cluster, instance_ids, column, votes)
+    _count_votes(clusters.pixels, clusters.cluster, instance_ids, stride, column, votes)
     return Overlaps(
         instance_ids=seen.astype(np.int32),
-        visible=visible[seen],
-        sizes=votes.sum(axis=1, dtype=np.int32),
-        votes=votes[:, :-1],
+        visible=visible[seen] * stride**2,
+        sizes=votes.sum(axis=1, dtype=np.int32) * stride**2,
+        votes=votes[:, :-1] * stride**2,
     )
 
 

@@ -60,6 +60,18 @@ def test_nothing_seen_and_nothing_detected() -> None:
     assert len(cover_another(empty, list_points_by_pixel(empty, SHAPE), 0.5)) == 0
 
 
+def test_every_second_pixel_stands_for_four() -> None:
+    seen = np.zeros((8, 8), np.int32)
+    seen[:, 4:] = 3
+    pixels = np.stack(np.meshgrid(np.arange(2, 8), np.arange(8)), axis=-1).reshape(-1, 2).astype(np.int32)
+    n = len(pixels)
+    one = np.ones((1, 1), np.float32)
+    clusters = PointClusters(np.zeros((n, 3), np.float32), pixels, np.zeros(n, np.int32), one, one[0], ("object",))
+    all_pixels, sampled = count_overlaps(clusters, seen), count_overlaps(clusters, seen[::2, ::2].copy(), 2)
+    for name in ("instance_ids", "visible", "sizes", "votes"):
+        assert getattr(sampled, name).tolist() == getattr(all_pixels, name).tolist(), name
+
+
 def test_the_best_overlap_goes_first_and_each_instance_goes_once() -> None:
     overlap = np.array([[0.6, 0.9], [0.0, 0.8], [0.3, 0.2]])
     assert match_one_to_one(overlap, 0.35).tolist() == [1, -1, -1]
