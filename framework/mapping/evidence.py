@@ -121,6 +121,8 @@ def update_voxel(evidence, row, n, measurement, point):
     Returns the number of evictions.
     """
     ids = evidence.instance_ids[row, n]
+    if point < 0 and ids[0] == 0:
+        return 0  # nothing is known of the voxel, and nothing is said about it
     id_logs = evidence.instance_log[row, n]
     classes = evidence.class_ids[row, n]
     class_logs = evidence.class_log[row, n]

@@ -13,6 +13,8 @@ from framework.parameters import check_bounds, require
 from framework.tracking.alignment import NormalEquations, Weights, linearise, model_view
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
+FINE_ENOUGH = 1e-4  # m and rad: a shorter step ends the finest level, four times as long a one the level before, ...
+
 
 @dataclass
 class VoxelHashingIcp(PoseTracker):
@@ -91,13 +93,14 @@ class VoxelHashingIcp(PoseTracker):
         return Pose(T_world_camera)
 
     def _align(self, frame_levels: list[PyramidLevel], view: View) -> tuple[Float64, NormalEquations]:
-        """T_view_camera, coarse to fine, and the normal equations at it."""
+        """T_view_camera, coarse to fine, and the normal equations of the last step."""
         model = model_view(view)
         intensities = model_intensities(view, levels=3)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         T_view_camera = np.eye(4)
         brightness = 0.0
         for level in (2, 1, 0):
+            enough = FINE_ENOUGH * 4**level
             for _ in range(iterations[level]):
                 equations = linearise(
                     frame_levels[level], model, intensities[level], T_view_camera, self._weights, brightness
@@ -105,11 +108,9 @@ class VoxelHashingIcp(PoseTracker):
                 brightness = equations.brightness
                 xi = _solved(equations)
                 T_view_camera = exp_se3(xi) @ T_view_camera
-                if np.abs(xi).max() < 1e-5:  # m and rad: far below what a frame can tell
+                if np.abs(xi).max() < enough:
                     break
-        return T_view_camera, linearise(
-            frame_levels[0], model, intensities[0], T_view_camera, self._weights, brightness
-        )
+        return T_view_camera, equations
 
     def _why_lost(self, frame: PyramidLevel, equations: NormalEquations, T_world_camera: Float64) -> str:
         """One line that says why the pose is not to be trusted, empty if it is."""
