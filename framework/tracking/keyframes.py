@@ -48,7 +48,8 @@ class Keyframes:
     max_keyframes: int = 200  # >= 1; beyond, the one that the others replace best is dropped
     min_distance: float = 0.25  # m, > 0: a keyframe is this far from every other, or turned, or half of each
     min_angle: float = 0.3  # rad, > 0
-    min_features: int = 50  # >= 4, with depth: a frame with fewer does not become a keyframe
+    max_features: int = 800  # >= 1, of a frame
+    min_features: int = 30  # >= 4, with depth: a frame with fewer does not become a keyframe
     candidates: int = 4  # >= 1, keyframes that a lost frame is matched with
     max_ratio: float = 0.8  # in (0, 1]: of a match's distance to that of the second best
     max_error: float = 4.0  # px, > 0: of the reprojection of an inlier
@@ -62,11 +63,12 @@ class Keyframes:
             max_keyframes=(1, 100_000),
             min_distance=(1e-3, 100.0),
             min_angle=(1e-3, 10.0),
+            max_features=(1, 100_000),
             min_features=(4, 100_000),
             candidates=(1, 1000),
             max_ratio=(1e-3, 1.0),
         )
-        self.extractor = FeatureExtractor()
+        self.extractor = FeatureExtractor(self.max_features)
         self._estimator = AbsolutePoseEstimator(self.max_error, self.min_inliers, self.min_inlier_ratio, self.seed)
         self._words = VisualWords(self.seed)
         self._keyframes: list[Keyframe] = []
@@ -83,29 +85,16 @@ class Keyframes:
 
     def add(self, frame: Frame, T_world_camera: Float64) -> bool:
         """Makes `frame` a keyframe if no other one is near; True when it has become one."""
-        if not self.is_new(T_world_camera):
-            return False
-        features = self.extractor.extract(frame).with_depth()
-        if len(features) < self.min_features:
-            self._barren = T_world_camera.copy()
-            return False
-        self.insert(frame, features, T_world_camera)
-        return True
+        return self.is_new(T_world_camera) and self._insert(frame, self.extractor.extract(frame), T_world_camera)
+
+    def add_with(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
+        """Like `add`, with the frame's features where they are known already."""
+        return self.is_new(T_world_camera) and self._insert(frame, features, T_world_camera)
 
     def is_new(self, T_world_camera: Float64) -> bool:
         """Whether a frame seen from here could become a keyframe. Takes microseconds."""
         near = self._poses if self._barren is None else np.concatenate([self._poses, self._barren[None]])
         return bool((self._separation(near, T_world_camera) >= 1).all())
-
-    def insert(self, frame: Frame, features: Features, T_world_camera: Float64) -> None:
-        """Makes `frame` a keyframe, with `features` that all have a depth."""
-        points = back_project(frame.camera, features.pixels, features.depth)
-        points_world = np.asarray(transform(T_world_camera, points), np.float32)
-        bag = self._words.bag(features.descriptors)
-        self._keyframes.append(Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag))
-        self._poses = np.concatenate([self._poses, T_world_camera[None]])
-        if len(self) > self.max_keyframes:
-            self._drop_most_redundant()
 
     def relocalise(self, frame: Frame) -> AbsolutePose | None:
         """The pose of `frame`, wherever it was taken, with the inliers that speak for it; None if it is not known."""
@@ -135,6 +124,20 @@ class Keyframes:
             [keyframe.points_world[pairs[:, 1]] for keyframe, pairs in zip(keyframes, matches, strict=True)]
         )
         return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
+
+    def _insert(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
+        features = features.with_depth()
+        if len(features) < self.min_features:
+            self._barren = T_world_camera.copy()
+            return False
+        points = back_project(frame.camera, features.pixels, features.depth)
+        points_world = np.asarray(transform(T_world_camera, points), np.float32)
+        bag = self._words.bag(features.descriptors)
+        self._keyframes.append(Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag))
+        self._poses = np.concatenate([self._poses, T_world_camera[None]])
+        if len(self) > self.max_keyframes:
+            self._drop_most_redundant()
+        return True
 
     def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
         """How far (K,) a pose is from others (K, 4, 4): 1 = far enough for a keyframe of its own."""
