@@ -18,6 +18,8 @@ from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import FeatureExtractor, Features, match
 from framework.tracking.visual_words import VisualWords, similarity
 
+BARREN_SEPARATION = 0.25  # of that between keyframes: what has too few features is worth another look from here on
+
 
 @dataclass(frozen=True)
 class Keyframe:
@@ -85,16 +87,36 @@ class Keyframes:
 
     def add(self, frame: Frame, T_world_camera: Float64) -> bool:
         """Makes `frame` a keyframe if no other one is near; True when it has become one."""
-        return self.is_new(T_world_camera) and self._insert(frame, self.extractor.extract(frame), T_world_camera)
+        if not self.is_new(T_world_camera) or self._near_barren(T_world_camera):
+            return False
+        if self.add_with(frame, self.extractor.extract(frame), T_world_camera):
+            return True
+        self._barren = T_world_camera.copy()
+        return False
 
     def add_with(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
         """Like `add`, with the frame's features where they are known already."""
-        return self.is_new(T_world_camera) and self._insert(frame, features, T_world_camera)
+        features = features.with_depth()
+        if len(features) < self.min_features or not self.is_new(T_world_camera):
+            return False
+        points = back_project(frame.camera, features.pixels, features.depth)
+        points_world = np.asarray(transform(T_world_camera, points), np.float32)
+        bag = self._words.bag(features.descriptors)
+        self._keyframes.append(Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag))
+        self._poses = np.concatenate([self._poses, T_world_camera[None]])
+        if len(self) > self.max_keyframes:
+            self._drop_most_redundant()
+        return True
 
     def is_new(self, T_world_camera: Float64) -> bool:
-        """Whether a frame seen from here could become a keyframe. Takes microseconds."""
-        near = self._poses if self._barren is None else np.concatenate([self._poses, self._barren[None]])
-        return bool((self._separation(near, T_world_camera) >= 1).all())
+        """Whether no keyframe was seen from near here. Takes microseconds."""
+        return bool((self._separation(self._poses, T_world_camera) >= 1).all())
+
+    def _near_barren(self, T_world_camera: Float64) -> bool:
+        """Whether the last frame with too few features was seen from near here: this one would cost as much in vain."""
+        if self._barren is None:
+            return False
+        return bool(self._separation(self._barren[None], T_world_camera)[0] < BARREN_SEPARATION)
 
     def relocalise(self, frame: Frame) -> AbsolutePose | None:
         """The pose of `frame`, wherever it was taken, with the inliers that speak for it; None if it is not known."""
@@ -124,20 +146,6 @@ class Keyframes:
             [keyframe.points_world[pairs[:, 1]] for keyframe, pairs in zip(keyframes, matches, strict=True)]
         )
         return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
-
-    def _insert(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
-        features = features.with_depth()
-        if len(features) < self.min_features:
-            self._barren = T_world_camera.copy()
-            return False
-        points = back_project(frame.camera, features.pixels, features.depth)
-        points_world = np.asarray(transform(T_world_camera, points), np.float32)
-        bag = self._words.bag(features.descriptors)
-        self._keyframes.append(Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag))
-        self._poses = np.concatenate([self._poses, T_world_camera[None]])
-        if len(self) > self.max_keyframes:
-            self._drop_most_redundant()
-        return True
 
     def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
         """How far (K,) a pose is from others (K, 4, 4): 1 = far enough for a keyframe of its own."""

@@ -53,15 +53,19 @@ def test_a_frame_that_is_not_new_is_not_looked_at(monkeypatch: pytest.MonkeyPatc
     assert not keyframes.add(papered_frame(pose(0.05)), pose(0.05))
 
 
-def test_a_frame_without_features_is_not_looked_at_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
-    keyframes = Keyframes()
+def test_a_frame_without_features_is_not_looked_at_again_and_again() -> None:
+    keyframes = Keyframes(min_distance=0.2)
+    seen = []
+    extract = keyframes.extractor.extract
+    keyframes.extractor.extract = lambda frame: seen.append(frame) or extract(frame)
     blank = replace(papered_frame(pose(0)), color=np.zeros((*CAMERA.shape, 3), np.uint8))
-    assert not keyframes.add(blank, pose(0))
-    assert not keyframes.is_new(pose(0.01))
-    assert keyframes.is_new(pose(1.0))
+    added = [keyframes.add(blank, pose(x)) for x in (0, 0.01, 0.04, 0.06, 0.07)]
+    assert added == [False] * 5
+    assert len(seen) == 2, "at 0 and at 0.06 m"
     without_depth = replace(papered_frame(pose(1)), depth=np.zeros(CAMERA.shape, np.float32))
     assert not keyframes.add(without_depth, pose(1.0))
-    assert len(keyframes) == 0
+    assert keyframes.add(papered_frame(pose(0.9)), pose(0.9))
+    assert len(keyframes) == 1
 
 
 def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
