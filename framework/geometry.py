@@ -61,7 +61,7 @@ def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDAr
     return np.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], axis=-1)
 
 
-def back_project(camera: Camera, pixels: Int32, depth: Float32) -> Float32:
+def back_project(camera: Camera, pixels: Int32 | Float32, depth: Float32) -> Float32:
     """Points (P, 3) in camera coordinates of pixels (P, 2) (u, v) with depths (P,) along z."""
     x = (pixels[:, 0] - np.float32(camera.cx)) * (depth / np.float32(camera.fx))
     y = (pixels[:, 1] - np.float32(camera.cy)) * (depth / np.float32(camera.fy))

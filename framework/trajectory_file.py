@@ -2,25 +2,67 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from framework.atomic_files import written_whole
-from framework.data import Bool, Float64, check_rigid
+from framework.data import Float64, check_rigid
 from framework.errors import DataError
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
-QUATERNION_TOLERANCE = 1e-2  # of the norm: published quaternions carry as few as 4 digits
+QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits and not another kind of number
+
+
+@dataclass(frozen=True)
+class TumLine:
+    """One line of a TUM file; whether its numbers are a pose is only told when that is asked for."""
+
+    path: Path
+    number: int  # of the line in the file, from 1
+    timestamp: float  # s
+    position: tuple[float, ...]  # (3,) m, may be NaN
+    quat_xyzw: tuple[float, ...]  # (4,), may be NaN
+
+    def pose(self) -> Float64:
+        """T_world_camera (4, 4), rigid. Raises DataError, naming file and line, when the numbers are none."""
+        norm = math.hypot(*self.quat_xyzw)
+        if not all(map(math.isfinite, (*self.position, norm))):
+            raise self.fault("the pose is not finite")
+        if abs(norm - 1) > QUATERNION_TOLERANCE:
+            raise self.fault(f"the quaternion qx qy qz qw has length {norm:.4g}, expected 1")
+        T_world_camera = np.eye(4)
+        T_world_camera[:3, :3] = Rotation.from_quat(self.quat_xyzw).as_matrix()
+        T_world_camera[:3, 3] = self.position
+        return T_world_camera
+
+    def fault(self, message: str) -> DataError:
+        return DataError(f"{self.path}, line {self.number}: {message}")
 
 
 def read_tum(path: Path) -> tuple[Float64, Float64]:
     """Timestamps (F,) s and poses T_world_camera (F, 4, 4) of a TUM file, in the file's order.
 
-    Empty lines and those that begin with `#` are skipped. Raises DataError, naming file and line, when a line does not
-    hold eight finite numbers with a unit quaternion, or when timestamps do not grow.
+    Raises DataError, naming file and line, when a line does not hold eight finite numbers with a unit quaternion, or
+    when timestamps do not grow.
+    """
+    lines = read_tum_lines(path)
+    for before, line in pairwise(lines):
+        if line.timestamp <= before.timestamp:
+            raise line.fault(f"timestamps must grow, found {line.timestamp:.12g} after {before.timestamp:.12g}")
+    timestamps = np.array([line.timestamp for line in lines], np.float64)
+    return timestamps, np.array([line.pose() for line in lines], np.float64).reshape(-1, 4, 4)
+
+
+def read_tum_lines(path: Path) -> list[TumLine]:
+    """The lines of a TUM file; empty ones and what follows a `#` are skipped.
+
+    Raises DataError, naming file and line, when one does not hold eight numbers, the first of them finite.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -28,18 +70,8 @@ def read_tum(path: Path) -> tuple[Float64, Float64]:
         raise DataError(f"{path} does not exist: expected a trajectory in TUM format") from error
     except (OSError, UnicodeDecodeError) as error:
         raise DataError(f"{path} could not be read as text: {error}") from error
-    numbered = [
-        (n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")
-    ]
-    rows = np.array([_row(path, n, line) for n, line in numbered], np.float64).reshape(-1, 8)
-    norms = np.linalg.norm(rows[:, 4:], axis=1)
-    _refuse(path, numbered, np.abs(norms - 1) > QUATERNION_TOLERANCE, "qx qy qz qw must have length 1")
-    _refuse(path, numbered, np.diff(rows[:, 0], prepend=-np.inf) <= 0, "timestamps must grow from line to line")
-    T = np.tile(np.eye(4), (len(rows), 1, 1))
-    T[:, :3, 3] = rows[:, 1:4]
-    if len(rows):
-        T[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    return rows[:, 0], T
+    words = [line.split("#", 1)[0].split() for line in lines]
+    return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
 
 def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
@@ -59,21 +91,13 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
             file.write(f"{timestamp:.9f} " + " ".join(f"{value:.12g}" for value in row) + "\n")
 
 
-def _row(path: Path, number: int, line: str) -> list[float]:
-    words = line.split()
-    if len(words) != 8:
-        raise DataError(f"{path}, line {number}: expected 8 numbers ({COLUMNS}), found {len(words)}")
+def _line(path: Path, number: int, words: list[str]) -> TumLine:
     try:
         values = [float(word) for word in words]
     except ValueError as error:
         raise DataError(f"{path}, line {number}: expected 8 numbers ({COLUMNS}): {error}") from error
-    if not np.isfinite(values).all():
-        raise DataError(f"{path}, line {number}: expected finite numbers ({COLUMNS}), found {line.strip()!r}")
-    return values
-
-
-def _refuse(path: Path, numbered: list[tuple[int, str]], wrong: Bool, expected: str) -> None:
-    """Raises DataError for the first line that is `wrong` (F,)."""
-    if wrong.any():
-        number, line = numbered[int(wrong.argmax())]
-        raise DataError(f"{path}, line {number}: {expected}, found {line.strip()!r}")
+    if len(values) != len(COLUMNS.split()):
+        raise DataError(f"{path}, line {number}: expected 8 numbers ({COLUMNS}), found {len(values)}")
+    if not math.isfinite(values[0]):
+        raise DataError(f"{path}, line {number}: the timestamp is not finite")
+    return TumLine(path, number, values[0], tuple(values[1:4]), tuple(values[4:]))

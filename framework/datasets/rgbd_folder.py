@@ -22,17 +22,16 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth, check_rigid
+from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
 from framework.datasets.image_files import read_color, read_uint16
 from framework.errors import ConfigError, DataError, FrameError
 from framework.evaluation.scene_truth import LabeledDepth, fuse_scene_truth
 from framework.interfaces import RGBDSequence
+from framework.trajectory_file import TumLine, read_tum_lines
 
 FRAME_RATE = 30.0  # Hz, for the timestamps of a folder without poses.txt
 NO_READING = 65535  # uint16 that several sensors write instead of 0
-QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits and not another kind of number
-POSE_COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 log = logging.getLogger(__name__)
 
@@ -134,18 +133,11 @@ class RgbdFolder(RGBDSequence):
     def _pose(self, index: int) -> tuple[float, Float64 | None]:
         if self._poses is None:
             return index / FRAME_RATE, None
-        line, (timestamp, *position, qx, qy, qz, qw) = self._poses[index]
-        where = f"frame {index}: {self.folder / 'poses.txt'}, line {line}"
-        norm = math.hypot(qx, qy, qz, qw)
-        if not all(map(math.isfinite, (*position, norm))):
-            raise FrameError(f"{where}: the pose is not finite")
-        if abs(norm - 1) > QUATERNION_TOLERANCE:
-            raise FrameError(f"{where}: the quaternion qx qy qz qw has length {norm:.4g}, expected 1")
-        T_world_camera = np.eye(4)
-        T_world_camera[:3, :3] = _rotation(np.array([qx, qy, qz, qw]) / norm)
-        T_world_camera[:3, 3] = position
-        check_rigid(where, T_world_camera)
-        return timestamp, T_world_camera
+        line = self._poses[index]
+        try:
+            return line.timestamp, line.pose()
+        except DataError as error:
+            raise FrameError(f"frame {index}: {error}") from error
 
     def _read_instances(self) -> tuple[dict[int, str | None], dict[int, Path]]:
         folder, names = self.folder / "instance", self.folder / "instances.json"
@@ -250,24 +242,11 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
     )
 
 
-def _read_poses(path: Path, frames: int) -> list[tuple[int, list[float]]] | None:
-    """Each frame's line number and its eight values, which may be NaN; None without the file."""
+def _read_poses(path: Path, frames: int) -> list[TumLine] | None:
+    """Each frame's line, which may be no pose; None without the file."""
     if not path.is_file():
         return None
-    poses: list[tuple[int, list[float]]] = []
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
-        words = line.split("#", 1)[0].split()
-        if not words:
-            continue
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            raise DataError(f"{path}, line {number}: expected numbers ({POSE_COLUMNS}), found {line!r}") from None
-        if len(values) != len(POSE_COLUMNS.split()):
-            raise DataError(f"{path}, line {number}: expected 8 numbers ({POSE_COLUMNS}), found {len(values)}")
-        if not math.isfinite(values[0]):
-            raise DataError(f"{path}, line {number}: the timestamp is not finite")
-        poses.append((number, values))
+    poses = read_tum_lines(path)
     if len(poses) != frames:
         raise DataError(
             f"{path} holds {len(poses)} poses, but color/ holds {frames} frames: one line a frame is needed"
@@ -284,15 +263,3 @@ def _read_class_names(path: Path) -> dict[int, str | None]:
             raise DataError(f'{path}: instance {key} must be {{"name": ..., "class": name or null}}, found {entry!r}')
         class_names[int(key)] = entry.get("class")
     return class_names
-
-
-def _rotation(quat_xyzw: Float64) -> Float64:
-    """The rotation matrix of a unit quaternion."""
-    x, y, z, w = quat_xyzw
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -43,9 +43,11 @@ def test_empty(tmp_path):
     [
         ("1.0 1 2 3 0 0 0\n", "line 3: expected 8 numbers .* found 7"),
         ("1.0 1 2 3 0 0 0 one\n", "line 3: expected 8 numbers .*'one'"),
-        ("1.0 1 nan 3 0 0 0 1\n", "line 3: expected finite numbers"),
-        ("1.0 1 2 3 0 0 0 0\n", "line 3: qx qy qz qw must have length 1"),
-        ("0.0 1 2 3 0 0 0 1\n", "line 3: timestamps must grow"),
+        ("1.0 1 nan 3 0 0 0 1\n", "line 3: the pose is not finite"),
+        ("1.0 1 2 3 0 0 0 0\n", "line 3: the quaternion qx qy qz qw has length 0, expected 1"),
+        ("inf 1 2 3 0 0 0 1\n", "line 3: the timestamp is not finite"),
+        ("0.0 1 2 3 0 0 0 1\n", "line 3: timestamps must grow, found 0 after 0"),
+        ("1.0 1 2 3 0 0 0 1\n0.5 1 2 3 0 0 0 1\n", "line 4: timestamps must grow, found 0.5 after 1"),
     ],
 )
 def test_faults_name_file_and_line(tmp_path, bad, message):

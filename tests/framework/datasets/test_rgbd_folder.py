@@ -209,7 +209,7 @@ def test_fewer_poses_than_frames(folder):
     ("line", "message"),
     [
         ("0.2 1 2 3 0 0 0", "line 4: expected 8 numbers .*, found 7"),
-        ("0.2 1 2 three 0 0 0 1", "line 4: expected numbers"),
+        ("0.2 1 2 three 0 0 0 1", "line 4: expected 8 numbers .*'three'"),
         ("nan 1 2 3 0 0 0 1", "line 4: the timestamp"),
     ],
 )

@@ -1,0 +1,164 @@
+"""Keyframes: what the camera has seen from where, so that a lost camera can be found again.
+
+After PTAM (Klein and Murray 2007) and ORB-SLAM (Mur-Artal et al. 2015): the lost frame's bag of visual words proposes
+the few keyframes that may show the same place; matched features with depth and P3P in RANSAC tell the pose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Float32, Float64, Frame, UInt8
+from framework.geometry import back_project, transform
+from framework.parameters import check_bounds
+from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
+from framework.tracking.features import FeatureExtractor, Features, match
+from framework.tracking.visual_words import VisualWords, similarity
+
+BARREN_SEPARATION = 0.25  # of that between keyframes: what has too few features is worth another look from here on
+
+
+@dataclass(frozen=True)
+class Keyframe:
+    """The features of one trusted frame that have a depth."""
+
+    T_world_camera: Float64  # (4, 4)
+    points_world: Float32  # (F, 3) m
+    descriptors: UInt8  # (F, 128)
+    bag: Float32  # of visual words
+
+    @property
+    def bytes(self) -> int:
+        return self.points_world.nbytes + self.descriptors.nbytes + self.bag.nbytes
+
+
+@dataclass
+class Keyframes:
+    """A bounded database of keyframes.
+
+    `add` is offered every trusted frame; only one that shows something new costs more than a few microseconds.
+    `relocalise` costs the same whatever the number of keyframes, but for the comparison of their bags of words.
+
+    Measured on 640x480 frames of redkitchen on one core: a frame that is not new takes 0.02 ms, one that is added
+    20 ms, a lost one 30 to 50 ms (of which features 20; the bags of 200 keyframes 4). With keyframes from frames 0 to
+    149, every second frame of 150 to 299 is found (24 inliers and a ratio of 0.2 at the least, 0.06 m in the median and
+    0.2 m at worst), also among 69 keyframes of another flat. Garbage, black frames and three other scenes are not (6
+    inliers at most), nor mirrored frames of the same kitchen (17 inliers at a ratio of 0.17, 20 at 0.12).
+    """
+
+    max_keyframes: int = 200  # >= 1; beyond, the one that the others replace best is dropped
+    min_distance: float = 0.25  # m, > 0: a keyframe is this far from every other, or turned, or half of each
+    min_angle: float = 0.3  # rad, > 0
+    max_features: int = 800  # >= 1, of a frame
+    min_features: int = 30  # >= 4, with depth: a frame with fewer does not become a keyframe
+    candidates: int = 6  # >= 1, keyframes that a lost frame is matched with
+    max_ratio: float = 0.8  # in (0, 1]: of a match's distance to that of the second best
+    max_error: float = 4.0  # px, > 0: of the reprojection of an inlier
+    min_inliers: int = 20  # >= 4
+    min_inlier_ratio: float = 0.15  # of the matches, in (0, 1]; low, because `candidates` may show other places
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            max_keyframes=(1, 100_000),
+            min_distance=(1e-3, 100.0),
+            min_angle=(1e-3, 10.0),
+            max_features=(1, 100_000),
+            min_features=(4, 100_000),
+            candidates=(1, 1000),
+            max_ratio=(1e-3, 1.0),
+        )
+        self.extractor = FeatureExtractor(self.max_features)
+        self._estimator = AbsolutePoseEstimator(self.max_error, self.min_inliers, self.min_inlier_ratio, self.seed)
+        self._words = VisualWords(self.seed)
+        self._keyframes: list[Keyframe] = []
+        self._poses = np.zeros((0, 4, 4))  # of the keyframes
+        self._barren: Float64 | None = None  # where the last frame was that had too few features
+
+    def __len__(self) -> int:
+        return len(self._keyframes)
+
+    @property
+    def byte_count(self) -> int:
+        """Bytes that the keyframes take."""
+        return sum(keyframe.bytes for keyframe in self._keyframes)
+
+    def add(self, frame: Frame, T_world_camera: Float64) -> bool:
+        """Makes `frame` a keyframe if no other one is near; True when it has become one."""
+        if not self.is_new(T_world_camera) or self._near_barren(T_world_camera):
+            return False
+        if self.add_with(frame, self.extractor.extract(frame), T_world_camera):
+            return True
+        self._barren = T_world_camera.copy()
+        return False
+
+    def add_with(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
+        """Like `add`, with the frame's features where they are known already."""
+        features = features.with_depth()
+        if len(features) < self.min_features or not self.is_new(T_world_camera):
+            return False
+        points = back_project(frame.camera, features.pixels, features.depth)
+        points_world = np.asarray(transform(T_world_camera, points), np.float32)
+        bag = self._words.bag(features.descriptors)
+        self._keyframes.append(Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag))
+        self._poses = np.concatenate([self._poses, T_world_camera[None]])
+        if len(self) > self.max_keyframes:
+            self._drop_most_redundant()
+        return True
+
+    def is_new(self, T_world_camera: Float64) -> bool:
+        """Whether no keyframe was seen from near here. Takes microseconds."""
+        return bool((self._separation(self._poses, T_world_camera) >= 1).all())
+
+    def _near_barren(self, T_world_camera: Float64) -> bool:
+        """Whether the last frame with too few features was seen from near here: this one would cost as much in vain."""
+        if self._barren is None:
+            return False
+        return bool(self._separation(self._barren[None], T_world_camera)[0] < BARREN_SEPARATION)
+
+    def relocalise(self, frame: Frame) -> AbsolutePose | None:
+        """The pose of `frame`, wherever it was taken, with the inliers that speak for it; None if it is not known."""
+        if not self._keyframes:
+            return None
+        features = self.extractor.extract(frame)
+        return self.locate(frame, features, self.alike(features))
+
+    def alike(self, features: Features) -> list[Keyframe]:
+        """The keyframes that look most like an image with these features, best first."""
+        bags = np.stack([keyframe.bag for keyframe in self._keyframes])
+        order = np.argsort(-similarity(self._words.bag(features.descriptors), bags), kind="stable")
+        return [self._keyframes[k] for k in order[: self.candidates]]
+
+    def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
+        """The keyframes seen from nearest to a pose, best first."""
+        order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
+        return [self._keyframes[k] for k in order[: self.candidates]]
+
+    def locate(self, frame: Frame, features: Features, keyframes: Sequence[Keyframe]) -> AbsolutePose | None:
+        """The pose of `frame` from its features' matches with several keyframes at once; None if they do not tell."""
+        if not keyframes:
+            return None
+        matches = [match(features.descriptors, keyframe.descriptors, self.max_ratio) for keyframe in keyframes]
+        query = np.concatenate([pairs[:, 0] for pairs in matches])
+        points_world = np.concatenate(
+            [keyframe.points_world[pairs[:, 1]] for keyframe, pairs in zip(keyframes, matches, strict=True)]
+        )
+        return self._estimator.estimate(frame.camera, features.pixels[query], points_world, features.depth[query])
+
+    def _separation(self, poses: Float64, T_world_camera: Float64) -> Float64:
+        """How far (K,) a pose is from others (K, 4, 4): 1 = far enough for a keyframe of its own."""
+        distance = np.linalg.norm(poses[:, :3, 3] - T_world_camera[:3, 3], axis=1)
+        cosine = (np.einsum("kij,ij->k", poses[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
+        return np.asarray(distance / self.min_distance + np.arccos(np.clip(cosine, -1, 1)) / self.min_angle)
+
+    def _drop_most_redundant(self) -> None:
+        """Drops the older one of the two keyframes that are nearest to each other."""
+        separation = np.stack([self._separation(self._poses, T) for T in self._poses])
+        np.fill_diagonal(separation, np.inf)
+        oldest = int(separation.min(axis=1).argmin())
+        del self._keyframes[oldest]
+        self._poses = np.delete(self._poses, oldest, axis=0)

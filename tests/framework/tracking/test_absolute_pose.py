@@ -1,0 +1,110 @@
+"""Exact matches give the exact pose; what does not determine one gives None."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.errors import ConfigError
+from framework.geometry import exp_se3, inverse, project, rotation_angle, transform
+from framework.tracking.absolute_pose import AbsolutePoseEstimator
+
+CAMERA = Camera(640, 480, 520.0, 530.0, 323.2, 236.1)
+T_WORLD_CAMERA = exp_se3(np.array([0.4, -0.2, 1.0, 0.3, -0.6, 0.2]))
+
+
+def matches(count: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Pixels, points in the world and depths that agree exactly."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform((-1, -1, 1), (1, 1, 4), (count, 3))
+    points[:, :2] *= 0.4 * points[:, 2:]
+    return project(CAMERA, points), transform(T_WORLD_CAMERA, points), points[:, 2]
+
+
+def test_exact_matches_give_the_exact_pose() -> None:
+    """With the half-pixel convention mixed up, the camera would be turned by a milliradian."""
+    pixels, points_world, depth = matches(100)
+    found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
+    assert found is not None
+    assert found.inlier_count == 100
+    np.testing.assert_allclose(found.T_world_camera, T_WORLD_CAMERA, atol=1e-6)
+
+
+def test_outliers_are_told_apart() -> None:
+    rng = np.random.default_rng(1)
+    pixels, points_world, _ = matches(200)
+    pixels += rng.normal(0, 0.5, pixels.shape)
+    pixels[:120] = rng.uniform((0, 0), (640, 480), (120, 2))
+    first = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world)
+    assert first is not None
+    assert first.inliers[120:].mean() > 0.98
+    assert first.inliers[:120].mean() < 0.02
+    error = inverse(T_WORLD_CAMERA) @ first.T_world_camera
+    assert np.linalg.norm(error[:3, 3]) < 0.005
+    assert rotation_angle(error[:3, :3]) < 0.002
+
+
+def test_the_same_matches_give_the_same_pose_whatever_was_estimated_before() -> None:
+    """Matches so noisy that other random samples lead to other inliers."""
+    rng = np.random.default_rng(2)
+    pixels, points_world, _ = matches(120)
+    pixels += rng.normal(0, 4, pixels.shape)
+    estimator = AbsolutePoseEstimator(seed=3)
+    first = estimator.estimate(CAMERA, pixels, points_world)
+    assert first is not None
+    for k in range(4):
+        estimator.estimate(CAMERA, *matches(50, seed=k)[:2])
+        again = AbsolutePoseEstimator(seed=3).estimate(CAMERA, pixels, points_world)
+        assert again is not None
+        np.testing.assert_array_equal(again.T_world_camera, first.T_world_camera)
+    others = [AbsolutePoseEstimator(seed=k).estimate(CAMERA, pixels, points_world) for k in range(4, 10)]
+    assert any(other is None or not np.array_equal(other.inliers, first.inliers) for other in others)
+
+
+@pytest.mark.parametrize("count", [0, 3, 4, 30, 300])
+def test_garbage_has_no_pose(count: int) -> None:
+    rng = np.random.default_rng(count)
+    pixels, points_world = rng.uniform((0, 0), (640, 480), (count, 2)), rng.uniform(-2, 2, (count, 3))
+    assert AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world) is None
+
+
+def test_too_few_or_too_rare_inliers_are_no_pose() -> None:
+    pixels, points_world, _ = matches(100)
+    assert AbsolutePoseEstimator(min_inliers=101).estimate(CAMERA, pixels, points_world) is None
+    pixels[:60] = np.random.default_rng(0).uniform((0, 0), (640, 480), (60, 2))
+    assert AbsolutePoseEstimator(min_inlier_ratio=0.3).estimate(CAMERA, pixels, points_world) is not None
+    assert AbsolutePoseEstimator(min_inlier_ratio=0.5).estimate(CAMERA, pixels, points_world) is None
+
+
+def test_what_is_not_finite_is_no_inlier() -> None:
+    pixels, points_world, depth = matches(100)
+    pixels[:10], points_world[10:20], points_world[20:30] = np.nan, np.nan, np.inf
+    found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
+    assert found is not None
+    assert found.inliers.tolist() == [False] * 30 + [True] * 70
+    assert AbsolutePoseEstimator().estimate(CAMERA, pixels * np.nan, points_world) is None
+
+
+def test_readings_that_contradict_the_pose_are_no_inliers() -> None:
+    pixels, points_world, depth = matches(100)
+    depth[:30] *= 1.2
+    depth[30:50] = 0  # no reading: neither for nor against
+    found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, depth)
+    assert found is not None
+    assert found.inliers.tolist() == [False] * 30 + [True] * 70
+    assert AbsolutePoseEstimator().estimate(CAMERA, pixels, points_world, 2 * depth[::-1]) is None
+
+
+@pytest.mark.parametrize("direction", [(0.0, 0.0, 0.0), (0.01, 0.02, 0.01)], ids=["point", "line"])
+def test_points_that_do_not_determine_the_pose_raise_nothing(direction: tuple[float, float, float]) -> None:
+    points = np.array([0.1, 0.2, 2.0]) + np.outer(np.arange(50), direction)
+    pixels = project(CAMERA, points)
+    found = AbsolutePoseEstimator().estimate(CAMERA, pixels, points)
+    assert found is None or np.isfinite(found.T_world_camera).all()
+
+
+@pytest.mark.parametrize("bound", [{"max_error": 0.0}, {"min_inliers": 3}, {"min_inlier_ratio": 1.5}, {"seed": -1}])
+def test_bounds(bound: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=rf"AbsolutePoseEstimator\.{next(iter(bound))}"):
+        AbsolutePoseEstimator(**bound)

@@ -1,0 +1,147 @@
+"""Keyframes on a papered room where every pose is known, and on real video."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import ConfigError
+from framework.geometry import exp_se3, inverse, rotation_angle
+from framework.tracking.features import FeatureExtractor
+from framework.tracking.keyframes import Keyframes
+from framework.tracking.visual_words import VisualWords, similarity
+from tests.papered_room import CAMERA, papered_frame
+
+SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
+
+
+def pose(x: float, yaw: float = 0.0) -> np.ndarray:
+    return exp_se3(np.array([x, 0, 0, 0, yaw, 0]))
+
+
+def apart(T_a: np.ndarray, T_b: np.ndarray) -> tuple[float, float]:
+    T = inverse(T_a) @ T_b
+    return float(np.linalg.norm(T[:3, 3])), rotation_angle(T[:3, :3])
+
+
+@pytest.fixture(scope="module")
+def keyframes() -> Keyframes:
+    keyframes = Keyframes()
+    for yaw in np.linspace(0, 6.2, 20):
+        keyframes.add(papered_frame(pose(0, yaw)), pose(0, yaw))
+    return keyframes
+
+
+def test_only_what_is_new_becomes_a_keyframe() -> None:
+    keyframes = Keyframes(min_distance=0.2, min_angle=0.3)
+    added = [
+        keyframes.add(papered_frame(T), T) for T in (pose(0), pose(0.19), pose(0.21), pose(0.21, 0.2), pose(0, 0.31))
+    ]
+    assert added == [True, False, True, False, True]
+    assert keyframes.add(papered_frame(pose(-0.12, 0.16)), pose(-0.12, 0.16)), "half of each is enough"
+
+
+def test_a_frame_that_is_not_new_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
+    keyframes = Keyframes()
+    assert keyframes.add(papered_frame(pose(0)), pose(0))
+    monkeypatch.setattr(FeatureExtractor, "extract", None)
+    assert not keyframes.add(papered_frame(pose(0.05)), pose(0.05))
+
+
+def test_a_frame_without_features_is_not_looked_at_again_and_again() -> None:
+    keyframes = Keyframes(min_distance=0.2)
+    seen = []
+    extract = keyframes.extractor.extract
+    keyframes.extractor.extract = lambda frame: seen.append(frame) or extract(frame)
+    blank = replace(papered_frame(pose(0)), color=np.zeros((*CAMERA.shape, 3), np.uint8))
+    added = [keyframes.add(blank, pose(x)) for x in (0, 0.01, 0.04, 0.06, 0.07)]
+    assert added == [False] * 5
+    assert len(seen) == 2, "at 0 and at 0.06 m"
+    without_depth = replace(papered_frame(pose(1)), depth=np.zeros(CAMERA.shape, np.float32))
+    assert not keyframes.add(without_depth, pose(1.0))
+    assert keyframes.add(papered_frame(pose(0.9)), pose(0.9))
+    assert len(keyframes) == 1
+
+
+def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
+    for k, yaw in enumerate(np.linspace(0.1, 6, 7)):
+        T_world_camera = exp_se3(np.array([0.1 - 0.03 * k, 0.05, 0.1, 0.05, yaw, 0.1]))
+        found = keyframes.relocalise(papered_frame(T_world_camera))
+        assert found is not None
+        distance, angle = apart(found.T_world_camera, T_world_camera)
+        assert distance < 0.01
+        assert angle < 0.005
+        assert found.inlier_count >= keyframes.min_inliers
+
+
+def test_the_same_frame_is_found_at_the_same_place(keyframes: Keyframes) -> None:
+    frame = papered_frame(pose(0.1, 0.4))
+    found = [keyframes.relocalise(frame) for _ in range(2)]
+    np.testing.assert_array_equal(found[0].T_world_camera, found[1].T_world_camera)
+
+
+def test_what_was_never_seen_is_not_found(keyframes: Keyframes) -> None:
+    rng = np.random.default_rng(0)
+    frame = papered_frame(pose(0))
+    noise = rng.integers(0, 255, (*CAMERA.shape, 3)).astype(np.uint8)
+    for color in (np.zeros_like(noise), noise, cv2.GaussianBlur(noise, (0, 0), 3), frame.color[:, ::-1]):
+        assert keyframes.relocalise(replace(frame, color=np.ascontiguousarray(color))) is None
+    assert keyframes.relocalise(papered_frame(pose(0), paper=1)) is None, "another room"
+    twice_as_far = replace(frame, depth=frame.depth * 2)
+    assert keyframes.relocalise(twice_as_far) is None, "a picture of the room is not the room"
+    assert Keyframes().relocalise(frame) is None
+
+
+def test_the_database_is_bounded_and_keeps_what_is_apart() -> None:
+    keyframes = Keyframes(max_keyframes=5, min_distance=0.01, min_angle=0.01, candidates=5)
+    for yaw in (0, 0.48, 0.5, 1.0, 2.0, 2.5, 2.52):
+        assert keyframes.add(papered_frame(pose(0, yaw)), pose(0, yaw))
+    assert len(keyframes) == 5
+    kept = sorted(apart(keyframe.T_world_camera, pose(0))[1] for keyframe in keyframes.nearest(pose(0)))
+    np.testing.assert_allclose(kept, [0, 0.5, 1, 2, 2.52], atol=1e-6)
+    assert keyframes.byte_count < 5 * 200_000
+
+
+def test_the_nearest_keyframes_come_first(keyframes: Keyframes) -> None:
+    angles = [apart(k.T_world_camera, pose(0, 1.0))[1] for k in keyframes.nearest(pose(0, 1.0))]
+    assert angles == sorted(angles)
+    assert angles[0] < 0.17
+
+
+def test_words_are_drawn_from_the_seed() -> None:
+    descriptors = np.random.default_rng(0).integers(0, 100, (50, 128)).astype(np.uint8)
+    bag = VisualWords(1).bag(descriptors)
+    assert (bag**2).sum() == pytest.approx(50)
+    np.testing.assert_array_equal(bag, VisualWords(1).bag(descriptors[::-1]))
+    assert not np.array_equal(bag, VisualWords(2).bag(descriptors))
+    other = VisualWords(1).bag(255 - descriptors)
+    np.testing.assert_allclose(similarity(bag, np.stack([bag, other])), [1, 0], atol=1e-6)
+
+
+@pytest.mark.parametrize("bound", [{"max_keyframes": 0}, {"min_distance": 0.0}, {"min_inliers": 3}, {"max_ratio": 1.2}])
+def test_bounds(bound: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(bound))):
+        Keyframes(**bound)
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="needs ../shared/data")
+def test_real_video_is_found_and_other_places_are_not() -> None:
+    kitchen = RgbdFolder(SHARED / "redkitchen")
+    keyframes = Keyframes()
+    for k in range(0, 150, 10):
+        keyframes.add(kitchen[k], kitchen[k].T_world_camera)
+    for k in range(5, 300, 30):
+        found = keyframes.relocalise(kitchen[k])
+        assert found is not None, f"frame {k}"
+        distance, angle = apart(found.T_world_camera, kitchen[k].T_world_camera)
+        assert distance < 0.15, f"frame {k}"
+        assert angle < 0.08
+    elsewhere = [("mit76", range(5)), ("redwood5", range(5)), ("replica_floor2", range(0, 123, 20))]
+    for name, chosen in elsewhere:
+        sequence = RgbdFolder(SHARED / name)
+        assert not [k for k in chosen if keyframes.relocalise(sequence[k]) is not None], name

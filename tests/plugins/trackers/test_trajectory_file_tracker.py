@@ -1,0 +1,102 @@
+"""Poses come from the file by time, in the world that the contract or the file defines."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.errors import ConfigError, DataError
+from framework.geometry import exp_se3
+from framework.trajectory_file import write_tum
+from plugins.trackers.trajectory_file import TrajectoryFile, World
+from tests import registered
+from tests.corner_room import CornerRoom, GridMap, pose_at
+
+SCENE = GridMap()
+T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # another system's world
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Frames 0 to 5 of the corner room, as another system saw them: 4 ms late, and without frame 3."""
+    path = tmp_path / "other_slam.txt"
+    frames = [0, 1, 2, 4, 5]
+    write_tum(path, [k / 30 + 0.004 for k in frames], [T_FILE_WORLD @ pose_at(k) for k in frames])
+    return path
+
+
+def test_poses_are_those_of_the_file_in_the_world_of_the_first_frame(path: Path) -> None:
+    tracker = TrajectoryFile(path)
+    for k, frame in enumerate(CornerRoom()):
+        pose = tracker.track(frame, SCENE)
+        assert pose.lost == (k == 3)
+        np.testing.assert_allclose(pose.T_world_camera, pose_at(2 if k == 3 else k), atol=1e-9)
+
+
+def test_a_frame_without_a_pose_is_lost_and_says_so(path: Path) -> None:
+    tracker = TrajectoryFile(path)
+    reasons = [tracker.track(frame, SCENE).reason for frame in CornerRoom()]
+    assert reasons[3] == "other_slam.txt has no pose at 0.100 s, the nearest is 0.029 s away"
+
+
+def test_without_true_poses_the_first_frame_is_the_identity(path: Path) -> None:
+    tracker = TrajectoryFile(path)
+    first, second, *_ = (tracker.track(frame, SCENE) for frame in CornerRoom(truth=False))
+    np.testing.assert_allclose(first.T_world_camera, np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(second.T_world_camera, np.linalg.inv(pose_at(0)) @ pose_at(1), atol=1e-9)
+
+
+def test_the_files_own_world_can_be_kept(path: Path) -> None:
+    tracker = TrajectoryFile(path, world=World.FILE)
+    for k, frame in enumerate(CornerRoom(frames=3)):
+        np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, T_FILE_WORLD @ pose_at(k), atol=1e-9)
+
+
+def test_a_file_that_begins_late_begins_the_world_at_its_first_pose(tmp_path: Path) -> None:
+    path = tmp_path / "late.txt"
+    write_tum(path, [2 / 30, 3 / 30], [T_FILE_WORLD @ pose_at(k) for k in (2, 3)])
+    tracker = TrajectoryFile(path)
+    poses = [tracker.track(frame, SCENE) for frame in CornerRoom(frames=4)]
+    assert [pose.lost for pose in poses] == [True, True, False, False]
+    for k in range(4):
+        np.testing.assert_allclose(poses[k].T_world_camera, pose_at(k), atol=1e-9)
+
+
+def test_clocks_can_be_brought_together(tmp_path: Path) -> None:
+    path = tmp_path / "clock.txt"
+    write_tum(path, [1.7e9, 1.7e9 + 1 / 30], [pose_at(0), pose_at(1)])
+    frames = [replace(frame, timestamp=frame.timestamp + 12) for frame in CornerRoom(frames=2)]
+    assert all(TrajectoryFile(path).track(frame, SCENE).lost for frame in frames)
+    tracker = TrajectoryFile(path, time_offset=12 - 1.7e9)
+    for k, frame in enumerate(frames):
+        np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("0 0 0 nan 0 0 0 1\n", "line 1: the pose is not finite"),
+        ("0 0 0 0 0 0 0 2\n", "line 1: the quaternion .* has length 2"),
+        ("1 0 0 0 0 0 0 1\n0 0 0 0 0 0 0 1\n", "line 2: timestamps must grow, found 0 after 1"),
+        ("1 0 0 0 0 0 0 1\n1 0 0 0 0 0 0 1\n", "line 2: timestamps must grow, found 1 after 1"),
+        ("1 0 0 0\n", "line 1: expected 8 numbers"),
+        ("# nothing\n", "holds no pose"),
+    ],
+)
+def test_what_is_no_trajectory_is_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "bad.txt").write_text(text)
+    with pytest.raises(DataError, match=rf"bad\.txt.* {message}") as refused:
+        registered.built("tracker", "trajectory_file", f"tracker.path={tmp_path / 'bad.txt'}")
+    assert "\n" not in str(refused.value)
+
+
+def test_a_missing_file_or_bad_parameter_is_named(tmp_path: Path, path: Path) -> None:
+    with pytest.raises(DataError, match=r"nowhere\.txt does not exist"):
+        TrajectoryFile(tmp_path / "nowhere.txt")
+    with pytest.raises(ConfigError, match=r"TrajectoryFile\.max_time_difference"):
+        TrajectoryFile(path, max_time_difference=-1)
+    with pytest.raises(ConfigError, match=r"tracker\.path"):
+        registered.built("tracker", "trajectory_file")
