@@ -1,0 +1,141 @@
+"""Tracking and mapping beside Open3D's, on the same frames, frame by frame in turns, in one process.
+
+`python -m pytest tests/benchmarks -k slam` prints the tables when all is measured; `--benchmark-json` keeps the
+numbers. Nothing here asserts a time: a number of a busy machine is no fault of the code. Ratios are of medians.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, Float64, Frame
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
+from tests.benchmarks.comparison import NOTHING, Table, mib, ms, times
+from tests.benchmarks.open3d_slam import Open3DSlam
+from tests.benchmarks.recordings import Recording, furnished_room, red_kitchen
+from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
+
+VOXEL_SIZES = (0.01, 0.02)  # m
+FIRST, LAST = 20, 100  # frames in [FIRST, LAST) count: at first the map is small, and pages and caches are cold
+TARGETS = {"whole loop": ">= 5", "integrate": ">= 3", "render full image": ">= 3"}  # times as fast as Open3D ...
+TARGETS_AT = 0.01  # m, ... at this voxel size
+
+
+@pytest.fixture(scope="module")
+def recordings(shared: Path) -> dict[str, Recording]:
+    return {r.name: r for r in (red_kitchen(shared, LAST), furnished_room(LAST))}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled() -> None:
+    """Every kernel compiled, or loaded from numba's cache, before anything is timed."""
+    room = furnished_room(3)
+    loop = SlamLoop(VoxelHashingIcp(), BayesianTsdf(voxel_size=0.02))
+    for frame, detections in zip(room.frames, room.detections, strict=True):
+        loop(frame, detections)
+        loop.render_all(frame)
+
+
+@pytest.mark.parametrize("voxel_size", VOXEL_SIZES, ids=lambda size: f"{100 * size:.0f}cm")
+@pytest.mark.parametrize("name", ["redkitchen", "synthetic room"], ids=lambda name: name.replace(" ", "_"))
+def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size: float) -> None:
+    """pytest-benchmark's own figures are of our loop with lifting; the setup of a round gives the frame to Open3D."""
+    recording = recordings[name]
+    duel = Duel(
+        recording,
+        SlamLoop(VoxelHashingIcp(), BayesianTsdf(voxel_size=voxel_size)),
+        Open3DSlam(recording.frames[0], voxel_size),
+    )
+    benchmark.pedantic(duel.ours, setup=duel.begin_frame, rounds=LAST - FIRST, warmup_rounds=FIRST)
+    duel.finish_frame()
+    medians = duel.medians()
+    scene, theirs = duel.ours.fuser.scene, duel.theirs
+    table = Table(
+        f"{name}, {100 * voxel_size:.0f} cm voxels",
+        ["milliseconds a frame, median", "ours", "Open3D", "times as fast", "target"],
+        [
+            [row, ms(o), ms(t), times(t, o), TARGETS.get(row, NOTHING) if voxel_size == TARGETS_AT else NOTHING]
+            for row, (o, t) in medians.items()
+        ],
+        [
+            f"Frames {FIRST} to {LAST - 1} of {LAST}, in turns in one process, Open3D without labels and ours with "
+            f"{np.mean([len(d) for d in recording.detections]):.1f} detections a frame; lost: {duel.ours.lost}.",
+            f"The whole loop leaves out lifting the masks to points, {ms(duel.lifting())} ms of ours; detection and "
+            "refinement are other stages.",
+        ],
+    )
+    tables.append(table)
+    tables.append(
+        Table(
+            f"Memory of that map: {name}, {100 * voxel_size:.0f} cm voxels",
+            ["MiB", "ours", "Open3D"],
+            [
+                ["used, without labels", mib(scene.voxels.byte_count), mib(theirs.bytes_used)],
+                ["used, with labels", mib(scene.byte_count), NOTHING],
+                ["allocated", mib(scene.byte_count), mib(theirs.bytes_allocated)],
+            ],
+            [
+                "Ours: byte_count, the arrays as they are. Open3D: the blocks in its hash map (used) and its capacity "
+                "(allocated), times the bytes of their voxels."
+            ],
+        )
+    )
+    benchmark.extra_info.update(
+        {f"{row}, ms (ours, Open3D)": [round(1e3 * float(x), 3) for x in pair] for row, pair in medians.items()},
+        bytes_ours=scene.byte_count,
+        bytes_open3d_used=theirs.bytes_used,
+        bytes_open3d_allocated=theirs.bytes_allocated,
+        lost=duel.ours.lost,
+    )
+
+
+class Duel:
+    """Ours and Open3D's on the same frames in turns, so that whatever else the machine does hits both alike."""
+
+    def __init__(self, recording: Recording, ours: SlamLoop, theirs: Open3DSlam) -> None:
+        self.recording = recording
+        self.ours = ours
+        self.theirs = theirs
+        self._measured: dict[str, list[tuple[float, float]]] = defaultdict(list)  # s, ours and theirs, frame by frame
+        self._lifting: list[float] = []
+        self._their_seconds: dict[str, float] = {}
+        self._frame = -1
+
+    def begin_frame(self) -> tuple[tuple[Frame, Detections], dict[str, Any]]:
+        """Lets Open3D do the next frame, and hands it over for ours."""
+        if self._frame >= 0:
+            self.finish_frame()
+        self._frame += 1
+        frame = self.recording.frames[self._frame]
+        self.theirs.load(frame)
+        for step in (self.theirs.track, self.theirs.integrate, self.theirs.render, self.theirs.render_all):
+            self._their_seconds[step.__name__] = seconds(step)[0]
+        return (frame, self.recording.detections[self._frame]), {}
+
+    def finish_frame(self) -> None:
+        """After our loop: the picture that nobody needs but viewers, and the books."""
+        full, _ = seconds(self.ours.render_all, self.recording.frames[self._frame])
+        o, t = self.ours.seconds, self._their_seconds
+        for row, pair in {
+            "whole loop": (o["track"] + o["fuse"], t["track"] + t["integrate"] + t["render"]),
+            "track": (o["track"], t["track"]),
+            RENDERING: (o[RENDERING], t["render"]),
+            "integrate": (o["fuse"], t["integrate"]),
+            "render full image": (full, t["render_all"]),
+        }.items():
+            self._measured[row].append(pair)
+        self._lifting.append(o["lift"])
+
+    def medians(self) -> dict[str, Float64]:
+        """(2,) seconds of ours and of Open3D's, by row."""
+        return {row: np.median(pairs[FIRST:], axis=0) for row, pairs in self._measured.items()}
+
+    def lifting(self) -> float:
+        """s"""
+        return float(np.median(self._lifting[FIRST:]))
