@@ -14,17 +14,24 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Float64, Frame
+from framework.geometry import inverse
+from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 from tests.benchmarks.comparison import NOTHING, Table, mib, ms, times
 from tests.benchmarks.open3d_slam import Open3DSlam
 from tests.benchmarks.recordings import Recording, furnished_room, red_kitchen
+from tests.benchmarks.room_row import FRAMES_A_ROOM, LENGTH, RoomRow
 from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
 FIRST, LAST = 20, 100  # frames in [FIRST, LAST) count: at first the map is small, and pages and caches are cold
 TARGETS = {"whole loop": ">= 5", "integrate": ">= 3", "render full image": ">= 3"}  # times as fast as Open3D ...
 TARGETS_AT = 0.01  # m, ... at this voxel size
+WALK = 2000  # frames
+EARLY, LATE = (200, 700), (1500, 2000)  # frames whose cost is compared
+SECOND_START = LATE[0] - EARLY[0]
+assert SECOND_START % FRAMES_A_ROOM == 0, "both see the same pictures"
 
 
 @pytest.fixture(scope="module")
@@ -93,6 +100,70 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
         bytes_open3d_allocated=theirs.bytes_allocated,
         lost=duel.ours.lost,
     )
+
+
+def test_slam_long_walk(benchmark, tables) -> None:
+    """2,000 frames through eight rooms that are all alike: the last ones cost what the first ones did.
+
+    From frame 1300 on, five whole rooms from the start, a second loop begins the walk in turns with the first: it sees
+    the same pictures at the same time, on a map that is still small. pytest-benchmark's figures are of the first loop.
+    """
+    walk, detector = RoomRow(WALK), GroundTruthDetector()
+    long, short = (SlamLoop(VoxelHashingIcp(), BayesianTsdf()) for _ in range(2))
+    spent: dict[str, list[float]] = {"long": [], "short": []}  # s, of track and fuse in each frame
+    size = []  # bytes and blocks of the long walk's map after each frame
+    scene = long.fuser.scene
+
+    def keep_books() -> None:
+        if long.poses:
+            spent["long"].append(long.seconds["track"] + long.seconds["fuse"])
+            size.append((scene.byte_count, scene.voxel_count))
+
+    def begin_frame() -> tuple[tuple[Frame, Detections], dict[str, Any]]:
+        keep_books()
+        k = len(long.poses)
+        if k >= SECOND_START:
+            frame = walk[k - SECOND_START]
+            short(frame, detector.detect(frame))
+            spent["short"].append(short.seconds["track"] + short.seconds["fuse"])
+        return (frame := walk[k], detector.detect(frame)), {}
+
+    benchmark.pedantic(long, setup=begin_frame, rounds=WALK)
+    keep_books()
+    drift = np.linalg.norm((inverse(walk[WALK - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
+    lost = long.lost
+    for k in range(WALK - 2, WALK - FRAMES_A_ROOM, -1):  # back through the last room, where nothing is new
+        long(walk[k], detector.detect(walk[k]))
+
+    early, late, beside = (
+        float(np.median(spent[who][slice(*window)]))
+        for who, window in (("long", EARLY), ("long", LATE), ("short", EARLY))
+    )
+    at_700, at_2000, after = size[EARLY[1] - 1], size[-1], (scene.byte_count, scene.voxel_count)
+    grown = [(size[end - 1][1] - size[begin - 1][1]) / (end - begin) for begin, end in (EARLY, LATE)]
+    table = Table(
+        f"Long walk: {WALK} frames, {WALK / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
+        ["", "frames 200 to 700", "frames 1500 to 2000", "ratio", "target"],
+        [
+            ["track + fuse, ms, median; in turns", ms(beside), ms(late), f"{late / beside:.2f}", "<= 1.1"],
+            ["track + fuse, ms, median; one after the other", ms(early), ms(late), f"{late / early:.2f}", "<= 1.1"],
+            ["new voxels a frame", f"{grown[0]:.0f}", f"{grown[1]:.0f}", f"{grown[1] / grown[0]:.2f}", NOTHING],
+            ["map at the end, MiB", mib(at_700[0]), mib(at_2000[0]), NOTHING, NOTHING],
+            ["map at the end, bytes a voxel", *(f"{b / n:.1f}" for b, n in (at_700, at_2000)),
+             f"{at_2000[0] / at_2000[1] / (at_700[0] / at_700[1]):.2f}", NOTHING],
+        ],
+        [
+            f"Back through the last room the map grew by {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
+            f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
+            f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
+            f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {scene.instance_count} instances.",
+        ],
+    )  # fmt: skip
+    tables.append(table)
+    benchmark.extra_info.update(
+        early_ms=1e3 * early, late_ms=1e3 * late, small_map_ms=1e3 * beside, bytes_700=at_700[0], bytes_2000=at_2000[0],
+        voxels_700=at_700[1], voxels_2000=at_2000[1], voxels_after_return=after[1], drift_m=float(drift), lost=lost,
+    )  # fmt: skip
 
 
 class Duel:
