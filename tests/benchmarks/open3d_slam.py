@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import open3d as o3d
 
-from framework.data import Float64, Frame, Pose
+from framework.data import Detections, Float64, Frame, Pose
 
 Method = o3d.t.pipelines.odometry.Method
 
@@ -14,7 +14,7 @@ MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; the latter is our fuser's
 MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
 TRUNCATION = 8.0  # voxels, the default
 BLOCK = 16  # voxels a side, the example's
-BLOCKS = {0.01: 12_000, 0.02: 4_000}  # by voxel size, m: room for all that the benchmarks see
+BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: room for all that the benchmarks see
 
 
 class Open3DSlam:
@@ -26,6 +26,7 @@ class Open3DSlam:
         K = o3d.core.Tensor(camera.K, o3d.core.float64)
         self._T_world_camera = np.eye(4) if first.T_world_camera is None else first.T_world_camera
         self._method = method
+        self._color = method != Method.PointToPlane
         self._model = o3d.t.pipelines.slam.Model(
             voxel_size, BLOCK, BLOCKS[voxel_size], o3d.core.Tensor(self._T_world_camera), device
         )
@@ -40,6 +41,15 @@ class Open3DSlam:
         depth = np.round(frame.depth * DEPTH_SCALE).astype(np.uint16)
         self._input.set_data_from_image("depth", o3d.t.geometry.Image(o3d.core.Tensor(depth)))
         self._input.set_data_from_image("color", o3d.t.geometry.Image(o3d.core.Tensor(frame.color)))
+
+    def __call__(self, frame: Frame, _detections: Detections) -> Pose:
+        """All steps of a frame; what is lost is not integrated."""
+        self.load(frame)
+        pose = self.track()
+        if not pose.lost:
+            self.integrate()
+            self.render()
+        return pose
 
     def track(self) -> Pose:
         """The pose of the loaded frame against the view that was rendered last."""
@@ -59,9 +69,9 @@ class Open3DSlam:
         self._model.integrate(self._input, DEPTH_SCALE, MAX_DEPTH, TRUNCATION)
         self._frames += 1
 
-    def render(self, color: bool = False) -> None:
+    def render(self) -> None:
         """What its tracker needs: the depth of the full image, and colour where the method uses it."""
-        self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, color)
+        self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, self._color)
 
     def render_all(self) -> None:
         """Depth, normals and colour of the full image."""

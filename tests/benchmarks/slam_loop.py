@@ -31,15 +31,16 @@ class SlamLoop:
         self._rendering = 0.0
         self._watch_rendering()
 
-    def __call__(self, frame: Frame, detections: Detections) -> None:
+    def __call__(self, frame: Frame, detections: Detections) -> Pose:
         self._rendering = 0.0
         track, pose = seconds(self.tracker.track, frame, self.fuser.scene)
         self.poses.append(pose)
         self.seconds = {"track": track, RENDERING: self._rendering, "lift": 0.0, "fuse": 0.0}
         if pose.lost:
-            return
+            return pose
         self.seconds["lift"], clusters = seconds(lift, detections, frame, pose)
         self.seconds["fuse"], _ = seconds(self.fuser.fuse, frame, pose, clusters)
+        return pose
 
     @property
     def lost(self) -> int:
