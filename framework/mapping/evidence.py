@@ -21,7 +21,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32
-from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, grown
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
 SLOTS = 4  # instances and classes that a voxel can tell apart
 NEW_CLASSES = 4  # a detection can bring its best so many classes into a voxel's slots
@@ -50,13 +50,13 @@ class Measurement(NamedTuple):
     named_classes: npt.NDArray[np.int16]  # (N, NEW_CLASSES) each cluster's best classes
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def best_instance(evidence, row, n):
     """The most likely instance of a voxel, 0 when none is more likely than the rest."""
     return evidence.instance_ids[row, n, 0] if evidence.instance_log[row, n, 0] > 0 else np.int32(0)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def best_counted_instance(evidence, row, n, counts):
     """The most likely instance of a voxel among those that count, by id in counts; 0 when none is likelier than the
     rest.
@@ -73,13 +73,13 @@ def best_counted_instance(evidence, row, n, counts):
     return best
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def best_class(evidence, row, n):
     """The most likely class of a voxel, -1 when none was ever named."""
     return np.int32(evidence.class_ids[row, n, 0])
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def add_evidence(labels, logs, free, label, gain):
     """Adds `gain` to a label's slot, or gives it the free or least likely one. Returns 1 when that evicted another."""
     least = 0
@@ -100,7 +100,7 @@ def add_evidence(labels, logs, free, label, gain):
     return 1
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _best_first(labels, logs, free):
     """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not
     matter.
@@ -114,7 +114,7 @@ def _best_first(labels, logs, free):
         logs[0], logs[best] = logs[best], logs[0]
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def update_voxel(evidence, row, n, measurement, point):
     """Both recursions for one voxel that is seen at a pixel whose list of cluster points starts at `point`, -1 = empty.
 

@@ -25,7 +25,7 @@ from framework.mapping.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.meshing import extract_mesh
 from framework.mapping.raycasting import render
 from framework.mapping.sensor import Sensor
-from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
 FORMAT = 1  # of the saved file; a change of meaning counts it up
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
@@ -164,6 +164,7 @@ class InstanceMap(SceneMap):
         b = scene.voxels.block_count
         for name in BLOCK_ARRAYS:
             getattr(scene.voxels.grid, name)[:b] = arrays[name]
+        find_solid_blocks(scene.voxels.grid, b)
         scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
         scene.labels.row_count = len(scene.labels.evidence.instance_ids)
         scene.labels.evicted = header["evicted"]

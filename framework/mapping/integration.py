@@ -25,8 +25,10 @@ from framework.mapping.voxel_grid import (
     TSDF_MAX,
     WEIGHT_ONE,
     VoxelGrid,
+    device,
     find_block,
     grown,
+    is_solid,
 )
 from framework.mapping.voxel_walk import inverses, leave_cell
 
@@ -35,7 +37,7 @@ RECENT = 1024  # block keys that a chunk remembers, to pass on each block about 
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _remember(recent, bx, by, bz):
     """True when the block was passed to `recent` (RECENT, 4) lately; remembers it otherwise."""
     slot = (bx * 73856093 ^ by * 19349669 ^ bz * 83492791) & (RECENT - 1)
@@ -48,7 +50,7 @@ def _remember(recent, bx, by, bz):
     return False
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _note(found, n, bx, by, bz):
     """Writes a block into `found` (M, 3) if there is room; the caller counts on, and asks again with more room."""
     if n < found.shape[0]:
@@ -157,6 +159,7 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
     height, width = depth.shape
     depth = depth.ravel()
     color = color.reshape(-1, 3)
+    solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     to_units = np.float32(1.0) / grid.tsdf_unit
     one = np.float32(1.0)
     half = np.float32(0.5)
@@ -216,6 +219,7 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
             weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
             near[n] = pixel[n] if seen & (abs(sdf) <= near_band) else np.int32(-1)
             share[n] = portion if sdf < band else zero  # colour belongs to the surface, not to the air before it
+        solid[block] = is_solid(tsdf)
         for n in range(BLOCK_VOXELS):
             if share[n] > zero:
                 for c in range(3):

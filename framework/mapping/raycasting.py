@@ -1,9 +1,15 @@
-"""What a camera sees of the map, by sphere tracing through its blocks.
+"""What a camera sees of the map, by sphere tracing through its blocks, coarse to fine.
 
 First the blocks in view are projected to image tiles, which bounds the depths that each tile's rays must search. Then
-a ray crosses absent regions and blocks in one step each, walks the truncated distance field by steps of the distance
-itself, and finds the surface where the field changes from positive to negative, refined on the trilinear field (secant
-method).
+every few pixels a ray crosses absent regions and blocks in one step each, walks the truncated distance field by steps
+of the distance itself, and finds the surface where the field changes from positive to negative. Between four such
+rays that meet one surface, the depth of the pixels is interpolated. All are refined on the trilinear field (Newton's
+method), and where that fails, the pixel gets a full search of its own.
+
+A surface narrower than the distance between the coarse rays could be overlooked by interpolation. So that distance is
+kept below the size of the map's own details, and where it is not, all pixels are searched.
+
+Rays are in voxels: o + z * d with d in voxels for each m of depth z.
 """
 
 from __future__ import annotations
@@ -15,219 +21,264 @@ from framework.data import Camera, Float32, Float64, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
-from framework.mapping.voxel_grid import BLOCK_SIDE, REGION_BLOCKS, REGION_SIDE, UNSEEN, VoxelGrid, find_block
-from framework.mapping.voxel_walk import distance_at, inverses, leave_cell, trilinear, trilinear_color, voxel_number
+from framework.mapping.voxel_grid import (
+    BLOCK_SIDE,
+    REGION_BLOCKS,
+    REGION_SIDE,
+    UNSEEN,
+    VoxelGrid,
+    device,
+    find_block,
+)
+from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, trilinear_color, voxel_number
 
 TILE = 8  # px; one tile's rays share blocks in the cache
-REFINEMENTS = 4  # secant steps at most: one meets a plane, two or three a curved surface
+REFINEMENTS = 4  # Newton steps at most: one meets a plane, two or three a curved surface
+CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter than this ends within some hundredths
+REACH = 2.0  # voxels, from where a refinement may start to the surface that it finds
+DETAIL = 3.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
+ONE_SURFACE = 8.0  # voxels of depth that a surface may rise between coarse rays
+TYPICAL_DEPTH = 2.0  # m, for the choice of the distance between coarse rays
+MAX_STRIDE = 8  # px between coarse rays
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _on_trilinear_field(grid, origin, dx, dy, dz, z, key, region):
-    """trilinear() at the point of the ray at depth z."""
-    scale = np.float32(1.0) / grid.voxel_size
-    return trilinear(
-        grid,
-        (origin[0] + z * dx) * scale,
-        (origin[1] + z * dy) * scale,
-        (origin[2] + z * dz) * scale,
-        key,
-        region,
-    )
+@device
+def _ray(view, scale, u, v):
+    """(d, step): the ray of pixel (u, v) in voxels for each m of depth, and the depth (m) of a way of one voxel."""
+    dx, dy, dz = ray_direction(view, u, v)
+    dx, dy, dz = dx * scale, dy * scale, dz * scale
+    return (dx, dy, dz), np.float32(1.0) / np.sqrt(dx * dx + dy * dy + dz * dz)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _refined(grid, origin, dx, dy, dz, z, distance, inverse_length, key, region):
-    """The zero of the trilinear field near depth z, where the nearest voxel has `distance`; 0 if there is none.
+@device
+def _refined(grid, o, d, step, z, key, region):
+    """(z, nx, ny, nz, key, region): the zero of the trilinear field near depth z, z = 0 if there is none.
 
-    The secant method, started with a unit slope. A zero at which the field rises along the ray is the back of a
-    surface.
+    (nx, ny, nz) is the field's gradient there, in stored units for each voxel. A zero at which the field rises along
+    the ray is the back of a surface.
     """
-    voxel = grid.voxel_size
-    reach = np.float32(2.0) * voxel * inverse_length
+    zero = np.float32(0.0)
+    nx = ny = nz = zero
     first = z
-    z += distance * inverse_length
-    value, valid, key, region = _on_trilinear_field(grid, origin, dx, dy, dz, z, key, region)
-    step = value * inverse_length
-    slope = np.float32(-1.0)
     for _ in range(REFINEMENTS):
-        if not valid or abs(value) < np.float32(2e-3) * voxel:
+        x, y, w = o[0] + z * d[0], o[1] + z * d[1], o[2] + z * d[2]
+        i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(w))
+        block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+        if block < 0:
             break
-        z_next = z + step
-        value_next, valid, key, region = _on_trilinear_field(grid, origin, dx, dy, dz, z_next, key, region)
-        if not valid or value_next == value:
+        value, nx, ny, nz, seen = trilinear(grid, block, x, y, w)
+        slope = nx * d[0] + ny * d[1] + nz * d[2]
+        if not seen or slope >= zero:
             break
-        slope = (value_next - value) / (z_next - z)
-        z = z_next
-        value = value_next
-        step = -value / slope
-    near_enough = abs(value) < np.float32(0.05) * voxel and abs(z - first) < reach
-    return z if valid and near_enough and slope < np.float32(0.0) else np.float32(0.0)
+        change = -value / slope
+        z += change
+        if not abs(z - first) < np.float32(REACH) * step:
+            break
+        if abs(change) < np.float32(CONVERGED) * step:
+            return z, nx, ny, nz, key, region
+    return zero, nx, ny, nz, key, region
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _first_surface(grid, origin, dx, dy, dz, near, far):
-    """The depth at which the ray origin + z * d first meets the surface from the front, 0 if it does not."""
-    one = np.float32(1.0)
-    half = np.float32(0.5)
-    voxel = grid.voxel_size
-    scale = one / voxel
-    block_size = np.float32(BLOCK_SIDE) * voxel
-    region_size = np.float32(REGION_SIDE) * block_size
-    d = (dx, dy, dz)
+@device
+def _first_surface(grid, o, d, step, near, far, key, region):
+    """(z, nx, ny, nz, key, region) where the ray first meets the surface from the front; z = 0 if it does not."""
+    zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
+    to_voxels = grid.tsdf_unit / grid.voxel_size
+    block_side = np.float32(BLOCK_SIDE)
+    region_side = np.float32(BLOCK_SIDE * REGION_SIDE)
     inverse_d = inverses(d)
     # the voxel nearest to a point is the cell that the point moved by half a voxel lies in
-    shifted = (origin[0] + half * voxel, origin[1] + half * voxel, origin[2] + half * voxel)
-    inverse_length = one / np.sqrt(dx * dx + dy * dy + dz * dz)
-    one_voxel = voxel * inverse_length  # in units of z, as is all that follows
+    shifted = (o[0] + half, o[1] + half, o[2] + half)
     # past a border by a thousandth of a voxel, and by more than z can be rounded, or the ray would stand still
-    hair = max(np.float32(1e-3) * one_voxel, np.float32(2.5e-7) * far)
-    key = np.int64(-2)
-    region = np.int32(-1)
+    hair = max(np.float32(1e-3) * step, np.float32(2.5e-7) * far)
     z = near
     from_front = False  # was the last voxel in front of a surface?
     while z < far:
-        i = int(np.floor((shifted[0] + z * dx) * scale))
-        j = int(np.floor((shifted[1] + z * dy) * scale))
-        k = int(np.floor((shifted[2] + z * dz) * scale))
+        i = np.int32(np.floor(shifted[0] + z * d[0]))
+        j = np.int32(np.floor(shifted[1] + z * d[1]))
+        k = np.int32(np.floor(shifted[2] + z * d[2]))
         block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
         if block < 0:
-            size = region_size if region < 0 else block_size
-            z = leave_cell(z, shifted, d, inverse_d, size, one / size) + hair
+            side = region_side if region < 0 else block_side
+            z = leave_cell(z, shifted, d, inverse_d, side, one / side) + hair
             from_front = False
             continue
-        stored = grid.tsdf[block, voxel_number(i, j, k)]
+        stored = grid.tsdf[np.uint32(block), np.uint32(voxel_number(i, j, k))]
         if stored == UNSEEN:
-            z += one_voxel
+            z += step
             from_front = False
             continue
-        distance = np.float32(stored) * grid.tsdf_unit
-        if abs(distance) < voxel or (from_front and stored < 0):
-            hit = _refined(grid, origin, dx, dy, dz, z, distance, inverse_length, key, region)
-            if hit > np.float32(0.0) and hit < far:
-                return hit
+        distance = np.float32(stored) * to_voxels
+        if abs(distance) < one or (from_front and stored < 0):
+            hit, nx, ny, nz, key, region = _refined(grid, o, d, step, z + distance * step, key, region)
+            if zero < hit < far:
+                return hit, nx, ny, nz, key, region
         from_front = stored > 0
-        z += max(distance * inverse_length, one_voxel)
-    return np.float32(0.0)
+        z += max(distance, one) * step
+    return zero, zero, zero, zero, key, region
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_far):
-    """Fills tile_near and tile_far (Y, X) m with the depths between which a tile's rays can meet a block.
+    """Fills tile_near and tile_far (Y, X) m with the depths between which a tile's rays can meet a surface.
 
-    Regions and blocks are taken for their bounding spheres, so the bounds are never too tight. `camera` holds
-    T_camera_world. The cost is a sphere test a region of the map (0.26 m^3 at 1 cm voxels) and the blocks of those in
-    view.
+    Regions and blocks are taken for the boxes along the camera's axes that hold them, so the bounds are never too
+    tight. `camera` holds T_camera_world. The cost is a test a region of the map (0.26 m^3 at 1 cm voxels) and one a
+    block of those in view.
     """
     tile_near[:] = far
     tile_far[:] = near
     voxel = grid.voxel_size
     block_size = np.float32(BLOCK_SIDE) * voxel
     region_size = np.float32(REGION_SIDE) * block_size
-    block_radius = np.float32(0.8661) * block_size + voxel
-    region_radius = np.float32(0.8661) * region_size + voxel
+    block_extent = _extent(camera, block_size, voxel)
+    region_extent = _extent(camera, region_size, voxel)
     half = np.float32(0.5)
     for region in range(region_count):
         x = (np.float32(grid.region_coords[region, 0]) + half) * region_size
         y = (np.float32(grid.region_coords[region, 1]) + half) * region_size
         z = (np.float32(grid.region_coords[region, 2]) + half) * region_size
-        if not _bounds(camera, x, y, z, region_radius, near, far, shape)[0]:
+        if not _bounds(camera, x, y, z, region_extent, near, far, shape)[0]:
             continue
         for child in range(REGION_BLOCKS):
             block = grid.region_blocks[region, child]
-            if block < 0:
+            if block < 0 or not grid.solid[block]:
                 continue
             x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
             y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
             z = (np.float32(grid.block_coords[block, 2]) + half) * block_size
-            visible, depth, u0, u1, v0, v1 = _bounds(camera, x, y, z, block_radius, near, far, shape)
+            visible, z0, z1, u0, u1, v0, v1 = _bounds(camera, x, y, z, block_extent, near, far, shape)
             if not visible:
                 continue
-            low, high = max(near, depth - block_radius), min(far, depth + block_radius)
             for ty in range(v0 // TILE, v1 // TILE + 1):
                 for tx in range(u0 // TILE, u1 // TILE + 1):
-                    tile_near[ty, tx] = min(tile_near[ty, tx], low)
-                    tile_far[ty, tx] = max(tile_far[ty, tx], high)
+                    tile_near[ty, tx] = min(tile_near[ty, tx], z0)
+                    tile_far[ty, tx] = max(tile_far[ty, tx], z1)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _bounds(camera, x, y, z, radius, near, far, shape):
-    """(visible, depth, u0, u1, v0, v1): the pixels, inclusive, that a sphere in the world can cover."""
+@device
+def _extent(camera, size, margin):
+    """Half the sides, along the camera's axes, of the box around a cube of the world; m."""
+    half = np.float32(0.5) * size
+    return (
+        half * (abs(camera.R[0, 0]) + abs(camera.R[0, 1]) + abs(camera.R[0, 2])) + margin,
+        half * (abs(camera.R[1, 0]) + abs(camera.R[1, 1]) + abs(camera.R[1, 2])) + margin,
+        half * (abs(camera.R[2, 0]) + abs(camera.R[2, 1]) + abs(camera.R[2, 2])) + margin,
+    )
+
+
+@device
+def _bounds(camera, x, y, z, extent, near, far, shape):
+    """(visible, z0, z1, u0, u1, v0, v1): depths (m) and pixels, inclusive, of the box around a point of the world."""
     height, width = shape
     pz = camera.R[2, 0] * x + camera.R[2, 1] * y + camera.R[2, 2] * z + camera.t[2]
-    if pz + radius < near or pz - radius > far:
-        return False, pz, 0, 0, 0, 0
-    if pz < np.float32(2.0) * radius:  # the camera is in or beside the sphere: no useful bound
-        return True, pz, 0, width - 1, 0, height - 1
+    z0, z1 = max(pz - extent[2], near), min(pz + extent[2], far)
+    if z0 > z1:
+        return False, z0, z1, 0, 0, 0, 0
     px = camera.R[0, 0] * x + camera.R[0, 1] * y + camera.R[0, 2] * z + camera.t[0]
     py = camera.R[1, 0] * x + camera.R[1, 1] * y + camera.R[1, 2] * z + camera.t[1]
-    # the sphere lies within the box pz +- radius, px +- radius: its corners give the extreme rays
-    z0, z1 = pz - radius, pz + radius
-    left, right = px - radius, px + radius
-    top, bottom = py - radius, py + radius
+    left, right = px - extent[0], px + extent[0]
+    top, bottom = py - extent[1], py + extent[1]
     u0 = camera.fx * min(left / z0, left / z1) + camera.cx
     u1 = camera.fx * max(right / z0, right / z1) + camera.cx
     v0 = camera.fy * min(top / z0, top / z1) + camera.cy
     v1 = camera.fy * max(bottom / z0, bottom / z1) + camera.cy
     if u1 < 0 or v1 < 0 or u0 > width - 1 or v0 > height - 1:
-        return False, pz, 0, 0, 0, 0
-    return True, pz, max(0, int(u0)), min(width - 1, int(u1) + 1), max(0, int(v0)), min(height - 1, int(v1) + 1)
+        return False, z0, z1, 0, 0, 0, 0
+    u0, v0 = max(u0, np.float32(0.0)), max(v0, np.float32(0.0))
+    u1, v1 = min(u1, np.float32(width - 2)), min(v1, np.float32(height - 2))
+    return True, z0, z1, int(u0), int(u1) + 1, int(v0), int(v1) + 1
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def cast(grid, view, tile_near, tile_far, depth, normals):
-    """Fills depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
-
-    Normals are central differences of the distance field at the voxel nearest to the hit.
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
+    """Fills depth (ceil(H / stride) + 1, ceil(W / stride) + 1) m of every stride-th pixel of an image (H, W) and of its
+    last ones, by a full search; 0 = no surface. `view` holds T_world_camera.
     """
-    height, width = depth.shape
-    tiles_y, tiles_x = tile_near.shape
     scale = np.float32(1.0) / grid.voxel_size
-    half = np.float32(0.5)
-    for tile in prange(tiles_x * tiles_y):
-        origin = (view.t[0], view.t[1], view.t[2])
-        near, far = tile_near[tile // tiles_x, tile % tiles_x], tile_far[tile // tiles_x, tile % tiles_x]
+    for y in prange(depth.shape[0]):
+        o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
         key = np.int64(-2)
         region = np.int32(-1)
-        for v in range(tile // tiles_x * TILE, min(height, (tile // tiles_x + 1) * TILE)):
-            for u in range(tile % tiles_x * TILE, min(width, (tile % tiles_x + 1) * TILE)):
-                dx, dy, dz = ray_direction(view, u, v)
-                z = _first_surface(grid, origin, dx, dy, dz, near, far)
-                depth[v, u] = z
-                nx = ny = nz = np.float32(0.0)
-                if z > np.float32(0.0):
-                    i = int(np.floor((origin[0] + z * dx) * scale + half))
-                    j = int(np.floor((origin[1] + z * dy) * scale + half))
-                    k = int(np.floor((origin[2] + z * dz) * scale + half))
-                    here, key, region = distance_at(grid, i, j, k, np.float32(0.0), key, region)
-                    x1, key, region = distance_at(grid, i + 1, j, k, here, key, region)
-                    x0, key, region = distance_at(grid, i - 1, j, k, here, key, region)
-                    y1, key, region = distance_at(grid, i, j + 1, k, here, key, region)
-                    y0, key, region = distance_at(grid, i, j - 1, k, here, key, region)
-                    z1, key, region = distance_at(grid, i, j, k + 1, here, key, region)
-                    z0, key, region = distance_at(grid, i, j, k - 1, here, key, region)
-                    nx, ny, nz = x1 - x0, y1 - y0, z1 - z0
+        v = min(y * stride, shape[0] - 1)
+        for x in range(depth.shape[1]):
+            u = min(x * stride, shape[1] - 1)
+            d, step = _ray(view, scale, u, v)
+            near, far = tile_near[v // TILE, u // TILE], tile_far[v // TILE, u // TILE]
+            z, _, _, _, key, region = _first_surface(grid, o, d, step, near, far, key, region)
+            depth[y, x] = z
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
+    """Fills depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
+
+    `coarse` is what cast_coarse() found. Normals are the gradient of the trilinear field.
+    """
+    height, width = depth.shape
+    zero, one = np.float32(0.0), np.float32(1.0)
+    voxel = grid.voxel_size
+    scale = one / voxel
+    # the depth up to which coarse rays are near enough to each other to show all there is
+    resolved = np.float32(DETAIL) * voxel * min(view.fx, view.fy) / np.float32(stride)
+    for y in prange(coarse.shape[0] - 1):
+        o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
+        key = np.int64(-2)
+        region = np.int32(-1)
+        v0, v1 = y * stride, min((y + 1) * stride, height - 1)
+        for x in range(coarse.shape[1] - 1):
+            u0, u1 = x * stride, min((x + 1) * stride, width - 1)
+            near, far = tile_near[v0 // TILE, u0 // TILE], tile_far[v0 // TILE, u0 // TILE]
+            z00, z01, z10, z11 = coarse[y, x], coarse[y, x + 1], coarse[y + 1, x], coarse[y + 1, x + 1]
+            nearest, farthest = min(min(z00, z01), min(z10, z11)), max(max(z00, z01), max(z10, z11))
+            empty = farthest == zero and far < resolved
+            rise = farthest - nearest
+            smooth = nearest > zero and farthest < resolved and rise < np.float32(ONE_SURFACE) * voxel
+            for v in range(v0, v1 + 1 if v1 == height - 1 else v1):
+                # the inverse of depth is linear across the image of a plane
+                b = np.float32(v - v0) / np.float32(max(v1 - v0, 1))
+                left = one / z00 + b * (one / z10 - one / z00) if smooth else zero
+                right = one / z01 + b * (one / z11 - one / z01) if smooth else zero
+                across = (right - left) / np.float32(max(u1 - u0, 1))
+                for u in range(u0, u1 + 1 if u1 == width - 1 else u1):
+                    z = nx = ny = nz = zero
+                    if not empty:
+                        d, step = _ray(view, scale, u, v)
+                        if smooth:
+                            start = one / (left + across * np.float32(u - u0))
+                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, key, region)
+                        if z == zero:
+                            z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near, far, key, region)
                     norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-                    if norm > np.float32(0.0):
-                        nx, ny, nz = nx / norm, ny / norm, nz / norm
-                normals[v, u, 0] = nx
-                normals[v, u, 1] = ny
-                normals[v, u, 2] = nz
+                    norm = one / norm if z > zero else zero  # the field falls along the ray, so it is not 0
+                    depth[v, u] = z
+                    normals[v, u, 0] = nx * norm
+                    normals[v, u, 1] = ny * norm
+                    normals[v, u, 2] = nz * norm
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
     """Fills color (H, W, 3) with the map's colour at the surface that `depth` (H, W) m, seen from `view`, describes."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
+    half = np.float32(0.5)
     for v in prange(height):
         key = np.int64(-2)
         region = np.int32(-1)
         for u in range(width):
+            red = green = blue = -half
             z = depth[v, u]
             if z > np.float32(0.0):
                 x, y, w = seen_point(view, u, v, z)
-                key, region = trilinear_color(grid, x * scale, y * scale, w * scale, key, region, color[v, u])
+                x, y, w = x * scale, y * scale, w * scale
+                i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(w))
+                block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+                if block >= 0:
+                    red, green, blue = trilinear_color(grid, block, x, y, w)
+            color[v, u, 0] = np.uint8(red + half)
+            color[v, u, 1] = np.uint8(green + half)
+            color[v, u, 2] = np.uint8(blue + half)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -256,8 +307,8 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
                     class_ids[v, u] = best_class(evidence, row, n)
 
 
-def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
-    """(depth (H, W) m, normals (H, W, 3) world) of the surface that `camera` sees; depth 0 where there is none."""
+def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
+    """(near, far), each (Y, X) m: the depths between which the rays of each tile can meet a block."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
     tile_near, tile_far = np.empty(tiles, np.float32), np.empty(tiles, np.float32)
     _bound_tiles(
@@ -270,17 +321,34 @@ def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera:
         tile_near,
         tile_far,
     )
+    return tile_near, tile_far
+
+
+def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
+    """(depth (H, W) m, normals (H, W, 3) world) of the surface that `camera` sees; depth 0 where there is none."""
+    tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
+    view = pinhole(camera, T_world_camera)
+    stride = _stride(camera, float(voxels.grid.voxel_size))
+    rays_y, rays_x = ((side + stride - 1) // stride + 1 for side in camera.shape)
+    coarse = np.empty((rays_y, rays_x), np.float32)
+    cast_coarse(voxels.grid, view, tile_near, tile_far, stride, camera.shape, coarse)
     depth = np.empty(camera.shape, np.float32)
     normals = np.empty((*camera.shape, 3), np.float32)
-    cast(voxels.grid, pinhole(camera, T_world_camera), tile_near, tile_far, depth, normals)
+    cast_fine(voxels.grid, view, tile_near, tile_far, stride, coarse, depth, normals)
     return depth, normals
+
+
+def _stride(camera: Camera, voxel_size: float) -> int:
+    """The pixels between coarse rays, a power of 2: so many that details of the map at a typical depth are resolved."""
+    resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / TYPICAL_DEPTH
+    return 1 << int(np.log2(min(max(resolved, 1.0), MAX_STRIDE)))
 
 
 def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> View:
     """What `camera` sees of the map, between the sensor's nearest and farthest depth."""
     depth, normals = cast_view(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
-    color = np.zeros((*camera.shape, 3), np.uint8)
+    color = np.empty((*camera.shape, 3), np.uint8)
     instance_ids = np.empty(camera.shape, np.int32)
     class_ids = np.empty(camera.shape, np.int32)
     paint(voxels.grid, view, depth, color)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from framework.data import Camera, Float32, Float64
+from framework.mapping.voxel_grid import device
 
 
 class Sensor(NamedTuple):
@@ -49,7 +49,7 @@ def pinhole(camera: Camera, T: Float64) -> Pinhole:
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def ray_direction(view, u, v):
     """(dx, dy, dz), in the world, m for each m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
     ray_x = (np.float32(u) - view.cx) / view.fx
@@ -61,7 +61,7 @@ def ray_direction(view, u, v):
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def seen_point(view, u, v, z):
     """(x, y, z), in the world, m: the point that pixel (u, v) sees at depth z (m). `view` holds T_world_camera."""
     dx, dy, dz = ray_direction(view, u, v)

@@ -34,6 +34,10 @@ TSDF_MAX = 32767  # the stored value of the widest truncation distance
 UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
 NO_KEY = -1
 
+# What kernels call in their innermost loops. Without reference counts (_nrt): threads that count the same arrays of the
+# Grid up and down at each call wait for each other.
+device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
+
 _KEY_BITS = 21  # of each region coordinate in a 63-bit key: +-2^20 regions, 670 km at 1 cm voxels
 _KEY_OFFSET = 1 << (_KEY_BITS - 1)
 _KEY_MASK = (1 << _KEY_BITS) - 1
@@ -49,13 +53,15 @@ class Grid(NamedTuple):
     region_coords: Int32  # (S, 3) region coordinates; its first block is 8 times that
     region_blocks: Int32  # (S, 512) block number, -1 = not allocated
     block_coords: Int32  # (B, 3) block coordinates; its first voxel is 8 times that
+    neighbors: Int32  # (B, 8) the blocks at +0 or +1 along x (bit 0), y (bit 1), z (bit 2); -1 = not allocated
     tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
     weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
     color: UInt8  # (B, 512, 3) RGB
+    solid: UInt8  # (B,) 1 where a voxel of it lies behind a surface: rays skip the others until they come near one
     label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def region_key(rx, ry, rz):
     """The packed key of region coordinates."""
     return (
@@ -65,14 +71,14 @@ def region_key(rx, ry, rz):
     )
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _slot(key, size):
     """Where the search for `key` starts in a table of `size` slots (Fibonacci hashing)."""
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64(mixed >> np.uint64(32)) & (size - 1)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def find_region(grid, key):
     """The number of the region with this key, -1 if there is none. Linear probing."""
     size = grid.table_keys.shape[0]
@@ -86,13 +92,13 @@ def find_region(grid, key):
         slot = (slot + 1) & (size - 1)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def child_number(bx, by, bz):
     """The place of a block in its region's table."""
     return ((bz & 7) * 8 + (by & 7)) * 8 + (bx & 7)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def find_block(grid, bx, by, bz, last_key, last_region):
     """(block, key, region) at block coordinates; block -1 = not allocated.
 
@@ -139,8 +145,41 @@ def insert_blocks(grid, coords, start, region_count, block_count):
             grid.block_coords[block_count, 0] = bx
             grid.block_coords[block_count, 1] = by
             grid.block_coords[block_count, 2] = bz
+            _link_neighbors(grid, block_count)
             block_count += 1
     return coords.shape[0], region_count, block_count
+
+
+@njit(cache=True, nogil=True)
+def _link_neighbors(grid, block):
+    """Tells a new block of its neighbors, and them of it."""
+    bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
+    key = np.int64(-2)
+    region = np.int32(-1)
+    for c in range(8):
+        dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
+        after, key, region = find_block(grid, bx + dx, by + dy, bz + dz, key, region)
+        grid.neighbors[block, c] = after
+        before, key, region = find_block(grid, bx - dx, by - dy, bz - dz, key, region)
+        if before >= 0:
+            grid.neighbors[before, c] = block
+
+
+@device
+def is_solid(tsdf):
+    """Whether a voxel of a block, tsdf (512,), was seen to lie behind a surface."""
+    lowest = np.int16(0)
+    for n in range(BLOCK_VOXELS):
+        stored = tsdf[n]
+        lowest = min(lowest, stored if stored != UNSEEN else np.int16(0))
+    return lowest < 0
+
+
+@njit(cache=True, nogil=True)
+def find_solid_blocks(grid, block_count):
+    """Fills grid.solid of the first blocks from their distances."""
+    for block in range(block_count):
+        grid.solid[block] = is_solid(grid.tsdf[block])
 
 
 @njit(cache=True, nogil=True)
@@ -171,9 +210,11 @@ class VoxelGrid:
             region_coords=np.zeros((64, 3), np.int32),
             region_blocks=np.full((64, REGION_BLOCKS), -1, np.int32),
             block_coords=np.zeros((first, 3), np.int32),
+            neighbors=np.full((first, 8), -1, np.int32),
             tsdf=np.full((first, BLOCK_VOXELS), UNSEEN, np.int16),
             weight=np.zeros((first, BLOCK_VOXELS), np.uint16),
             color=np.zeros((first, BLOCK_VOXELS, 3), np.uint8),
+            solid=np.zeros(first, np.uint8),
             label_row=np.full(first, -1, np.int32),
         )
 
@@ -207,9 +248,11 @@ class VoxelGrid:
             more = min(2 * len(grid.block_coords), self.max_blocks)
             grid = grid._replace(
                 block_coords=grown(grid.block_coords, more, 0),
+                neighbors=grown(grid.neighbors, more, -1),
                 tsdf=grown(grid.tsdf, more, UNSEEN),
                 weight=grown(grid.weight, more, 0),
                 color=grown(grid.color, more, 0),
+                solid=grown(grid.solid, more, 0),
                 label_row=grown(grid.label_row, more, -1),
             )
         if self.region_count == len(grid.region_blocks):

@@ -1,14 +1,13 @@
-"""Reading the voxel grid along a ray: cell borders, single voxels, trilinear samples."""
+"""Reading the voxel grid along a ray: cell borders and the trilinear fields between voxels."""
 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
-from framework.mapping.voxel_grid import BLOCK_SIDE, UNSEEN, find_block
+from framework.mapping.voxel_grid import UNSEEN, device
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _leave_slab(z, start, d, inverse_d, size, inverse_size):
     """leave_cell() along one axis."""
     cell = np.floor((start + z * d) * inverse_size)
@@ -17,7 +16,7 @@ def _leave_slab(z, start, d, inverse_d, size, inverse_size):
     return (cell * size - start) * inverse_d
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def leave_cell(z, start, d, inverse_d, size, inverse_size):
     """The parameter at which the ray start + z * d leaves the grid cell of side `size` that it is in at z.
 
@@ -29,7 +28,7 @@ def leave_cell(z, start, d, inverse_d, size, inverse_size):
     return max(z, min(exit_x, min(exit_y, exit_z)))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def inverses(d):
     """1 / d of a triple, with zeros taken for a hair, so that no ray divides by zero."""
     hair = np.float32(1e-12)
@@ -39,86 +38,95 @@ def inverses(d):
     return np.float32(1.0) / x, np.float32(1.0) / y, np.float32(1.0) / z
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def voxel_number(i, j, k):
     """The place of voxel (i, j, k) within its block."""
     return ((k & 7) * 8 + (j & 7)) * 8 + (i & 7)
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def trilinear(grid, x, y, z, key, region):
-    """(distance m, valid, key, region) at the point (x, y, z), in voxels.
+@device
+def _stored(grid, block, neighbor, n):
+    """The stored distance of voxel n of a block's neighbor, UNSEEN where there is none."""
+    there = grid.neighbors[np.uint32(block), np.uint32(neighbor)]
+    return grid.tsdf[np.uint32(there), np.uint32(n)] if there >= 0 else np.int16(UNSEEN)
 
-    Valid when all eight voxels around it were seen.
+
+@device
+def corners(grid, block, i, j, k):
+    """The stored distances of the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` holds voxel (i, j, k)."""
+    x, y, z = i & 7, j & 7, k & 7
+    n = (z * 8 + y) * 8 + x
+    here = np.uint32(block)
+    if max(x, max(y, z)) < 7:
+        return (
+            grid.tsdf[here, np.uint32(n)],
+            grid.tsdf[here, np.uint32(n + 1)],
+            grid.tsdf[here, np.uint32(n + 8)],
+            grid.tsdf[here, np.uint32(n + 9)],
+            grid.tsdf[here, np.uint32(n + 64)],
+            grid.tsdf[here, np.uint32(n + 65)],
+            grid.tsdf[here, np.uint32(n + 72)],
+            grid.tsdf[here, np.uint32(n + 73)],
+        )
+    # the carry of each coordinate into the next block is that coordinate's bit of the neighbor's number
+    next_x, next_y, next_z = (x + 1) & 7, ((y + 1) & 7) * 8, ((z + 1) & 7) * 64
+    over_x, over_y, over_z = (x + 1) >> 3, ((y + 1) >> 3) << 1, ((z + 1) >> 3) << 2
+    y *= 8
+    z *= 64
+    return (
+        grid.tsdf[here, np.uint32(n)],
+        _stored(grid, block, over_x, z + y + next_x),
+        _stored(grid, block, over_y, z + next_y + x),
+        _stored(grid, block, over_y | over_x, z + next_y + next_x),
+        _stored(grid, block, over_z, next_z + y + x),
+        _stored(grid, block, over_z | over_x, next_z + y + next_x),
+        _stored(grid, block, over_z | over_y, next_z + next_y + x),
+        _stored(grid, block, over_z | over_y | over_x, next_z + next_y + next_x),
+    )
+
+
+@device
+def trilinear(grid, block, x, y, z):
+    """(value, d/dx, d/dy, d/dz, valid): the field of stored distances at (x, y, z), in voxels, and its gradient.
+
+    `block` holds the voxel at the floor of the point. Valid when all eight voxels around it were seen.
     """
-    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+    i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    one = np.float32(1.0)
-    block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
-    if block < 0:
-        return np.float32(0.0), False, key, region
-    total = np.float32(0.0)
-    if (i & 7) < 7 and (j & 7) < 7 and (k & 7) < 7:
-        tsdf = grid.tsdf[block]
-        n = voxel_number(i, j, k)
-        for corner in range(8):
-            a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-            stored = tsdf[n + a + BLOCK_SIDE * b + BLOCK_SIDE * BLOCK_SIDE * c]
-            if stored == UNSEEN:
-                return np.float32(0.0), False, key, region
-            share = (fx if a else one - fx) * (fy if b else one - fy) * (fz if c else one - fz)
-            total += share * np.float32(stored)
-        return total * grid.tsdf_unit, True, key, region
-    for corner in range(8):
-        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-        block, key, region = find_block(grid, (i + a) >> 3, (j + b) >> 3, (k + c) >> 3, key, region)
-        if block < 0:
-            return np.float32(0.0), False, key, region
-        stored = grid.tsdf[block, voxel_number(i + a, j + b, k + c)]
-        if stored == UNSEEN:
-            return np.float32(0.0), False, key, region
-        share = (fx if a else one - fx) * (fy if b else one - fy) * (fz if c else one - fz)
-        total += share * np.float32(stored)
-    return total * grid.tsdf_unit, True, key, region
+    s = corners(grid, block, i, j, k)
+    seen = min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
+    # along x, then y, then z
+    x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
+    dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
+    dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
+    x00 += fx * dx00
+    x10 += fx * dx10
+    x01 += fx * dx01
+    x11 += fx * dx11
+    dy0, dy1 = x10 - x00, x11 - x01
+    y0, y1 = x00 + fy * dy0, x01 + fy * dy1
+    dx0, dx1 = dx00 + fy * (dx10 - dx00), dx01 + fy * (dx11 - dx01)
+    return y0 + fz * (y1 - y0), dx0 + fz * (dx1 - dx0), dy0 + fz * (dy1 - dy0), y1 - y0, seen
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def trilinear_color(grid, x, y, z, key, region, out):
-    """The colour at (x, y, z), in voxels, into `out` (3,) uint8; voxels never seen do not count.
-
-    Returns (key, region).
-    """
-    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
+@device
+def trilinear_color(grid, block, x, y, z):
+    """(red, green, blue) at (x, y, z), in voxels; voxels never seen do not count. `block` as in trilinear()."""
+    i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
     one = np.float32(1.0)
     red = green = blue = total = np.float32(0.0)
     for corner in range(8):
         a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-        block, key, region = find_block(grid, (i + a) >> 3, (j + b) >> 3, (k + c) >> 3, key, region)
-        if block < 0:
-            continue
-        n = voxel_number(i + a, j + b, k + c)
-        if grid.tsdf[block, n] == UNSEEN:
+        u, v, w = (i & 7) + a, (j & 7) + b, (k & 7) + c
+        there = grid.neighbors[np.uint32(block), np.uint32((w >> 3) << 2 | (v >> 3) << 1 | u >> 3)]
+        n = np.uint32(voxel_number(u, v, w))
+        if there < 0 or grid.tsdf[np.uint32(there), n] == UNSEEN:
             continue
         share = (fx if a else one - fx) * (fy if b else one - fy) * (fz if c else one - fz)
-        red += share * np.float32(grid.color[block, n, 0])
-        green += share * np.float32(grid.color[block, n, 1])
-        blue += share * np.float32(grid.color[block, n, 2])
+        red += share * np.float32(grid.color[np.uint32(there), n, 0])
+        green += share * np.float32(grid.color[np.uint32(there), n, 1])
+        blue += share * np.float32(grid.color[np.uint32(there), n, 2])
         total += share
-    if total > np.float32(0.0):
-        scale = one / total
-        out[0] = np.uint8(red * scale + np.float32(0.5))
-        out[1] = np.uint8(green * scale + np.float32(0.5))
-        out[2] = np.uint8(blue * scale + np.float32(0.5))
-    return key, region
-
-
-@njit(cache=True, nogil=True, forceinline=True)
-def distance_at(grid, i, j, k, fallback, key, region):
-    """(distance m, key, region) of voxel (i, j, k); `fallback` where it was never seen."""
-    block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
-    if block >= 0:
-        stored = grid.tsdf[block, voxel_number(i, j, k)]
-        if stored != UNSEEN:
-            return np.float32(stored) * grid.tsdf_unit, key, region
-    return fallback, key, region
+    scale = one / max(total, np.float32(1e-6))
+    return red * scale, green * scale, blue * scale

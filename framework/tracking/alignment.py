@@ -6,6 +6,9 @@ The frame's points p_i are moved by T = T_view_camera and projected into the vie
 with normal n_i, and its model intensity. Residuals are divided by their expected noise, so that both terms count
 standard deviations; w_i and v_i are Tukey's biweights. Gauss-Newton steps are twists of the view's frame: T <- exp(xi)
 T.
+
+An image row is done in passes that hold no branches, so that the compiler vectorises them; a point that does not count
+has weight 0.
 """
 
 from __future__ import annotations
@@ -15,22 +18,42 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Camera, Float32, Float64
+from framework.data import Camera, Float32, Float64, View
+from framework.mapping.voxel_grid import device
 from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
-TERMS = 27 + 6  # of a chunk's sums: 21 + 6 of the normal equations, then the counts and squares below
+TERMS = 27 + 5  # of a chunk's sums: 21 + 6 of the normal equations, then the counts below
+NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
 
 
 class ModelView(NamedTuple):
     """The view of the map that frames are aligned to."""
 
     depth: Float32  # (H, W) m, 0 = nothing there
-    normals: Float32  # (H, W, 3) in the view's camera frame
+    normals: Float32  # (3, H, W) in the view's camera frame
     fx: np.float32
     fy: np.float32
     cx: np.float32
     cy: np.float32
+
+
+def model_view(view: View) -> ModelView:
+    """What alignment needs of a view of the map."""
+    normals = np.empty((3, *view.depth.shape), np.float32)
+    _turn_normals(view.normals_world, np.ascontiguousarray(view.T_world_camera[:3, :3].T, np.float32), normals)
+    camera = view.camera
+    return ModelView(view.depth, normals, *(np.float32(k) for k in (camera.fx, camera.fy, camera.cx, camera.cy)))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _turn_normals(normals_world, R, normals):
+    """Fills normals (3, H, W) with R n of the normals n of normals_world (H, W, 3)."""
+    for v in prange(normals.shape[1]):
+        for u in range(normals.shape[2]):
+            x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
+            for i in range(3):
+                normals[i, v, u] = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z
 
 
 class Weights(NamedTuple):
@@ -52,159 +75,216 @@ class NormalEquations(NamedTuple):
     b: Float64  # (6,)
     visible: int  # points that fall on a mapped part of the view
     matched: int  # of these, points near enough to their model point to be weighed
-    residual: float  # root mean square of the matched points' distances, m
     brightness: float  # mean of frame - model intensity: the change of exposure
 
 
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def depth_noise(z):
     """Standard deviation (m) of a structured-light reading at depth z (m): Nguyen et al. 2012, eq. 3 (axial noise)."""
     return np.float32(0.0012) + np.float32(0.0019) * (z - np.float32(0.4)) * (z - np.float32(0.4))
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _frame_normal(depth, u, v, inv_fx, inv_fy, cx, cy, z):
-    """The normal of the frame's surface at a pixel, towards the camera, from its four neighbours; 0 if they differ."""
-    zero = np.float32(0.0)
-    if u < 1 or v < 1 or u >= depth.shape[1] - 1 or v >= depth.shape[0] - 1:
-        return zero, zero, zero
-    left, right, up, down = depth[v, u - 1], depth[v, u + 1], depth[v - 1, u], depth[v + 1, u]
-    gap = np.float32(0.05) * z
-    if min(min(left, right), min(up, down)) <= zero:
-        return zero, zero, zero
-    if max(max(abs(left - z), abs(right - z)), max(abs(up - z), abs(down - z))) > gap:
-        return zero, zero, zero
-    x = (np.float32(u) - cx) * inv_fx
-    y = (np.float32(v) - cy) * inv_fy
-    # tangents along u and v
-    ax = (x + inv_fx) * right - (x - inv_fx) * left
-    ay = y * (right - left)
-    az = right - left
-    bx = x * (down - up)
-    by = (y + inv_fy) * down - (y - inv_fy) * up
-    bz = down - up
-    nx, ny, nz = by * az - bz * ay, bz * ax - bx * az, bx * ay - by * ax
-    norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-    if norm == zero:
-        return zero, zero, zero
-    return nx / norm, ny / norm, nz / norm
-
-
-@njit(cache=True, nogil=True, forceinline=True)
+@device
 def _tukey(r, scale):
     """Tukey's biweight of a residual in standard deviations."""
     s = r / scale
-    s = np.float32(1.0) - s * s
-    return s * s if s > np.float32(0.0) else np.float32(0.0)
+    s = max(np.float32(1.0) - s * s, np.float32(0.0))
+    return s * s
 
 
-@njit(cache=True, nogil=True, forceinline=True)
-def _add(sums, J, r, w):
-    """Adds w J^T J (upper triangle) and w J^T r to the sums."""
+@device
+def _project(depth, v, fx, fy, cx, cy, model, R, t, points, places, pixels):
+    """One row of the frame in the view: points (3, W) m, places (2, W) px, and the model's pixel number (W,).
+
+    The pixel number is -1 where there is no reading or it falls outside the view.
+    """
+    height, width = model.depth.shape
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    right, bottom = np.float32(width) - half, np.float32(height) - half
+    y = (np.float32(v) - cy) / fy
+    inv_fx = one / fx
+    for u in range(depth.shape[1]):
+        d = depth[v, u]
+        x = (np.float32(np.int32(u)) - cx) * inv_fx
+        px = d * (R[0, 0] * x + R[0, 1] * y + R[0, 2]) + t[0]
+        py = d * (R[1, 0] * x + R[1, 1] * y + R[1, 2]) + t[1]
+        pz = d * (R[2, 0] * x + R[2, 1] * y + R[2, 2]) + t[2]
+        inv_z = one / max(pz, np.float32(NEAREST))
+        mu = model.fx * px * inv_z + model.cx
+        mv = model.fy * py * inv_z + model.cy
+        inside = (d > zero) & (pz > np.float32(NEAREST)) & (mu > -half) & (mv > -half) & (mu < right) & (mv < bottom)
+        column = np.int32(mu + half) if inside else np.int32(0)
+        line = np.int32(mv + half) if inside else np.int32(0)
+        points[0, u], points[1, u], points[2, u] = px, py, pz
+        places[0, u], places[1, u] = mu, mv
+        pixels[u] = line * np.int32(width) + column if inside else np.int32(-1)
+
+
+@device
+def _add_geometry(depth, normals, v, model, flat_depth, flat_normals, R, weights, points, pixels, matched, J, w, r):
+    """The point-to-plane terms of a row into J (6, W), w and r (W,); returns (visible, weighed).
+
+    matched (W,) becomes 1 where a point is near enough to its model point, 0 elsewhere.
+    """
+    one, zero = np.float32(1.0), np.float32(0.0)
+    inv_fx, inv_fy = one / model.fx, one / model.fy
+    max_distance2 = weights.max_distance * weights.max_distance
+    width = np.int32(model.depth.shape[1])
+    size = np.int32(model.depth.size)
+    visible = np.int32(0)
+    weighed = np.int32(0)
+    for u in range(depth.shape[1]):
+        pixel = max(pixels[u], np.int32(0))
+        q = flat_depth[np.uint32(pixel)] if pixels[u] >= 0 else zero
+        column = pixel % width
+        line = pixel // width
+        qx = (np.float32(column) - model.cx) * inv_fx * q
+        qy = (np.float32(line) - model.cy) * inv_fy * q
+        px, py, pz = points[0, u], points[1, u], points[2, u]
+        ex, ey, ez = px - qx, py - qy, pz - q
+        near = (q > zero) & (ex * ex + ey * ey + ez * ez <= max_distance2)
+        nx = flat_normals[np.uint32(pixel)]
+        ny = flat_normals[np.uint32(pixel + size)]
+        nz = flat_normals[np.uint32(pixel + size + size)]
+        fx, fy, fz = normals[0, v, u], normals[1, v, u], normals[2, v, u]
+        dot = (
+            nx * (R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz)
+            + ny * (R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz)
+            + nz * (R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz)
+        )
+        sigma = depth_noise(depth[v, u])
+        distance = nx * ex + ny * ey + nz * ez
+        weight = _tukey(distance / sigma, weights.geometric_scale) * weights.depth_weight / (sigma * sigma)
+        weight = weight if near & (dot > weights.min_normal_dot) else zero
+        J[0, u], J[1, u], J[2, u] = nx, ny, nz
+        J[3, u], J[4, u], J[5, u] = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
+        w[u] = weight
+        r[u] = distance
+        matched[u] = one if near else zero
+        visible += np.int32(1) if q > zero else np.int32(0)
+        weighed += np.int32(1) if weight > zero else np.int32(0)
+    return visible, weighed
+
+
+@device
+def _add_photometry(
+    intensity, v, model, model_intensity, flat, inverse_scale, weights, brightness, points, places, matched, J, w, r
+):
+    """The photometric terms of a row, behind the geometric ones in J (6, 2 W), w and r (2 W,).
+
+    Returns (weighed, sum of frame - model intensity, how many). `inverse_scale` is the width of model_intensity over
+    that of the view, whose pixels `places` are in.
+    """
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    level_height, level_width = model_intensity.shape
+    right, bottom = np.float32(level_width - 2), np.float32(level_height - 2)
+    row = np.int32(level_width)
+    strength = weights.color_weight / (weights.intensity_noise * weights.intensity_noise)
+    compared = np.int32(0)
+    weighed = np.int32(0)
+    darker = zero
+    width = intensity.shape[1]
+    for u in range(width):
+        lu = (places[0, u] + half) * inverse_scale - half
+        lv = (places[1, u] + half) * inverse_scale - half
+        inside = (matched[u] > zero) & (lu >= one) & (lv >= one) & (lu < right) & (lv < bottom)
+        lu = lu if inside else one
+        lv = lv if inside else one
+        ju, jv = np.int32(lu), np.int32(lv)
+        a, b = lu - np.float32(ju), lv - np.float32(jv)
+        n = jv * row + ju
+        i00, i10 = flat[np.uint32(n)], flat[np.uint32(n + 1)]
+        i01, i11 = flat[np.uint32(n + row)], flat[np.uint32(n + row + 1)]
+        seen = inside & (min(min(i00, i10), min(i01, i11)) >= zero)
+        du0, du1 = i10 - i00, i11 - i01
+        top, low = i00 + a * du0, i01 + a * du1
+        value = top + b * (low - top)
+        change = value - intensity[v, u]
+        px, py, pz = points[0, u], points[1, u], points[2, u]
+        inv_z = one / max(pz, np.float32(NEAREST))
+        gx = (du0 + b * (du1 - du0)) * inverse_scale * model.fx * inv_z
+        gy = (low - top) * inverse_scale * model.fy * inv_z
+        gz = -(gx * px + gy * py) * inv_z
+        residual = change + brightness
+        weight = _tukey(residual / weights.intensity_noise, weights.photometric_scale) * strength
+        weight = weight if seen else zero
+        J[0, width + u], J[1, width + u], J[2, width + u] = gx, gy, gz
+        J[3, width + u], J[4, width + u], J[5, width + u] = py * gz - pz * gy, pz * gx - px * gz, px * gy - py * gx
+        w[width + u] = weight
+        r[width + u] = residual
+        compared += np.int32(1) if seen else np.int32(0)
+        weighed += np.int32(1) if weight > zero else np.int32(0)
+        darker -= change if seen else zero
+    return weighed, darker, compared
+
+
+@device
+def _add_row(J, w, r, weighted, total):
+    """Adds the sums of w J^T J (upper triangle) and w J^T r over a row to the total."""
+    size = w.shape[0]
     n = 0
     for i in range(6):
-        wj = w * J[i]
+        for u in range(size):
+            weighted[u] = w[u] * J[i, u]
         for j in range(i, 6):
-            sums[n] += np.float64(wj * J[j])
+            product = np.float32(0.0)
+            for u in range(size):
+                product += weighted[u] * J[j, u]
+            total[n] += np.float64(product)
             n += 1
-        sums[21 + i] += np.float64(wj * r)
+        product = np.float32(0.0)
+        for u in range(size):
+            product += weighted[u] * r[u]
+        total[21 + i] += np.float64(product)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _accumulate(depth, intensity, fx, fy, cx, cy, model, model_intensity, level_scale, R, t, weights, brightness, sums):
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+def _accumulate(
+    depth, intensity, normals, fx, fy, cx, cy, model, model_intensity, inverse_scale, R, t, weights, brightness, sums
+):
     """Sums the normal equations over one pyramid level of the frame, by chunks of rows, into sums (CHUNKS, TERMS).
 
-    `R`, `t` are T_view_camera. `level_scale` is the width of the view over that of model_intensity, a power of 2.
+    `R`, `t` are T_view_camera.
     """
     height, width = depth.shape
-    model_height, model_width = model.depth.shape
-    level_height, level_width = model_intensity.shape
-    one = np.float32(1.0)
-    half = np.float32(0.5)
-    zero = np.float32(0.0)
-    inv_fx, inv_fy = one / fx, one / fy
-    inverse_scale = one / level_scale
+    terms = 2 * width if weights.color_weight > np.float32(0.0) else width
+    flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)
-        J = np.empty(6, np.float32)
+        points = np.empty((3, width), np.float32)
+        places = np.empty((2, width), np.float32)
+        pixels = np.empty(width, np.int32)
+        matched = np.empty(width, np.float32)
+        J = np.empty((6, terms), np.float32)
+        w, r, weighted = np.empty(terms, np.float32), np.empty(terms, np.float32), np.empty(terms, np.float32)
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
-            for u in range(width):
-                d = depth[v, u]
-                if d <= zero:
-                    continue
-                x = (np.float32(u) - cx) * inv_fx * d
-                y = (np.float32(v) - cy) * inv_fy * d
-                px = R[0, 0] * x + R[0, 1] * y + R[0, 2] * d + t[0]
-                py = R[1, 0] * x + R[1, 1] * y + R[1, 2] * d + t[1]
-                pz = R[2, 0] * x + R[2, 1] * y + R[2, 2] * d + t[2]
-                if pz <= np.float32(0.05):
-                    continue
-                inv_z = one / pz
-                mu = model.fx * px * inv_z + model.cx
-                mv = model.fy * py * inv_z + model.cy
-                if not (mu > -half and mv > -half):
-                    continue
-                iu, iv = int(mu + half), int(mv + half)
-                if iu >= model_width or iv >= model_height:
-                    continue
-                q = model.depth[iv, iu]
-                if q <= zero:
-                    continue
-                total[27] += 1.0
-                qx = (np.float32(iu) - model.cx) / model.fx * q
-                qy = (np.float32(iv) - model.cy) / model.fy * q
-                nx, ny, nz = model.normals[iv, iu, 0], model.normals[iv, iu, 1], model.normals[iv, iu, 2]
-                ex, ey, ez = px - qx, py - qy, pz - q
-                if ex * ex + ey * ey + ez * ez > weights.max_distance * weights.max_distance:
-                    continue
-                sigma = depth_noise(d)
-                r = nx * ex + ny * ey + nz * ez
-                if weights.depth_weight > zero:
-                    fnx, fny, fnz = _frame_normal(depth, u, v, inv_fx, inv_fy, cx, cy, d)
-                    dot = (
-                        nx * (R[0, 0] * fnx + R[0, 1] * fny + R[0, 2] * fnz)
-                        + ny * (R[1, 0] * fnx + R[1, 1] * fny + R[1, 2] * fnz)
-                        + nz * (R[2, 0] * fnx + R[2, 1] * fny + R[2, 2] * fnz)
-                    )
-                    if dot > weights.min_normal_dot:
-                        w = _tukey(r / sigma, weights.geometric_scale) * weights.depth_weight
-                        if w > zero:
-                            J[0], J[1], J[2] = nx, ny, nz
-                            J[3], J[4], J[5] = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
-                            w /= sigma * sigma
-                            _add(total, J, r, w)
-                            total[28] += 1.0
-                            total[29] += np.float64(r * r)
-                if weights.color_weight > zero:
-                    # the level's intensity image, whose pixels are level_scale view pixels wide
-                    lu = (mu + half) * inverse_scale - half
-                    lv = (mv + half) * inverse_scale - half
-                    ju, jv = int(np.floor(lu)), int(np.floor(lv))
-                    if ju < 1 or jv < 1 or ju + 2 >= level_width or jv + 2 >= level_height:
-                        continue
-                    a, b = lu - np.float32(ju), lv - np.float32(jv)
-                    i00, i10 = model_intensity[jv, ju], model_intensity[jv, ju + 1]
-                    i01, i11 = model_intensity[jv + 1, ju], model_intensity[jv + 1, ju + 1]
-                    if min(min(i00, i10), min(i01, i11)) < zero:
-                        continue
-                    value = (one - b) * ((one - a) * i00 + a * i10) + b * ((one - a) * i01 + a * i11)
-                    gu = ((one - b) * (i10 - i00) + b * (i11 - i01)) * inverse_scale
-                    gv = ((one - a) * (i01 - i00) + a * (i11 - i10)) * inverse_scale
-                    change = value - intensity[v, u]
-                    total[30] += 1.0
-                    total[31] -= np.float64(change)
-                    r = change + brightness
-                    w = _tukey(r / weights.intensity_noise, weights.photometric_scale) * weights.color_weight
-                    if w <= zero:
-                        continue
-                    gx = gu * model.fx * inv_z
-                    gy = gv * model.fy * inv_z
-                    gz = -(gx * px + gy * py) * inv_z
-                    J[0], J[1], J[2] = gx, gy, gz
-                    J[3], J[4], J[5] = py * gz - pz * gy, pz * gx - px * gz, px * gy - py * gx
-                    w /= weights.intensity_noise * weights.intensity_noise
-                    _add(total, J, r, w)
-                    total[32] += 1.0
+            _project(depth, v, fx, fy, cx, cy, model, R, t, points, places, pixels)
+            visible, weighed = _add_geometry(
+                depth, normals, v, model, flat_depth, flat_normals, R, weights, points, pixels, matched, J, w, r
+            )
+            total[27] += visible
+            total[28] += weighed
+            if terms > width:
+                weighed, darker, compared = _add_photometry(
+                    intensity,
+                    v,
+                    model,
+                    model_intensity,
+                    flat_intensity,
+                    inverse_scale,
+                    weights,
+                    brightness,
+                    points,
+                    places,
+                    matched,
+                    J,
+                    w,
+                    r,
+                )
+                total[29] += weighed
+                total[30] += np.float64(darker)
+                total[31] += compared
+            _add_row(J, w, r, weighted, total)
         sums[chunk] = total
 
 
@@ -222,16 +302,18 @@ def linearise(
     """
     sums = np.empty((CHUNKS, TERMS))
     camera: Camera = level.camera
+    scale = round(model.depth.shape[1] / model_intensity.shape[1])  # a power of 2
     _accumulate(
         level.depth,
         level.intensity,
+        level.normals,
         np.float32(camera.fx),
         np.float32(camera.fy),
         np.float32(camera.cx),
         np.float32(camera.cy),
         model,
         model_intensity,
-        np.float32(round(model.depth.shape[1] / model_intensity.shape[1])),
+        np.float32(1 / scale),
         np.ascontiguousarray(T_view_camera[:3, :3], np.float32),
         np.ascontiguousarray(T_view_camera[:3, 3], np.float32),
         weights,
@@ -246,7 +328,6 @@ def linearise(
         A=A,
         b=total[21:27],
         visible=int(total[27]),
-        matched=int(total[28]) if weights.depth_weight > 0 else int(total[32]),
-        residual=float(np.sqrt(total[29] / max(total[28], 1))),
-        brightness=float(total[31] / max(total[30], 1)),
+        matched=int(total[28]) if weights.depth_weight > 0 else int(total[29]),
+        brightness=float(total[30] / max(total[31], 1)),
     )

@@ -20,6 +20,7 @@ class PyramidLevel:
     camera: Camera
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
+    normals: Float32  # (3, H, W) of the surface, towards the camera, in its frame; 0 where neighbors are apart
 
 
 def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int) -> list[PyramidLevel]:
@@ -28,29 +29,30 @@ def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, l
     `finest` is 1 or a power of 1/2. Intensities average all pixels, depths those of one surface.
     """
     intensity = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
-    level = PyramidLevel(camera, depth, intensity)
-    while level.camera.width > camera.width * finest:
-        level = _halved(level)
-    pyramid = [level]
-    for _ in range(levels - 1):
-        pyramid.append(_halved(pyramid[-1]))
-    return pyramid
+    pyramid: list[PyramidLevel] = []
+    least = camera.width * finest
+    while True:
+        if camera.width <= least:
+            normals = np.empty((3, *camera.shape), np.float32)
+            _normals(depth, *(np.float32(k) for k in (camera.fx, camera.fy, camera.cx, camera.cy)), normals)
+            pyramid.append(PyramidLevel(camera, depth, intensity, normals))
+            if len(pyramid) == levels:
+                return pyramid
+        camera = _halved(camera)
+        half_depth, half_intensity = np.empty(camera.shape, np.float32), np.empty(camera.shape, np.float32)
+        _halve(depth, intensity, half_depth, half_intensity)
+        depth, intensity = half_depth, half_intensity
 
 
-def _halved(level: PyramidLevel) -> PyramidLevel:
-    height, width = level.depth.shape
-    half = Camera(
-        width // 2,
-        height // 2,
-        level.camera.fx / 2,
-        level.camera.fy / 2,
-        (level.camera.cx + 0.5) / 2 - 0.5,
-        (level.camera.cy + 0.5) / 2 - 0.5,
+def _halved(camera: Camera) -> Camera:
+    return Camera(
+        camera.width // 2,
+        camera.height // 2,
+        camera.fx / 2,
+        camera.fy / 2,
+        (camera.cx + 0.5) / 2 - 0.5,
+        (camera.cy + 0.5) / 2 - 0.5,
     )
-    depth = np.empty(half.shape, np.float32)
-    intensity = np.empty(half.shape, np.float32)
-    _halve(level.depth, level.intensity, depth, intensity)
-    return PyramidLevel(half, depth, intensity)
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -77,6 +79,38 @@ def _halve(depth, intensity, half_depth, half_intensity):
                         total += d
                         count += np.float32(1.0)
             half_depth[v, u] = total / count if count > np.float32(0.0) else np.float32(0.0)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def _normals(depth, fx, fy, cx, cy, normals):
+    """Normals (3, H, W) from each pixel's four neighbors; 0 at the border, and where one of them is on another surface.
+
+    A row in a pass that holds no branches, so that the compiler vectorises it.
+    """
+    height, width = depth.shape
+    zero, one = np.float32(0.0), np.float32(1.0)
+    inv_fx, inv_fy = one / fx, one / fy
+    for v in prange(height):
+        normals[0, v, 0] = normals[1, v, 0] = normals[2, v, 0] = zero
+        normals[0, v, width - 1] = normals[1, v, width - 1] = normals[2, v, width - 1] = zero
+        above, below = max(v - 1, 0), min(v + 1, height - 1)
+        y = (np.float32(v) - cy) * inv_fy
+        for u in range(1, width - 1):
+            z = depth[v, u]
+            left, right, up, down = depth[v, u - 1], depth[v, u + 1], depth[above, u], depth[below, u]
+            x = (np.float32(np.int32(u)) - cx) * inv_fx
+            across, along = right - left, down - up
+            # the tangents (x + inv_fx) * right - (x - inv_fx) * left, ... along u and along v
+            ax, ay = x * across + inv_fx * (right + left), y * across
+            bx, by = x * along, y * along + inv_fy * (down + up)
+            nx, ny, nz = by * across - along * ay, along * ax - bx * across, bx * ay - by * ax
+            apart = max(max(abs(left - z), abs(right - z)), max(abs(up - z), abs(down - z)))
+            smooth = (min(min(left, right), min(up, down)) > zero) & (apart <= np.float32(DEPTH_GAP) * z)
+            norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+            scale = one / norm if smooth & (norm > zero) else zero
+            normals[0, v, u], normals[1, v, u], normals[2, v, u] = nx * scale, ny * scale, nz * scale
+    normals[:, 0] = zero
+    normals[:, height - 1] = zero
 
 
 def model_intensities(view: View, levels: int) -> list[Float32]:

@@ -10,7 +10,7 @@ from framework.data import Float64, Frame, Pose, View
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
-from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearise
+from framework.tracking.alignment import NormalEquations, Weights, linearise, model_view
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
 
@@ -92,14 +92,7 @@ class VoxelHashingIcp(PoseTracker):
 
     def _align(self, frame_levels: list[PyramidLevel], view: View) -> tuple[Float64, NormalEquations]:
         """T_view_camera, coarse to fine, and the normal equations at it."""
-        model = ModelView(
-            depth=view.depth,
-            normals=view.normals_world @ view.T_world_camera[:3, :3].astype(np.float32),
-            fx=np.float32(view.camera.fx),
-            fy=np.float32(view.camera.fy),
-            cx=np.float32(view.camera.cx),
-            cy=np.float32(view.camera.cy),
-        )
+        model = model_view(view)
         intensities = model_intensities(view, levels=3)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         T_view_camera = np.eye(4)

@@ -31,7 +31,7 @@ def step(
         normals[surface == k] = gap @ n
     depth = np.where(surface <= len(scene.planes), depth, 0).astype(np.float32)
     f, c = (np.float32(CAMERA.fx), np.float32(CAMERA.fy)), (np.float32(CAMERA.cx), np.float32(CAMERA.cy))
-    model = ModelView(depth, normals, *f, *c)
+    model = ModelView(depth, np.ascontiguousarray(normals.transpose(2, 0, 1)), *f, *c)
     view = dataclasses.make_dataclass("Seen", ["color", "depth"])(view_frame.color, depth)
     intensity = model_intensities(view, 3)[level]
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
