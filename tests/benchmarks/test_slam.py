@@ -28,7 +28,7 @@ from tests.benchmarks.room_row import FRAMES_A_ROOM, LENGTH, RoomRow
 from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 
 VOXEL_SIZES = (0.01, 0.02)  # m
-FIRST, LAST = 20, 100  # frames in [FIRST, LAST) count: at first the map is small, and pages and caches are cold
+FIRST, LAST = 20, 80  # frames in [FIRST, LAST) count: at first the map is small, and pages and caches are cold
 TARGETS = {"whole loop": ">= 5", "integrate": ">= 3", "render full image": ">= 3"}  # times as fast as Open3D ...
 TARGETS_AT = 0.01  # m, ... at this voxel size
 WALK = 2000  # frames
@@ -64,18 +64,26 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
     )
     benchmark.pedantic(duel.ours, setup=duel.begin_frame, rounds=LAST - FIRST, warmup_rounds=FIRST)
     duel.finish_frame()
-    medians = duel.medians()
+    medians = duel.quantiles(0.5)
     scene, theirs = duel.ours.fuser.scene, duel.theirs
     table = Table(
         f"{name}, {100 * voxel_size:.0f} cm voxels",
-        ["milliseconds a frame, median", "ours", "Open3D", "times as fast", "target"],
+        ["milliseconds a frame, median", "ours", "Open3D", "times as fast", "target", "of the quickest tenths"],
         [
-            [row, ms(o), ms(t), times(t, o), TARGETS.get(row, NOTHING) if voxel_size == TARGETS_AT else NOTHING]
-            for row, (o, t) in medians.items()
+            [
+                row,
+                ms(o),
+                ms(t),
+                times(t, o),
+                TARGETS.get(row, NOTHING) if voxel_size == TARGETS_AT else NOTHING,
+                times(quick_t, quick_o),
+            ]
+            for (row, (o, t)), (quick_o, quick_t) in zip(medians.items(), duel.quantiles(0.1).values(), strict=True)
         ],
         [
             f"Frames {FIRST} to {LAST - 1} of {LAST}, in turns in one process, Open3D without labels and ours with "
             f"{np.mean([len(d) for d in recording.detections]):.1f} detections a frame; lost: {duel.ours.lost}.",
+            "The last column is the ratio of the 10th percentiles, which a busy machine disturbs less than medians.",
             f"The whole loop leaves out lifting the masks to points, {ms(duel.lifting())} ms of ours; detection and "
             "refinement are other stages.",
         ],
@@ -260,9 +268,9 @@ class Duel:
             self._measured[row].append(pair)
         self._lifting.append(o["lift"])
 
-    def medians(self) -> dict[str, Float64]:
+    def quantiles(self, q: float) -> dict[str, Float64]:
         """(2,) seconds of ours and of Open3D's, by row."""
-        return {row: np.median(pairs[FIRST:], axis=0) for row, pairs in self._measured.items()}
+        return {row: np.quantile(pairs[FIRST:], q, axis=0) for row, pairs in self._measured.items()}
 
     def lifting(self) -> float:
         """s"""

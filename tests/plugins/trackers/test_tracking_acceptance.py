@@ -224,18 +224,25 @@ def test_a_jump_in_a_real_video_is_tracked_or_told(shared_data: Path) -> None:
     assert not np.isnan(off[-5:]).any()
 
 
-def test_a_blank_wall_that_fills_the_view_is_told() -> None:
-    """From a corner along an untextured wall until nothing else is in view, and back."""
+BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)
+STAYS_LOST = pytest.mark.xfail(
+    strict=False, reason="at the border of what is determined it loses touch for good: no texture to relocalise by"
+)
+
+
+@pytest.mark.parametrize("spheres", [[BALL], pytest.param([], marks=STAYS_LOST)], ids=["ball", "bare"])
+def test_a_blank_wall_that_fills_the_view_is_told(spheres: list[tuple[np.ndarray, float]]) -> None:
+    """From a corner, bare or with a ball in it, along an untextured wall until nothing else is in view, and back."""
     corner = Scene(
         planes=[
             (np.array([0.0, 0.0, -1.0]), -2.5),
             (np.array([0.0, -1.0, 0.0]), -1.0),
             (np.array([1.0, 0.0, 0.0]), -1.6),
         ],
-        spheres=[(np.array([-1.2, 0.8, 2.2]), 0.25)],
+        spheres=spheres,
         contrast=0.0,
     )
-    there = [pose(-1.1 + 1.6 * s, 0.5 - 0.8 * s, 1.0) for s in np.linspace(0, 1, 60)]
+    there = [pose(-1.1 + 1.6 * s, 0.5 - 0.8 * s, 1.0) for s in np.linspace(0, 1, 100)]
     shown = [corner.frame(T, k) for k, T in enumerate([*there, *there[::-1]])]
     wall_only = [bool((corner.render(CAMERA, f.T_world_camera)[2] == 1).all()) for f in shown]
     assert sum(wall_only) >= 20
