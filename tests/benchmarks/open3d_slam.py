@@ -1,0 +1,114 @@
+"""Open3D's dense SLAM (t.pipelines.slam), driven and timed as its own example `dense_slam.py` does."""
+
+from __future__ import annotations
+
+import numpy as np
+import open3d as o3d
+
+from framework.data import Detections, Float64, Frame, Pose
+
+Method = o3d.t.pipelines.odometry.Method
+
+DEPTH_SCALE = 1000.0  # units per metre: depth goes in as uint16 millimetres
+MIN_DEPTH, MAX_DEPTH = 0.1, 5.0  # m; the latter is our fuser's
+MAX_DEPTH_DIFFERENCE = 0.07  # m, the default
+TRUNCATION = 8.0  # voxels, the default
+BLOCK = 16  # voxels a side, the example's
+BLOCKS = {0.01: 16_000, 0.02: 4_000}  # by voxel size, m: room for all that the benchmarks see
+
+
+class Open3DSlam:
+    """One map and one camera; the steps of a frame are separate, so that each can be timed. No labels."""
+
+    def __init__(self, first: Frame, voxel_size: float, method: Method = Method.PointToPlane) -> None:
+        device = o3d.core.Device("CPU:0")
+        camera = first.camera
+        K = o3d.core.Tensor(camera.K, o3d.core.float64)
+        self._T_world_camera = np.eye(4) if first.T_world_camera is None else first.T_world_camera
+        self._method = method
+        self._color = method != Method.PointToPlane
+        self._model = o3d.t.pipelines.slam.Model(
+            voxel_size, BLOCK, BLOCKS[voxel_size], o3d.core.Tensor(self._T_world_camera), device
+        )
+        self._input = o3d.t.pipelines.slam.Frame(camera.height, camera.width, K, device)
+        self._view = o3d.t.pipelines.slam.Frame(camera.height, camera.width, K, device)
+        self._K = K
+        self._camera = camera
+        self._frames = 0
+
+    def load(self, frame: Frame) -> None:
+        """Hands over the images; not part of what is timed."""
+        depth = np.round(frame.depth * DEPTH_SCALE).astype(np.uint16)
+        self._input.set_data_from_image("depth", o3d.t.geometry.Image(o3d.core.Tensor(depth)))
+        self._input.set_data_from_image("color", o3d.t.geometry.Image(o3d.core.Tensor(frame.color)))
+
+    def __call__(self, frame: Frame, _detections: Detections) -> Pose:
+        """All steps of a frame; what is lost is not integrated."""
+        self.load(frame)
+        pose = self.track()
+        if not pose.lost:
+            self.integrate()
+            self.render()
+        return pose
+
+    def track(self) -> Pose:
+        """The pose of the loaded frame against the view that was rendered last."""
+        if not self._frames:
+            return Pose(self._T_world_camera)
+        try:
+            result = self._model.track_frame_to_model(
+                self._input, self._view, DEPTH_SCALE, MAX_DEPTH, MAX_DEPTH_DIFFERENCE, self._method
+            )
+        except RuntimeError as error:  # "Singular 6x6 linear system detected, tracking failed."
+            return Pose(self._T_world_camera, lost=True, reason=str(error))
+        self._T_world_camera = self._T_world_camera @ result.transformation.numpy()
+        return Pose(_rigid(self._T_world_camera))
+
+    def integrate(self) -> None:
+        self._model.update_frame_pose(self._frames, o3d.core.Tensor(self._T_world_camera))
+        self._model.integrate(self._input, DEPTH_SCALE, MAX_DEPTH, TRUNCATION)
+        self._frames += 1
+
+    def render(self) -> None:
+        """What its tracker needs: the depth of the full image, and colour where the method uses it."""
+        self._model.synthesize_model_frame(self._view, DEPTH_SCALE, MIN_DEPTH, MAX_DEPTH, TRUNCATION, self._color)
+
+    def render_all(self) -> None:
+        """Depth, normals and colour of the full image."""
+        self._model.voxel_grid.ray_cast(
+            self._model.frustum_block_coords,
+            self._K,
+            o3d.core.Tensor(np.linalg.inv(self._T_world_camera)),
+            self._camera.width,
+            self._camera.height,
+            ["depth", "normal", "color"],
+            DEPTH_SCALE,
+            MIN_DEPTH,
+            MAX_DEPTH,
+            1.0,
+            TRUNCATION,
+        )
+
+    @property
+    def bytes_used(self) -> int:
+        """Of the blocks that hold something."""
+        return int(self._model.get_hashmap().size()) * self._bytes_a_block
+
+    @property
+    def bytes_allocated(self) -> int:
+        """Of all the blocks that were asked for in advance."""
+        return int(self._model.get_hashmap().capacity()) * self._bytes_a_block
+
+    @property
+    def _bytes_a_block(self) -> int:
+        grid = self._model.voxel_grid
+        arrays = [grid.attribute(name) for name in ("tsdf", "weight", "color")]
+        return sum(array[0].num_elements() * array.dtype.byte_size() for array in arrays)
+
+
+def _rigid(T: Float64) -> Float64:
+    """Rounding of a product of hundreds of transforms taken out."""
+    U, _, Vt = np.linalg.svd(T[:3, :3])
+    rigid = np.eye(4)
+    rigid[:3, :3], rigid[:3, 3] = U @ Vt, T[:3, 3]
+    return rigid

@@ -1,0 +1,68 @@
+"""Our tracker and fuser on one frame after the other, with the time that each step takes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from framework.data import Detections, Frame, Pose
+from framework.geometry import lift
+from framework.interfaces import MapFuser, PoseTracker
+
+RENDERING = "render for tracking"  # a part of track
+
+
+def seconds(step: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """How long a step took, and what it returned."""
+    begin = time.perf_counter()
+    answer = step(*arguments)
+    return time.perf_counter() - begin, answer
+
+
+class SlamLoop:
+    """Track, lift, fuse. The public interfaces only, so that any tracker and fuser can be measured."""
+
+    def __init__(self, tracker: PoseTracker, fuser: MapFuser) -> None:
+        self.tracker = tracker
+        self.fuser = fuser
+        self.seconds: dict[str, float] = {}  # of the last frame's steps
+        self.poses: list[Pose] = []
+        self._rendering = 0.0
+        self._watch_rendering()
+
+    def __call__(self, frame: Frame, detections: Detections) -> Pose:
+        self._rendering = 0.0
+        track, pose = seconds(self.tracker.track, frame, self.fuser.scene)
+        self.poses.append(pose)
+        self.seconds = {"track": track, RENDERING: self._rendering, "lift": 0.0, "fuse": 0.0}
+        if pose.lost:
+            return pose
+        self.seconds["lift"], clusters = seconds(lift, detections, frame, pose)
+        self.seconds["fuse"], _ = seconds(self.fuser.fuse, frame, pose, clusters)
+        return pose
+
+    @property
+    def lost(self) -> int:
+        return sum(pose.lost for pose in self.poses)
+
+    def render_all(self, frame: Frame) -> None:
+        """Depth, normals, colour, instance and class ids of the full image, from where the camera was last."""
+        self.fuser.scene.render(frame.camera, self.poses[-1].T_world_camera)
+
+    def _watch_rendering(self) -> None:
+        """Adds up the time that the tracker spends in what the map offers for rendering."""
+        scene = self.fuser.scene
+        for name in dir(type(scene)):
+            if name.startswith(("render", "cast")) and callable(getattr(scene, name)):
+                setattr(scene, name, self._timed(getattr(scene, name)))
+
+    def _timed(self, method: Callable[..., Any]) -> Callable[..., Any]:
+        def timed(*arguments: Any, **named: Any) -> Any:
+            begin = time.perf_counter()
+            try:
+                return method(*arguments, **named)
+            finally:
+                self._rendering += time.perf_counter() - begin
+
+        return timed

@@ -1,0 +1,268 @@
+"""What the tracker promises: accuracy on scenes known exactly, and a map that no bad frame damages.
+
+The issue's longer runs (300 real frames, 200 synthetic ones) are rows of `pytest tests/benchmarks -k slam`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+import numba
+import numpy as np
+import open3d as o3d
+import pytest
+
+from framework.data import Frame, PointClusters, Pose
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.datasets.synthetic import Synthetic
+from framework.evaluation.trajectory import evaluate
+from framework.geometry import inverse
+from framework.interfaces import SceneMap
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
+from tests.analytic_scene import CAMERA, Scene, pose
+
+NOTHING = PointClusters(
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 2), np.int32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 1), np.float32),
+    np.zeros(0, np.float32),
+    ("chair",),
+)
+VOXEL = 0.02  # m, of the small images here
+WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as lost, is a lie
+
+
+def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = VOXEL) -> tuple[list[Pose], SceneMap]:
+    """As the pipeline does it: what is lost is not fused."""
+    fuser = BayesianTsdf(voxel_size=voxel_size)
+    poses = []
+    for frame in frames:
+        poses.append(tracker.track(frame, fuser.scene))
+        if not poses[-1].lost:
+            fuser.fuse(frame, poses[-1], NOTHING)
+    return poses, fuser.scene
+
+
+def drift(tracked: Pose, frame: Frame) -> float:
+    """m, between the estimate and the truth."""
+    assert frame.T_world_camera is not None
+    return float(np.linalg.norm((inverse(frame.T_world_camera) @ tracked.T_world_camera)[:3, 3]))
+
+
+def drifts(poses: Sequence[Pose], frames: Sequence[Frame]) -> np.ndarray:
+    """(n,) m; NaN where the pose is lost."""
+    return np.array([np.nan if p.lost else drift(p, f) for p, f in zip(poses, frames, strict=True)])
+
+
+@pytest.fixture(scope="module")
+def wall() -> list[Frame]:
+    """Sideways along a flat, textured wall, 0.6 m at 1.5 m, with a Kinect's noise: only the texture tells."""
+    scene = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
+    rng = np.random.default_rng(0)
+    exact = [scene.frame(pose(0.01 * k, 0.02 * np.sin(0.1 * k)), k) for k in range(60)]
+    noise = [rng.normal(0, 0.002, CAMERA.shape).astype(np.float32) for _ in exact]
+    return [dataclasses.replace(f, depth=f.depth + n) for f, n in zip(exact, noise, strict=True)]
+
+
+def test_colour_holds_on_to_a_flat_wall(wall: list[Frame]) -> None:
+    poses, _ = run(VoxelHashingIcp(finest=1.0), wall)
+    assert not any(p.lost for p in poses)
+    assert drift(poses[-1], wall[-1]) < 0.01
+
+
+@pytest.mark.parametrize("min_information", [3e-4, 0.0], ids=["default", "unchecked"])
+def test_geometry_alone_slides_along_it_or_says_so(min_information: float, wall: list[Frame]) -> None:
+    poses, _ = run(VoxelHashingIcp(finest=1.0, color_weight=0.0, min_information=min_information), wall)
+    assert any(p.lost for p in poses) or drift(poses[-1], wall[-1]) > 0.1
+
+
+def test_the_drift_in_an_exact_room_is_a_fraction_of_a_voxel() -> None:
+    """40 frames of the walk whose 200 frames are a benchmark; 1 cm voxels."""
+    room = Synthetic(frames=240, stop=40, noise=0.0)
+    poses, _ = run(VoxelHashingIcp(), room, voxel_size=0.01)
+    assert not any(p.lost for p in poses)
+    assert drift(poses[-1], room[39]) < 0.002
+
+
+def test_colour_does_no_harm_where_geometry_suffices(shared_data: Path) -> None:
+    """A real kitchen: with colour the trajectory is not worse than without."""
+    frames = list(RgbdFolder(shared_data / "redkitchen", stop=80, stride=2))
+    truth = [f.T_world_camera for f in frames]
+    both, alone = (evaluate(truth, run(VoxelHashingIcp(color_weight=w), frames)[0]) for w in (0.1, 0.0))
+    assert both.frames == len(frames), "none is lost"
+    assert both.ate_rmse_m < 0.015
+    assert both.ate_rmse_m < alone.ate_rmse_m + 0.001
+
+
+class Surface:
+    """The exact surface of a synthetic room, and how far a map is from it."""
+
+    def __init__(self, room: Synthetic) -> None:
+        self._scene = o3d.t.geometry.RaycastingScene()
+        surfaces = room.room.surfaces
+        self._scene.add_triangles(
+            o3d.core.Tensor(surfaces.vertices), o3d.core.Tensor(surfaces.triangles.astype(np.uint32))
+        )
+
+    def error(self, scene: SceneMap) -> tuple[float, float]:
+        """Median distance of the mesh's vertices, m, and the share that is more than two voxels off."""
+        distance = self._scene.compute_distance(o3d.core.Tensor(scene.mesh().vertices)).numpy()
+        return float(np.median(distance)), float((distance > 2 * VOXEL).mean())
+
+
+@pytest.fixture(scope="module")
+def room() -> Synthetic:
+    """Furnished, seen by a Kinect, quarter resolution."""
+    return Synthetic(frames=240, stop=80, width=320, height=240)
+
+
+@pytest.fixture(scope="module")
+def frames(room: Synthetic) -> list[Frame]:
+    return list(room)
+
+
+@pytest.fixture(scope="module")
+def surface(room: Synthetic) -> Surface:
+    return Surface(room)
+
+
+@pytest.fixture(scope="module")
+def elsewhere() -> list[Frame]:
+    return list(Synthetic(scene="elsewhere", frames=240, stop=3, width=320, height=240))
+
+
+@pytest.fixture(scope="module")
+def clean_error(frames: list[Frame], surface: Surface) -> tuple[float, float]:
+    """Of the map that no bad frame has come near."""
+    return surface.error(run(VoxelHashingIcp(), [*frames[:60], *frames[60:5:-1]])[1])
+
+
+def black(frame: Frame) -> Frame:
+    """A hand before the lens."""
+    return dataclasses.replace(frame, depth=np.zeros_like(frame.depth), color=np.zeros_like(frame.color))
+
+
+def plain(frame: Frame) -> Frame:
+    """A blank wall at 1 m fills the view."""
+    return dataclasses.replace(frame, depth=np.full_like(frame.depth, 1.0), color=np.full_like(frame.color, 200))
+
+
+def garbage(frame: Frame) -> Frame:
+    rng = np.random.default_rng([7, frame.index])
+    return dataclasses.replace(
+        frame,
+        depth=rng.uniform(0.4, 5.0, frame.depth.shape).astype(np.float32),
+        color=rng.integers(0, 256, frame.color.shape, np.uint8),
+    )
+
+
+def assert_unharmed(
+    poses: list[Pose], shown: list[Frame], error: tuple[float, float], clean: tuple[float, float]
+) -> None:
+    """No pose is wrong without saying so, the last ones are right, and the map is as good as without the bad frames."""
+    off = drifts(poses, shown)
+    assert np.nanmax(off) < WRONG, f"frame {np.nanargmax(off)} of the video is {np.nanmax(off):.3f} m off and not lost"
+    assert not np.isnan(off[-10:]).any(), f"lost on known ground: {poses[-1].reason}"
+    assert error[0] < clean[0] + 0.1 * VOXEL
+    assert error[1] < clean[1] + 0.02
+
+
+def there_and_back(frames: list[Frame], begin: int, bad: list[Frame], end: int) -> list[Frame]:
+    """The camera walks on behind the bad frames, [begin, end), for ten more frames, and then back to the beginning."""
+    return [*frames[:begin], *bad, *frames[end : end + 10], *frames[end + 10 : 5 : -1]]
+
+
+NEEDS_RELOCALISATION = pytest.mark.xfail(
+    strict=False, reason="the last pose is too far away to start from, and too wrong a match is accepted"
+)
+
+
+@pytest.mark.parametrize(
+    ("spoilt", "count"),
+    [
+        pytest.param(black, 10, marks=NEEDS_RELOCALISATION),
+        pytest.param(plain, 10, marks=NEEDS_RELOCALISATION),
+        (garbage, 1),
+        pytest.param(garbage, 5, marks=NEEDS_RELOCALISATION),
+    ],
+)
+def test_bad_frames_are_lost_and_do_no_harm(spoilt, count: int, frames: list[Frame], surface, clean_error) -> None:
+    shown = there_and_back(frames, 25, [spoilt(f) for f in frames[25 : 25 + count]], 25 + count)
+    poses, scene = run(VoxelHashingIcp(), shown)
+    assert all(p.lost for p in poses[25 : 25 + count])
+    assert_unharmed(poses, shown, surface.error(scene), clean_error)
+
+
+def test_a_cut_to_another_room_and_back_does_no_harm(frames: list[Frame], elsewhere, surface, clean_error) -> None:
+    bad = [dataclasses.replace(f, depth=e.depth, color=e.color) for f, e in zip(frames[25:28], elsewhere, strict=True)]
+    shown = there_and_back(frames, 25, bad, 28)
+    poses, scene = run(VoxelHashingIcp(), shown)
+    assert all(p.lost for p in poses[25:28])
+    assert_unharmed(poses, shown, surface.error(scene), clean_error)
+
+
+@pytest.mark.parametrize("missing", [3, *(pytest.param(n, marks=NEEDS_RELOCALISATION) for n in (5, 20, 40))])
+def test_a_jump_is_tracked_or_told(missing: int, frames: list[Frame], surface, clean_error) -> None:
+    """Frames are missing from the middle of the video: 4, 9, 30 and 58 cm; 2, 5, 17 and 33 degrees."""
+    shown = there_and_back(frames, 25, [], 25 + missing)
+    poses, scene = run(VoxelHashingIcp(), shown)
+    assert_unharmed(poses, shown, surface.error(scene), clean_error)
+
+
+@NEEDS_RELOCALISATION
+def test_a_jump_in_a_real_video_is_tracked_or_told(shared_data: Path) -> None:
+    """As above, against the poses that the data come with, which are good to a centimetre or two."""
+    frames = list(RgbdFolder(shared_data / "redkitchen", stop=70))
+    shown = [*frames[:25], *frames[45:55], *frames[55:5:-2]]
+    poses, _ = run(VoxelHashingIcp(), shown)
+    off = drifts(poses, shown)
+    assert np.nanmax(off) < WRONG
+    assert not np.isnan(off[-5:]).any()
+
+
+BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)
+STAYS_LOST = pytest.mark.xfail(
+    strict=False, reason="at the border of what is determined it loses touch for good: no texture to relocalise by"
+)
+
+
+@pytest.mark.parametrize("spheres", [[BALL], pytest.param([], marks=STAYS_LOST)], ids=["ball", "bare"])
+def test_a_blank_wall_that_fills_the_view_is_told(spheres: list[tuple[np.ndarray, float]]) -> None:
+    """From a corner, bare or with a ball in it, along an untextured wall until nothing else is in view, and back."""
+    corner = Scene(
+        planes=[
+            (np.array([0.0, 0.0, -1.0]), -2.5),
+            (np.array([0.0, -1.0, 0.0]), -1.0),
+            (np.array([1.0, 0.0, 0.0]), -1.6),
+        ],
+        spheres=spheres,
+        contrast=0.0,
+    )
+    there = [pose(-1.1 + 1.6 * s, 0.5 - 0.8 * s, 1.0) for s in np.linspace(0, 1, 100)]
+    shown = [corner.frame(T, k) for k, T in enumerate([*there, *there[::-1]])]
+    wall_only = [bool((corner.render(CAMERA, f.T_world_camera)[2] == 1).all()) for f in shown]
+    assert sum(wall_only) >= 20
+    poses, scene = run(VoxelHashingIcp(finest=1.0), shown)
+    errors = drifts(poses, shown)
+    assert all(p.lost for p, blank in zip(poses, wall_only, strict=True) if blank)
+    assert np.nanmax(errors) < WRONG
+    assert not np.isnan(errors[-10:]).any()
+    assert np.median(corner.distance(scene.mesh().vertices.astype(float))) < 0.1 * VOXEL
+
+
+def test_poses_and_map_do_not_depend_on_the_number_of_threads(frames: list[Frame], tmp_path: Path) -> None:
+    saved, tracked = [], []
+    before = numba.get_num_threads()
+    for threads in (1, min(2, numba.config.NUMBA_NUM_THREADS)):
+        numba.set_num_threads(threads)
+        poses, scene = run(VoxelHashingIcp(), frames[:12])
+        scene.save(tmp_path / "map.npz")
+        saved.append((tmp_path / "map.npz").read_bytes())
+        tracked.append(np.array([p.T_world_camera for p in poses]))
+    numba.set_num_threads(before)
+    assert np.array_equal(*tracked)
+    assert saved[0] == saved[1]
