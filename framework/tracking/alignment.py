@@ -23,7 +23,8 @@ from framework.mapping.voxel_grid import device
 from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
-TERMS = 27 + 5  # of a chunk's sums: 21 + 6 of the normal equations, then the counts below
+TERMS = 27 + 7  # of a chunk's sums: 21 + 6 of the normal equations, then the counts below
+CLOSE = 0.05  # m, or 3 standard deviations: a reading this far from the model's depth agrees with it
 NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
 
 
@@ -74,7 +75,9 @@ class NormalEquations(NamedTuple):
     A: Float64  # (6, 6)
     b: Float64  # (6,)
     visible: int  # points that fall on a mapped part of the view
-    matched: int  # of these, points near enough to their model point to be weighed
+    matched: int  # of these, points with a weight
+    close: int  # of the visible, points whose depth in the view agrees with the model's
+    behind: int  # of the visible, points so far behind the model that they could not be seen through it
     brightness: float  # mean of frame - model intensity: the change of exposure
 
 
@@ -122,7 +125,7 @@ def _project(depth, v, fx, fy, cx, cy, model, R, t, points, places, pixels):
 
 @device
 def _add_geometry(depth, normals, v, model, flat_depth, flat_normals, R, weights, points, pixels, matched, J, w, r):
-    """The point-to-plane terms of a row into J (6, W), w and r (W,); returns (visible, weighed).
+    """The point-to-plane terms of a row into J (6, W), w and r (W,); returns (visible, weighed, close, behind).
 
     matched (W,) becomes 1 where a point is near enough to its model point, 0 elsewhere.
     """
@@ -131,8 +134,7 @@ def _add_geometry(depth, normals, v, model, flat_depth, flat_normals, R, weights
     max_distance2 = weights.max_distance * weights.max_distance
     width = np.int32(model.depth.shape[1])
     size = np.int32(model.depth.size)
-    visible = np.int32(0)
-    weighed = np.int32(0)
+    visible = weighed = close = behind = np.int32(0)
     for u in range(depth.shape[1]):
         pixel = max(pixels[u], np.int32(0))
         q = flat_depth[np.uint32(pixel)] if pixels[u] >= 0 else zero
@@ -163,7 +165,10 @@ def _add_geometry(depth, normals, v, model, flat_depth, flat_normals, R, weights
         matched[u] = one if near else zero
         visible += np.int32(1) if q > zero else np.int32(0)
         weighed += np.int32(1) if weight > zero else np.int32(0)
-    return visible, weighed
+        apart = max(np.float32(CLOSE), np.float32(3.0) * sigma)
+        close += np.int32(1) if (q > zero) & (abs(ez) < apart) else np.int32(0)
+        behind += np.int32(1) if (q > zero) & (ez > apart + apart) else np.int32(0)
+    return visible, weighed, close, behind
 
 
 @device
@@ -259,11 +264,13 @@ def _accumulate(
         w, r, weighted = np.empty(terms, np.float32), np.empty(terms, np.float32), np.empty(terms, np.float32)
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
             _project(depth, v, fx, fy, cx, cy, model, R, t, points, places, pixels)
-            visible, weighed = _add_geometry(
+            visible, weighed, close, behind = _add_geometry(
                 depth, normals, v, model, flat_depth, flat_normals, R, weights, points, pixels, matched, J, w, r
             )
             total[27] += visible
             total[28] += weighed
+            total[29] += close
+            total[30] += behind
             if terms > width:
                 weighed, darker, compared = _add_photometry(
                     intensity,
@@ -281,9 +288,9 @@ def _accumulate(
                     w,
                     r,
                 )
-                total[29] += weighed
-                total[30] += np.float64(darker)
-                total[31] += compared
+                total[31] += weighed
+                total[32] += np.float64(darker)
+                total[33] += compared
             _add_row(J, w, r, weighted, total)
         sums[chunk] = total
 
@@ -328,6 +335,8 @@ def linearise(
         A=A,
         b=total[21:27],
         visible=int(total[27]),
-        matched=int(total[28]) if weights.depth_weight > 0 else int(total[29]),
-        brightness=float(total[30] / max(total[31], 1)),
+        matched=int(total[28]) if weights.depth_weight > 0 else int(total[31]),
+        close=int(total[29]),
+        behind=int(total[30]),
+        brightness=float(total[32] / max(total[33], 1)),
     )

@@ -2,18 +2,34 @@
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Float64, Frame, Pose, View
+from framework.data import Float64, Frame, Pose
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
 from framework.tracking.alignment import NormalEquations, Weights, linearise, model_view
+from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
+LEVELS = 3
 FINE_ENOUGH = 1e-4  # m and rad: a shorter step ends the finest level, four times as long a one the level before, ...
+SAME_PLACE = 0.05  # m and rad: two alignments that end nearer to each other than this have found the same pose
+VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
+VISITED_APART = 0.1  # m and rad
+
+
+class Alignment(NamedTuple):
+    """Where the alignment of a frame has ended."""
+
+    T_world_camera: Float64
+    agreement: float  # share of the points in view that agree with the map
+    reason: str  # why it is impossible, empty if it is not
+    doubt: str  # why it takes the keyframes' word to trust it, empty if it does not
 
 
 @dataclass
@@ -36,6 +52,10 @@ class VoxelHashingIcp(PoseTracker):
     min_visible: float = 0.15  # in [0, 1]: share of the frame's points that must fall on the map
     min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
     min_information: float = 3e-4  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
+    min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
+    max_behind: float = 0.015  # in [0, 1]: ... and behind it; what fails must be confirmed by the keyframes
+    relocalise: bool = True  # by features of keyframes, when lost or in doubt
+    seed: int = 0  # of the relocalisation's random samples
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -56,6 +76,8 @@ class VoxelHashingIcp(PoseTracker):
             min_visible=(0.0, 1.0),
             min_matched=(0.0, 1.0),
             min_information=(0.0, 1.0),
+            min_agreement=(0.0, 1.0),
+            max_behind=(0.0, 1.0),
         )
         require(np.log2(self.finest) % 1 == 0, "VoxelHashingIcp.finest", self.finest, "1, 1/2, 1/4, ...")
         self._weights = Weights(
@@ -69,52 +91,92 @@ class VoxelHashingIcp(PoseTracker):
         )
         self._T_world_last: Float64 | None = None  # the last pose that was trusted
         self._T_last_next = np.eye(4)  # its motion since the one before: the constant-velocity prediction
+        self._lost_frames = 0  # in a row
+        self._keyframes = Keyframes(seed=self.seed)
+        self._visited: deque[Float64] = deque(maxlen=VISITED)
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         if self._T_world_last is None:
             T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
             if not frame.depth.any():  # a world that starts with nothing in it would have nothing to be tracked by
                 return Pose(T_world_camera, lost=True, reason="the frame has no depth")
-            self._T_world_last = T_world_camera
-            return Pose(T_world_camera)
-        T_world_view = self._T_world_last @ self._T_last_next
-        frame_levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, levels=3)
-        view = scene.render(frame_levels[0].camera, T_world_view)
-        T_view_camera, equations = self._align(frame_levels, view)
-        T_world_camera = T_world_view @ T_view_camera
-        # products of poses and of their inverses amplify rounding errors exponentially
-        T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
-        reason = self._why_lost(frame_levels[0], equations, T_world_camera)
-        if reason:
+            return self._trusted(frame, T_world_camera)
+        levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
+        alignment = self._align(levels, scene, self._T_world_last @ self._T_last_next, self._T_world_last)
+        if (self._lost_frames or alignment.reason or alignment.doubt) and levels[0].depth.any():
+            alignment = self._searched(alignment, frame, levels, scene)
+        if alignment.reason or alignment.doubt:
+            self._lost_frames += 1
             self._T_last_next = np.eye(4)
-            return Pose(self._T_world_last, lost=True, reason=reason)
-        self._T_last_next = inverse(self._T_world_last) @ T_world_camera
+            return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
+        self._T_last_next = np.eye(4) if self._lost_frames else inverse(self._T_world_last) @ alignment.T_world_camera
+        return self._trusted(frame, alignment.T_world_camera)
+
+    def _trusted(self, frame: Frame, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera
+        self._lost_frames = 0
+        if self.relocalise:
+            self._keyframes.add(frame, T_world_camera)
+            if not any(_near(T, T_world_camera, VISITED_APART) for T in self._visited):
+                self._visited.append(T_world_camera)
         return Pose(T_world_camera)
 
-    def _align(self, frame_levels: list[PyramidLevel], view: View) -> tuple[Float64, NormalEquations]:
-        """T_view_camera, coarse to fine, and the normal equations of the last step."""
-        model = model_view(view)
-        intensities = model_intensities(view, levels=3)
+    def _searched(self, alignment: Alignment, frame: Frame, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+        """The best pose of a frame that is lost or in doubt: asks the keyframes, then goes through visited places."""
+        found = self._keyframes.relocalise(frame) if self.relocalise else None
+        if found is not None:
+            again = self._align(levels, scene, found.T_world_camera, found.T_world_camera)
+            if not again.reason and _near(again.T_world_camera, found.T_world_camera, self.max_distance):
+                if alignment.reason or again.agreement > alignment.agreement:
+                    alignment = again
+                if _near(again.T_world_camera, alignment.T_world_camera, SAME_PLACE):
+                    return alignment._replace(doubt="")
+        if (alignment.reason or alignment.doubt) and self._visited:
+            T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
+            again = self._align(levels, scene, T_world_visited, T_world_visited)
+            if not (again.reason or again.doubt):
+                return again
+        return alignment
+
+    def _align(
+        self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
+    ) -> Alignment:
+        """Aligns a frame to the view of the map at T_world_view, coarse to fine; it comes from T_world_from."""
+        view = scene.render(levels[0].camera, T_world_view)
+        model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         T_view_camera = np.eye(4)
         brightness = 0.0
-        for level in (2, 1, 0):
-            enough = FINE_ENOUGH * 4**level
+        for level in reversed(range(LEVELS)):
+            weights = self._weights_at(level)
             for _ in range(iterations[level]):
-                equations = linearise(
-                    frame_levels[level], model, intensities[level], T_view_camera, self._weights, brightness
-                )
+                equations = linearise(levels[level], model, intensities[level], T_view_camera, weights, brightness)
                 brightness = equations.brightness
                 xi = _solved(equations)
                 T_view_camera = exp_se3(xi) @ T_view_camera
-                if np.abs(xi).max() < enough:
+                if np.abs(xi).max() < FINE_ENOUGH * 4**level:
                     break
-        return T_view_camera, equations
+        T_world_camera = T_world_view @ T_view_camera
+        # products of poses and of their inverses amplify rounding errors exponentially
+        T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
+        reason = self._why_impossible(levels[0], equations, inverse(T_world_from) @ T_world_camera)
+        agreement = equations.close / max(equations.visible, 1)
+        behind = equations.behind / max(equations.visible, 1)
+        doubt = ""
+        if agreement < self.min_agreement or behind > self.max_behind:
+            doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
+        return Alignment(T_world_camera, agreement, reason, doubt)
 
-    def _why_lost(self, frame: PyramidLevel, equations: NormalEquations, T_world_camera: Float64) -> str:
-        """One line that says why the pose is not to be trusted, empty if it is."""
-        assert self._T_world_last is not None
+    def _weights_at(self, level: int) -> Weights:
+        """What is an outlier where the pose is known to a fraction of a voxel need not be one on the way there."""
+        return self._weights._replace(
+            max_distance=self._weights.max_distance * np.float32(1 + level),
+            geometric_scale=self._weights.geometric_scale * np.float32(2**level),
+            photometric_scale=self._weights.photometric_scale * np.float32(2**level),
+        )
+
+    def _why_impossible(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
+        """One line that says why this cannot be the pose, empty if it can."""
         points = int(np.count_nonzero(frame.depth))
         if points == 0:
             return "the frame has no depth"
@@ -122,15 +184,20 @@ class VoxelHashingIcp(PoseTracker):
             return f"{equations.visible / points:.0%} of the frame's points fall on the map"
         if equations.matched < self.min_matched * equations.visible:
             return f"{equations.matched / equations.visible:.0%} of the points in view agree with the map"
-        T_last_camera = inverse(self._T_world_last) @ T_world_camera
-        step = float(np.linalg.norm(T_last_camera[:3, 3]))
-        turn = rotation_angle(T_last_camera[:3, :3])
+        step = float(np.linalg.norm(T_from_camera[:3, 3]))
+        turn = rotation_angle(T_from_camera[:3, :3])
         if step > self.max_step or turn > self.max_turn:
             return f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
         information = np.linalg.eigvalsh(equations.A)
         if information[0] < self.min_information * information.mean():
             return "the surface in view does not determine the motion"
         return ""
+
+
+def _near(T_a: Float64, T_b: Float64, limit: float) -> bool:
+    """Whether two poses are within `limit` m and rad of each other."""
+    T_ab = inverse(T_a) @ T_b
+    return bool(np.linalg.norm(T_ab[:3, 3]) < limit and rotation_angle(T_ab[:3, :3]) < limit)
 
 
 def _solved(equations: NormalEquations) -> Float64:
