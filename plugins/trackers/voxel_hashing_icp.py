@@ -51,7 +51,7 @@ class VoxelHashingIcp(PoseTracker):
     max_turn: float = 0.35  # rad, > 0: likewise
     min_visible: float = 0.15  # in [0, 1]: share of the frame's points that must fall on the map
     min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
-    min_information: float = 3e-4  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
+    min_information: float = 1e-3  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
     min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
     max_behind: float = 0.015  # in [0, 1]: ... and behind it; what fails must be confirmed by the keyframes
     relocalise: bool = True  # by features of keyframes, when lost or in doubt
@@ -132,11 +132,22 @@ class VoxelHashingIcp(PoseTracker):
                 if _near(again.T_world_camera, alignment.T_world_camera, SAME_PLACE):
                     return alignment._replace(doubt="")
         if (alignment.reason or alignment.doubt) and self._visited:
-            T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
-            again = self._align(levels, scene, T_world_visited, T_world_visited)
+            again = self._from_visited(self._visited[-1 - self._lost_frames % len(self._visited)], levels, scene)
             if not (again.reason or again.doubt):
                 return again
         return alignment
+
+    def _from_visited(self, T_world_visited: Float64, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+        """Aligns from a visited place, and again from where that ends: only the view from there tells whether the frame
+        determines its pose.
+        """
+        first = self._align(levels, scene, T_world_visited, T_world_visited)
+        if first.reason or first.doubt:
+            return first
+        second = self._align(levels, scene, first.T_world_camera, T_world_visited)
+        if not _near(first.T_world_camera, second.T_world_camera, SAME_PLACE / 2):
+            return second._replace(reason="two alignments from a visited place do not agree")
+        return second
 
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
