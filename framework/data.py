@@ -189,14 +189,20 @@ class PointClusters:
 
 
 @dataclass(frozen=True)
-class View:
-    """What the map shows to a camera: the model side of tracking, association and pictures."""
+class SurfaceView:
+    """The surface that the map shows to a camera: the model side of tracking."""
 
     camera: Camera
     T_world_camera: Float64  # (4, 4)
     depth: Float32  # (H, W) m along z, 0 = nothing mapped there
     normals_world: Float32  # (H, W, 3) unit length, towards the camera; 0 where depth is 0
     color: UInt8  # (H, W, 3) RGB
+
+
+@dataclass(frozen=True)
+class View(SurfaceView):
+    """What the map shows to a camera, labels included."""
+
     instance_ids: Int32  # (H, W), 0 = no instance
     class_ids: Int32  # (H, W) index into the map's classes, -1 = no class
 

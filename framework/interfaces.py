@@ -20,6 +20,7 @@ from pathlib import Path
 from framework.data import (
     Camera,
     Detections,
+    Float32,
     Float64,
     Frame,
     Instance,
@@ -27,6 +28,7 @@ from framework.data import (
     PointClusters,
     Pose,
     SceneTruth,
+    SurfaceView,
     View,
 )
 
@@ -125,6 +127,13 @@ class SceneMap(ABC):
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """What `camera` would see of the map, by ray-casting."""
+
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        """The surface that `camera` would see where it reads `depth` (H, W) m: what a tracker compares a frame with.
+
+        A map may begin its search at the readings, and show nothing where there is none and nothing far behind them.
+        """
+        return self.render(camera, T_world_camera)
 
     @abstractmethod
     def mesh(self) -> InstanceMesh:

@@ -17,13 +17,13 @@ import numpy.typing as npt
 import open3d as o3d
 
 from framework.atomic_files import written_whole
-from framework.data import Bool, Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, View
+from framework.data import Bool, Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.evidence import Evidence, EvidenceRows
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.meshing import SurfaceNets, look_up
-from framework.mapping.raycasting import render
+from framework.mapping.raycasting import render, render_near
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
@@ -96,6 +96,9 @@ class InstanceMap(SceneMap):
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         return render(self.voxels, self.labels.evidence, self.sensor, camera, T_world_camera)
+
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        return render_near(self.voxels, self.sensor, camera, T_world_camera, depth)
 
     def mesh(self) -> InstanceMesh:
         return self._mesh

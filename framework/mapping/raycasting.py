@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Camera, Float32, Float64, View
+from framework.data import Camera, Float32, Float64, SurfaceView, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.frustum import bounds, extent
@@ -36,9 +36,10 @@ from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, trilin
 TILE = 8  # px; one tile's rays share blocks in the cache
 REFINEMENTS = 4  # Newton steps at most: one meets a plane, two or three a curved surface
 CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter than this ends within some hundredths
-REACH = 2.0  # voxels, from where a refinement may start to the surface that it finds
+REACH = 3.0  # voxels, from where a refinement may start to the surface that it finds
 DETAIL = 3.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
 ONE_SURFACE = 8.0  # voxels of depth that a surface may rise between coarse rays
+MAX_SHIFT = 10.0  # voxels between a reading and the map's surface that may still be one surface seen from elsewhere
 TYPICAL_DEPTH = 2.0  # m, for the choice of the distance between coarse rays
 MAX_STRIDE = 8  # px between coarse rays
 
@@ -225,6 +226,40 @@ def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def cast_near(grid, view, tile_near, tile_far, readings, depth, normals):
+    """Like cast_fine(), with the search begun at the camera's own readings (H, W) m; nothing where there is none, nor
+    where the map's surface is more than MAX_SHIFT behind the reading.
+
+    A wrong pose displaces all readings of a surface alike, so each pixel begins where its neighbor was put right.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    voxel = grid.voxel_size
+    scale = one / voxel
+    for v in prange(depth.shape[0]):
+        o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
+        key = np.int64(-2)
+        region = np.int32(-1)
+        shift = zero
+        for u in range(depth.shape[1]):
+            z = nx = ny = nz = zero
+            if readings[v, u] > zero:
+                d, step = _ray(view, scale, u, v)
+                z, nx, ny, nz, key, region = _refined(grid, o, d, step, readings[v, u] + shift, key, region)
+                if z == zero:
+                    near = tile_near[v // TILE, u // TILE]
+                    far = min(tile_far[v // TILE, u // TILE], readings[v, u] + np.float32(MAX_SHIFT) * voxel)
+                    z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near, far, key, region)
+                apart = z - readings[v, u]
+                shift = apart if z > zero and abs(apart) < np.float32(MAX_SHIFT) * voxel else zero
+            norm = np.sqrt(nx * nx + ny * ny + nz * nz)
+            norm = one / norm if z > zero else zero
+            depth[v, u] = z
+            normals[v, u, 0] = nx * norm
+            normals[v, u, 1] = ny * norm
+            normals[v, u, 2] = nz * norm
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def paint(grid, view, depth, color):
     """Fills color (H, W, 3) with the map's colour at the surface that `depth` (H, W) m, seen from `view`, describes."""
     height, width = depth.shape
@@ -321,3 +356,17 @@ def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera
     paint(voxels.grid, view, depth, color)
     label(voxels.grid, evidence, view, depth, instance_ids, class_ids)
     return View(camera, T_world_camera, depth, normals, color, instance_ids, class_ids)
+
+
+def render_near(
+    voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32
+) -> SurfaceView:
+    """The surface that `camera` sees at its `readings` (H, W) m, or in front of them."""
+    tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
+    view = pinhole(camera, T_world_camera)
+    depth = np.empty(camera.shape, np.float32)
+    normals = np.empty((*camera.shape, 3), np.float32)
+    cast_near(voxels.grid, view, tile_near, tile_far, readings, depth, normals)
+    color = np.empty((*camera.shape, 3), np.uint8)
+    paint(voxels.grid, view, depth, color)
+    return SurfaceView(camera, T_world_camera, depth, normals, color)

@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Camera, Float32, Float64, View
+from framework.data import Camera, Float32, Float64, SurfaceView
 from framework.mapping.voxel_grid import device
 from framework.tracking.pyramid import PyramidLevel
 
@@ -39,7 +39,7 @@ class ModelView(NamedTuple):
     cy: np.float32
 
 
-def model_view(view: View) -> ModelView:
+def model_view(view: SurfaceView) -> ModelView:
     """What alignment needs of a view of the map."""
     normals = np.empty((3, *view.depth.shape), np.float32)
     _turn_normals(view.normals_world, np.ascontiguousarray(view.T_world_camera[:3, :3].T, np.float32), normals)

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Camera, Float32, UInt8, View
+from framework.data import Camera, Float32, SurfaceView, UInt8
 
 DEPTH_GAP = 0.05  # of the depth: readings farther apart than this do not belong to one surface and are not averaged
 
@@ -113,7 +113,7 @@ def _normals(depth, fx, fy, cx, cy, normals):
     normals[:, height - 1] = zero
 
 
-def model_intensities(view: View, levels: int) -> list[Float32]:
+def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
     """The view's intensity in [0, 1] at its own resolution and halvings of it, -1 where nothing is mapped."""
     intensity = cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
     intensity[view.depth == 0] = -1

@@ -102,7 +102,10 @@ class VoxelHashingIcp(PoseTracker):
                 return Pose(T_world_camera, lost=True, reason="the frame has no depth")
             return self._trusted(frame, T_world_camera)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
-        alignment = self._align(levels, scene, self._T_world_last @ self._T_last_next, self._T_world_last)
+        if self._lost_frames:
+            alignment = self._align_twice(levels, scene, self._T_world_last)
+        else:
+            alignment = self._align(levels, scene, self._T_world_last @ self._T_last_next, self._T_world_last)
         if (self._lost_frames or alignment.reason or alignment.doubt) and levels[0].depth.any():
             alignment = self._searched(alignment, frame, levels, scene)
         if alignment.reason or alignment.doubt:
@@ -132,28 +135,29 @@ class VoxelHashingIcp(PoseTracker):
                 if _near(again.T_world_camera, alignment.T_world_camera, SAME_PLACE):
                     return alignment._replace(doubt="")
         if (alignment.reason or alignment.doubt) and self._visited:
-            again = self._from_visited(self._visited[-1 - self._lost_frames % len(self._visited)], levels, scene)
+            T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
+            again = self._align_twice(levels, scene, T_world_visited)
             if not (again.reason or again.doubt):
                 return again
         return alignment
 
-    def _from_visited(self, T_world_visited: Float64, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Aligns from a visited place, and again from where that ends: only the view from there tells whether the frame
-        determines its pose.
+    def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
+        """Aligns from where the camera was, and again from where that ends: only the view from there tells whether the
+        frame determines its pose.
         """
-        first = self._align(levels, scene, T_world_visited, T_world_visited)
+        first = self._align(levels, scene, T_world_from, T_world_from)
         if first.reason or first.doubt:
             return first
-        second = self._align(levels, scene, first.T_world_camera, T_world_visited)
+        second = self._align(levels, scene, first.T_world_camera, T_world_from)
         if not _near(first.T_world_camera, second.T_world_camera, SAME_PLACE / 2):
-            return second._replace(reason="two alignments from a visited place do not agree")
+            return second._replace(doubt="two alignments, the second from where the first has ended, do not agree")
         return second
 
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
         """Aligns a frame to the view of the map at T_world_view, coarse to fine; it comes from T_world_from."""
-        view = scene.render(levels[0].camera, T_world_view)
+        view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         T_view_camera = np.eye(4)
