@@ -37,9 +37,8 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 
     Voxels outside the image get pixel 0 and a depth beyond any reading.
     """
-    one, half = np.float32(1.0), np.float32(0.5)
-    seven, three, six = np.int32(7), np.int32(3), np.int32(6)
-    right, bottom = np.float32(shape[1]) - half, np.float32(shape[0]) - half
+    zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+    seven, three = np.int32(7), np.int32(3)
     width = np.int32(shape[1])
     x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE)
     y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE)
@@ -48,20 +47,24 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
     R00, R01, R02, t0 = camera.R[0, 0] * voxel, camera.R[0, 1] * voxel, camera.R[0, 2] * voxel, camera.t[0]
     R10, R11, R12, t1 = camera.R[1, 0] * voxel, camera.R[1, 1] * voxel, camera.R[1, 2] * voxel, camera.t[1]
     R20, R21, R22, t2 = camera.R[2, 0] * voxel, camera.R[2, 1] * voxel, camera.R[2, 2] * voxel, camera.t[2]
-    for n in range(BLOCK_VOXELS):
-        m = np.int32(n)
-        x, y, z = x0 + np.float32(m & seven), y0 + np.float32((m >> three) & seven), z0 + np.float32(m >> six)
-        px = R00 * x + R01 * y + R02 * z + t0
-        py = R10 * x + R11 * y + R12 * z + t1
-        pz = R20 * x + R21 * y + R22 * z + t2
-        w = one / max(pz, min_depth)
-        u = camera.fx * px * w + camera.cx
-        v = camera.fy * py * w + camera.cy
-        inside = (pz > min_depth) & (u > -half) & (v > -half) & (u < right) & (v < bottom)
-        column = np.int32(u + half) if inside else np.int32(0)
-        line = np.int32(v + half) if inside else np.int32(0)
-        pixel[n] = line * width + column
-        scratch[n] = pz if inside else np.float32(FAR)
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx + half, camera.cy + half
+    right, bottom = np.float32(shape[1]), np.float32(shape[0])
+    for row in range(BLOCK_VOXELS // BLOCK_SIDE):
+        m = np.int32(row)
+        y, z = y0 + np.float32(m & seven), z0 + np.float32(m >> three)
+        row_x = R00 * x0 + R01 * y + R02 * z + t0
+        row_y = R10 * x0 + R11 * y + R12 * z + t1
+        row_z = R20 * x0 + R21 * y + R22 * z + t2
+        for i in range(BLOCK_SIDE):
+            x = np.float32(np.int32(i))
+            px, py, pz = row_x + R00 * x, row_y + R10 * x, row_z + R20 * x
+            w = one / max(pz, min_depth)
+            u = fx * px * w + cx
+            v = fy * py * w + cy
+            inside = (pz > min_depth) & (u > zero) & (v > zero) & (u < right) & (v < bottom)
+            number = np.int32(v) * width + np.int32(u)
+            pixel[row * BLOCK_SIDE + i] = number if inside else np.int32(0)
+            scratch[row * BLOCK_SIDE + i] = pz if inside else np.float32(FAR)
 
 
 @device
