@@ -113,9 +113,10 @@ def _average_colors(packed, seen, rounding, scratch):
         red += share * (four * np.float32(new & byte) - red)
         green += share * (four * np.float32((new >> one_byte) & byte) - green)
         blue += share * (four * np.float32((new >> two_bytes) & byte) - blue)
-        packed[n] = pack_color(
+        mean = pack_color(
             min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
         )
+        packed[n] = mean if share > np.float32(0.0) else packed[n]
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")

@@ -107,7 +107,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
             continue
         stored = grid.tsdf[np.uint32(block), np.uint32(voxel_number(i, j, k))]
         if stored == UNSEEN:
-            z += step
+            z += step + step  # a surface has more than one voxel before it that was seen
             from_front = False
             continue
         distance = np.float32(stored) * to_voxels
@@ -177,6 +177,16 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
             depth[y, x] = z
 
 
+@device
+def _first_and_last(z00, z01, z10, z11):
+    """The least and the greatest depth of four, of which 0 is none."""
+    none = np.float32(np.inf)
+    nearest = min(
+        min(z00 if z00 > 0 else none, z01 if z01 > 0 else none), min(z10 if z10 > 0 else none, z11 if z11 > 0 else none)
+    )
+    return nearest, max(max(z00, z01), max(z10, z11))
+
+
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
     """Fills depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
@@ -187,6 +197,7 @@ def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
     scale = one / voxel
+    rise = np.float32(ONE_SURFACE) * voxel
     # the depth up to which coarse rays are near enough to each other to show all there is
     resolved = np.float32(DETAIL) * voxel * min(view.fx, view.fy) / np.float32(stride)
     for y in prange(coarse.shape[0] - 1):
@@ -198,10 +209,12 @@ def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
             u0, u1 = x * stride, min((x + 1) * stride, width - 1)
             near, far = tile_near[v0 // TILE, u0 // TILE], tile_far[v0 // TILE, u0 // TILE]
             z00, z01, z10, z11 = coarse[y, x], coarse[y, x + 1], coarse[y + 1, x], coarse[y + 1, x + 1]
-            nearest, farthest = min(min(z00, z01), min(z10, z11)), max(max(z00, z01), max(z10, z11))
+            nearest, farthest = _first_and_last(z00, z01, z10, z11)
+            all_hit = min(min(z00, z01), min(z10, z11)) > zero
             empty = farthest == zero and far < resolved
-            rise = farthest - nearest
-            smooth = nearest > zero and farthest < resolved and rise < np.float32(ONE_SURFACE) * voxel
+            smooth = all_hit and farthest < resolved and farthest - nearest < rise
+            if farthest > zero and (farthest if all_hit else far) < resolved:
+                near, far = max(near, nearest - rise), min(far, farthest + rise)
             for v in range(v0, v1 + 1 if v1 == height - 1 else v1):
                 # the inverse of depth is linear across the image of a plane
                 b = np.float32(v - v0) / np.float32(max(v1 - v0, 1))

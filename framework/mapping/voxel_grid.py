@@ -179,12 +179,13 @@ def _link_neighbors(grid, block):
 _CHANNEL = np.int32(1023)
 _GREEN = np.int32(10)
 _BLUE = np.int32(20)
+COLORED = np.uint32(1 << 30)  # the bit that tells a colour from none
 
 
 @device
 def pack_color(red, green, blue):
     """A voxel's colour from quarters of a level, 0 to 1020 each: ten bits a channel, so that averages do not stall."""
-    return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE)
+    return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
 
 
 @device

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.mapping.voxel_grid import UNSEEN, device, unpack_color
+from framework.mapping.voxel_grid import COLORED, UNSEEN, device, unpack_color
 
 
 @device
@@ -45,28 +45,28 @@ def voxel_number(i, j, k):
 
 
 @device
-def _stored(grid, block, neighbor, n):
-    """The stored distance of voxel n of a block's neighbor, UNSEEN where there is none."""
+def _of_neighbor(grid, values, block, neighbor, n, missing):
+    """What `values` (B, 512) holds for voxel n of a block's neighbor, `missing` where there is none."""
     there = grid.neighbors[np.uint32(block), np.uint32(neighbor)]
-    return grid.tsdf[np.uint32(there), np.uint32(n)] if there >= 0 else np.int16(UNSEEN)
+    return values[np.uint32(there), np.uint32(n)] if there >= 0 else missing
 
 
 @device
-def corners(grid, block, i, j, k):
-    """The stored distances of the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` holds voxel (i, j, k)."""
+def corners(grid, values, block, i, j, k, missing):
+    """What `values` (B, 512) holds for the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` holds (i, j, k)."""
     x, y, z = i & 7, j & 7, k & 7
     n = (z * 8 + y) * 8 + x
     here = np.uint32(block)
     if max(x, max(y, z)) < 7:
         return (
-            grid.tsdf[here, np.uint32(n)],
-            grid.tsdf[here, np.uint32(n + 1)],
-            grid.tsdf[here, np.uint32(n + 8)],
-            grid.tsdf[here, np.uint32(n + 9)],
-            grid.tsdf[here, np.uint32(n + 64)],
-            grid.tsdf[here, np.uint32(n + 65)],
-            grid.tsdf[here, np.uint32(n + 72)],
-            grid.tsdf[here, np.uint32(n + 73)],
+            values[here, np.uint32(n)],
+            values[here, np.uint32(n + 1)],
+            values[here, np.uint32(n + 8)],
+            values[here, np.uint32(n + 9)],
+            values[here, np.uint32(n + 64)],
+            values[here, np.uint32(n + 65)],
+            values[here, np.uint32(n + 72)],
+            values[here, np.uint32(n + 73)],
         )
     # the carry of each coordinate into the next block is that coordinate's bit of the neighbor's number
     next_x, next_y, next_z = (x + 1) & 7, ((y + 1) & 7) * 8, ((z + 1) & 7) * 64
@@ -74,14 +74,14 @@ def corners(grid, block, i, j, k):
     y *= 8
     z *= 64
     return (
-        grid.tsdf[here, np.uint32(n)],
-        _stored(grid, block, over_x, z + y + next_x),
-        _stored(grid, block, over_y, z + next_y + x),
-        _stored(grid, block, over_y | over_x, z + next_y + next_x),
-        _stored(grid, block, over_z, next_z + y + x),
-        _stored(grid, block, over_z | over_x, next_z + y + next_x),
-        _stored(grid, block, over_z | over_y, next_z + next_y + x),
-        _stored(grid, block, over_z | over_y | over_x, next_z + next_y + next_x),
+        values[here, np.uint32(n)],
+        _of_neighbor(grid, values, block, over_x, z + y + next_x, missing),
+        _of_neighbor(grid, values, block, over_y, z + next_y + x, missing),
+        _of_neighbor(grid, values, block, over_y | over_x, z + next_y + next_x, missing),
+        _of_neighbor(grid, values, block, over_z, next_z + y + x, missing),
+        _of_neighbor(grid, values, block, over_z | over_x, next_z + y + next_x, missing),
+        _of_neighbor(grid, values, block, over_z | over_y, next_z + next_y + x, missing),
+        _of_neighbor(grid, values, block, over_z | over_y | over_x, next_z + next_y + next_x, missing),
     )
 
 
@@ -93,7 +93,7 @@ def trilinear(grid, block, x, y, z):
     """
     i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
     fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    s = corners(grid, block, i, j, k)
+    s = corners(grid, grid.tsdf, block, i, j, k, np.int16(UNSEEN))
     seen = min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
     # along x, then y, then z
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
@@ -110,24 +110,28 @@ def trilinear(grid, block, x, y, z):
 
 
 @device
+def _blend(red, green, blue, total, packed, share):
+    """Adds a packed colour with its share; a voxel without a colour has no say."""
+    share = share if packed & COLORED else np.float32(0.0)
+    r, g, b = unpack_color(packed)
+    return red + share * r, green + share * g, blue + share * b, total + share
+
+
+@device
 def trilinear_color(grid, block, x, y, z):
-    """(red, green, blue) at (x, y, z), in voxels; voxels never seen do not count. `block` as in trilinear()."""
+    """(red, green, blue) at (x, y, z), in voxels, between the voxels that have a colour. `block` as in trilinear()."""
     i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
-    fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    one = np.float32(1.0)
-    red = green = blue = total = np.float32(0.0)
-    for corner in range(8):
-        a, b, c = corner & 1, (corner >> 1) & 1, corner >> 2
-        u, v, w = (i & 7) + a, (j & 7) + b, (k & 7) + c
-        there = grid.neighbors[np.uint32(block), np.uint32((w >> 3) << 2 | (v >> 3) << 1 | u >> 3)]
-        n = np.uint32(voxel_number(u, v, w))
-        if there < 0 or grid.tsdf[np.uint32(there), n] == UNSEEN:
-            continue
-        share = (fx if a else one - fx) * (fy if b else one - fy) * (fz if c else one - fz)
-        channels = unpack_color(grid.color[np.uint32(there), n])
-        red += share * channels[0]
-        green += share * channels[1]
-        blue += share * channels[2]
-        total += share
+    x1, y1, z1 = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+    one, zero = np.float32(1.0), np.float32(0.0)
+    x0, y0, z0 = one - x1, one - y1, one - z1
+    p = corners(grid, grid.color, block, i, j, k, np.uint32(0))
+    r, g, b, total = _blend(zero, zero, zero, zero, p[0], x0 * y0 * z0)
+    r, g, b, total = _blend(r, g, b, total, p[1], x1 * y0 * z0)
+    r, g, b, total = _blend(r, g, b, total, p[2], x0 * y1 * z0)
+    r, g, b, total = _blend(r, g, b, total, p[3], x1 * y1 * z0)
+    r, g, b, total = _blend(r, g, b, total, p[4], x0 * y0 * z1)
+    r, g, b, total = _blend(r, g, b, total, p[5], x1 * y0 * z1)
+    r, g, b, total = _blend(r, g, b, total, p[6], x0 * y1 * z1)
+    r, g, b, total = _blend(r, g, b, total, p[7], x1 * y1 * z1)
     scale = np.float32(0.25) / max(total, np.float32(1e-6))
-    return red * scale, green * scale, blue * scale
+    return r * scale, g * scale, b * scale

@@ -97,7 +97,7 @@ def test_rounding_does_not_wrap_round(frame_number: int) -> None:
 
 def channels(packed: np.ndarray) -> np.ndarray:
     """(N, 3) red, green, blue in levels."""
-    return np.stack([packed & 1023, (packed >> 10) & 1023, packed >> 20], axis=-1) / 4
+    return np.stack([packed & 1023, (packed >> 10) & 1023, (packed >> 20) & 1023], axis=-1) / 4
 
 
 @pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
