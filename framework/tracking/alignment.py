@@ -7,8 +7,8 @@ with normal n_i, and its model intensity. Residuals are divided by their expecte
 standard deviations; w_i and v_i are Tukey's biweights. Gauss-Newton steps are twists of the view's frame: T <- exp(xi)
 T.
 
-An image row is done in passes that hold no branches, so that the compiler vectorises them; a point that does not count
-has weight 0.
+Points are done in batches of a fixed size, in passes that the compiler vectorises: loops without branches over fields
+of one array, and other loops that only fetch from images. A point that does not count has weight 0.
 """
 
 from __future__ import annotations
@@ -24,6 +24,15 @@ from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
 TERMS = 27 + 7  # of a chunk's sums: 21 + 6 of the normal equations, then the counts below
+BATCH = 160  # points; divides the usual widths
+# where the fields of a batch begin: of its points in the frame, in the view, and in the model ...
+DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
+    field * BATCH for field in range(21)
+)
+POINT_FIELDS = 21
+# ... and of its terms
+J0, J1, J2, J3, J4, J5, W, ERROR, WEIGHTED = (field * BATCH for field in range(9))
+TERM_FIELDS = 9
 CLOSE = 0.05  # m, or 3 standard deviations: a reading this far from the model's depth agrees with it
 NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
 
@@ -96,150 +105,186 @@ def _tukey(r, scale):
 
 
 @device
-def _project(depth, v, fx, fy, cx, cy, model, R, t, points, places, pixels):
-    """One row of the frame in the view: points (3, W) m, places (2, W) px, and the model's pixel number (W,).
-
-    The pixel number is -1 where there is no reading or it falls outside the view.
-    """
-    height, width = model.depth.shape
-    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    right, bottom = np.float32(width) - half, np.float32(height) - half
-    y = (np.float32(v) - cy) / fy
-    inv_fx = one / fx
-    for u in range(depth.shape[1]):
-        d = depth[v, u]
-        x = (np.float32(np.int32(u)) - cx) * inv_fx
-        px = d * (R[0, 0] * x + R[0, 1] * y + R[0, 2]) + t[0]
-        py = d * (R[1, 0] * x + R[1, 1] * y + R[1, 2]) + t[1]
-        pz = d * (R[2, 0] * x + R[2, 1] * y + R[2, 2]) + t[2]
-        inv_z = one / max(pz, np.float32(NEAREST))
-        mu = model.fx * px * inv_z + model.cx
-        mv = model.fy * py * inv_z + model.cy
-        inside = (d > zero) & (pz > np.float32(NEAREST)) & (mu > -half) & (mv > -half) & (mu < right) & (mv < bottom)
-        column = np.int32(mu + half) if inside else np.int32(0)
-        line = np.int32(mv + half) if inside else np.int32(0)
-        points[0, u], points[1, u], points[2, u] = px, py, pz
-        places[0, u], places[1, u] = mu, mv
-        pixels[u] = line * np.int32(width) + column if inside else np.int32(-1)
+def _load(depth, intensity, normals, v, u0, points):
+    """A batch of the frame from pixel (u0, v) on into `points`; beyond the end of the row there are no readings."""
+    for n in range(BATCH):
+        u = u0 + n
+        if u < depth.shape[1]:
+            points[DEPTH + n], points[INTENSITY + n] = depth[v, u], intensity[v, u]
+            points[NX + n], points[NY + n], points[NZ + n] = normals[0, v, u], normals[1, v, u], normals[2, v, u]
+        else:
+            points[DEPTH + n] = np.float32(0.0)
 
 
 @device
-def _add_geometry(depth, normals, v, model, flat_depth, flat_normals, R, weights, points, pixels, matched, J, w, r):
-    """The point-to-plane terms of a row into J (6, W), w and r (W,); returns (visible, weighed, close, behind).
+def _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel):
+    """Where a batch of points lies in the view, m and px, and the view's pixel numbers (BATCH,), -1 = none."""
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    width = np.int32(shape[1])
+    right, bottom = np.float32(shape[1]), np.float32(shape[0])
+    y = (np.float32(v) - cy) / fy
+    x0, dx = (np.float32(u0) - cx) / fx, one / fx
+    row_x, row_y, row_z = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
+    R00, R10, R20 = R[0, 0], R[1, 0], R[2, 0]
+    t0, t1, t2 = t[0], t[1], t[2]
+    mfx, mfy, mcx, mcy = model.fx, model.fy, model.cx + half, model.cy + half
+    for n in range(BATCH):
+        d = points[DEPTH + n]
+        x = x0 + np.float32(np.int32(n)) * dx
+        px, py, pz = d * (R00 * x + row_x) + t0, d * (R10 * x + row_y) + t1, d * (R20 * x + row_z) + t2
+        inv_z = one / max(pz, np.float32(NEAREST))
+        u, v_ = mfx * px * inv_z + mcx, mfy * py * inv_z + mcy
+        inside = (d > zero) & (pz > np.float32(NEAREST)) & (u > zero) & (v_ > zero) & (u < right) & (v_ < bottom)
+        number = np.int32(v_) * width + np.int32(u)
+        pixel[n] = number if inside else np.int32(-1)
+        points[PX + n], points[PY + n], points[PZ + n] = px, py, pz
+        points[U + n], points[V + n] = u, v_
 
-    matched (W,) becomes 1 where a point is near enough to its model point, 0 elsewhere.
+
+@device
+def _gather_model(depth, normals, size, pixel, points):
+    """The model's depth and normal at each point's pixel; depth 0 = none."""
+    for n in range(BATCH):
+        i = pixel[n]
+        if i >= 0:
+            points[QZ + n] = depth[np.uint32(i)]
+            points[MX + n] = normals[np.uint32(i)]
+            points[MY + n] = normals[np.uint32(i + size)]
+            points[MZ + n] = normals[np.uint32(i + size + size)]
+        else:
+            points[QZ + n] = np.float32(0.0)
+
+
+@device
+def _add_geometry(model, R, weights, points, J):
+    """The point-to-plane terms of a batch into J; returns (visible, weighed, close, behind).
+
+    points[NEAR] becomes 1 where a point is near enough to its model point, 0 elsewhere.
     """
-    one, zero = np.float32(1.0), np.float32(0.0)
+    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
+    cx, cy = model.cx + half, model.cy + half
+    R00, R01, R02, R10, R11, R12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    R20, R21, R22 = R[2, 0], R[2, 1], R[2, 2]
     max_distance2 = weights.max_distance * weights.max_distance
-    width = np.int32(model.depth.shape[1])
-    size = np.int32(model.depth.size)
+    min_dot, scale, strength = weights.min_normal_dot, weights.geometric_scale, weights.depth_weight
     visible = weighed = close = behind = np.int32(0)
-    for u in range(depth.shape[1]):
-        pixel = max(pixels[u], np.int32(0))
-        q = flat_depth[np.uint32(pixel)] if pixels[u] >= 0 else zero
-        column = pixel % width
-        line = pixel // width
-        qx = (np.float32(column) - model.cx) * inv_fx * q
-        qy = (np.float32(line) - model.cy) * inv_fy * q
-        px, py, pz = points[0, u], points[1, u], points[2, u]
+    for n in range(BATCH):
+        q = points[QZ + n]
+        px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
+        # the model point is the one that the pixel's centre sees
+        qx = (np.floor(points[U + n]) + half - cx) * inv_fx * q
+        qy = (np.floor(points[V + n]) + half - cy) * inv_fy * q
         ex, ey, ez = px - qx, py - qy, pz - q
-        near = (q > zero) & (ex * ex + ey * ey + ez * ez <= max_distance2)
-        nx = flat_normals[np.uint32(pixel)]
-        ny = flat_normals[np.uint32(pixel + size)]
-        nz = flat_normals[np.uint32(pixel + size + size)]
-        fx, fy, fz = normals[0, v, u], normals[1, v, u], normals[2, v, u]
+        mapped = q > zero
+        near = mapped & (ex * ex + ey * ey + ez * ez <= max_distance2)
+        nx, ny, nz = points[MX + n], points[MY + n], points[MZ + n]
+        fx, fy, fz = points[NX + n], points[NY + n], points[NZ + n]
         dot = (
-            nx * (R[0, 0] * fx + R[0, 1] * fy + R[0, 2] * fz)
-            + ny * (R[1, 0] * fx + R[1, 1] * fy + R[1, 2] * fz)
-            + nz * (R[2, 0] * fx + R[2, 1] * fy + R[2, 2] * fz)
+            nx * (R00 * fx + R01 * fy + R02 * fz)
+            + ny * (R10 * fx + R11 * fy + R12 * fz)
+            + nz * (R20 * fx + R21 * fy + R22 * fz)
         )
-        sigma = depth_noise(depth[v, u])
+        sigma = depth_noise(points[DEPTH + n])
         distance = nx * ex + ny * ey + nz * ez
-        weight = _tukey(distance / sigma, weights.geometric_scale) * weights.depth_weight / (sigma * sigma)
-        weight = weight if near & (dot > weights.min_normal_dot) else zero
-        J[0, u], J[1, u], J[2, u] = nx, ny, nz
-        J[3, u], J[4, u], J[5, u] = py * nz - pz * ny, pz * nx - px * nz, px * ny - py * nx
-        w[u] = weight
-        r[u] = distance
-        matched[u] = one if near else zero
-        visible += np.int32(1) if q > zero else np.int32(0)
-        weighed += np.int32(1) if weight > zero else np.int32(0)
+        weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
+        weight = weight if near & (dot > min_dot) else zero
+        weighty = weight > zero
+        points[NEAR + n] = one if near else zero
+        J[W + n] = weight
+        # what has no weight may hold anything, also NaN, from the pixel that it does not have
+        J[ERROR + n] = distance if weighty else zero
+        J[J0 + n] = nx if weighty else zero
+        J[J1 + n] = ny if weighty else zero
+        J[J2 + n] = nz if weighty else zero
+        J[J3 + n] = py * nz - pz * ny if weighty else zero
+        J[J4 + n] = pz * nx - px * nz if weighty else zero
+        J[J5 + n] = px * ny - py * nx if weighty else zero
         apart = max(np.float32(CLOSE), np.float32(3.0) * sigma)
-        close += np.int32(1) if (q > zero) & (abs(ez) < apart) else np.int32(0)
-        behind += np.int32(1) if (q > zero) & (ez > apart + apart) else np.int32(0)
+        visible += np.int32(1) if mapped else np.int32(0)
+        weighed += np.int32(1) if weighty else np.int32(0)
+        close += np.int32(1) if mapped & (abs(ez) < apart) else np.int32(0)
+        behind += np.int32(1) if mapped & (ez > apart + apart) else np.int32(0)
     return visible, weighed, close, behind
 
 
 @device
-def _add_photometry(
-    intensity, v, model, model_intensity, flat, inverse_scale, weights, brightness, points, places, matched, J, w, r
-):
-    """The photometric terms of a row, behind the geometric ones in J (6, 2 W), w and r (2 W,).
+def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
+    """The four intensities of the model around each point, and its place between them; -1 = nothing mapped there."""
+    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    width = np.int32(shape[1])
+    right, bottom = np.float32(shape[1] - 2), np.float32(shape[0] - 2)
+    for n in range(BATCH):
+        # U and V have their origin at the corner of the image
+        u, v = points[U + n] * inverse_scale - half, points[V + n] * inverse_scale - half
+        inside = (points[NEAR + n] > zero) & (u >= one) & (v >= one) & (u < right) & (v < bottom)
+        column, line = np.int32(u), np.int32(v)
+        points[A + n], points[B + n] = u - np.float32(column), v - np.float32(line)
+        pixel[n] = line * width + column if inside else np.int32(-1)
+    for n in range(BATCH):
+        i = pixel[n]
+        if i >= 0:
+            points[I00 + n], points[I10 + n] = intensity[np.uint32(i)], intensity[np.uint32(i + 1)]
+            points[I01 + n], points[I11 + n] = intensity[np.uint32(i + width)], intensity[np.uint32(i + width + 1)]
+        else:
+            points[I00 + n] = -one
 
-    Returns (weighed, sum of frame - model intensity, how many). `inverse_scale` is the width of model_intensity over
-    that of the view, whose pixels `places` are in.
-    """
-    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
-    level_height, level_width = model_intensity.shape
-    right, bottom = np.float32(level_width - 2), np.float32(level_height - 2)
-    row = np.int32(level_width)
-    strength = weights.color_weight / (weights.intensity_noise * weights.intensity_noise)
-    compared = np.int32(0)
-    weighed = np.int32(0)
+
+@device
+def _add_photometry(model, inverse_scale, weights, brightness, points, J):
+    """The photometric terms of a batch into J; returns (weighed, sum of frame - model intensity, how many)."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    noise, scale = weights.intensity_noise, weights.photometric_scale
+    strength = weights.color_weight / (noise * noise)
+    fx, fy = model.fx * inverse_scale, model.fy * inverse_scale
+    compared = weighed = np.int32(0)
     darker = zero
-    width = intensity.shape[1]
-    for u in range(width):
-        lu = (places[0, u] + half) * inverse_scale - half
-        lv = (places[1, u] + half) * inverse_scale - half
-        inside = (matched[u] > zero) & (lu >= one) & (lv >= one) & (lu < right) & (lv < bottom)
-        lu = lu if inside else one
-        lv = lv if inside else one
-        ju, jv = np.int32(lu), np.int32(lv)
-        a, b = lu - np.float32(ju), lv - np.float32(jv)
-        n = jv * row + ju
-        i00, i10 = flat[np.uint32(n)], flat[np.uint32(n + 1)]
-        i01, i11 = flat[np.uint32(n + row)], flat[np.uint32(n + row + 1)]
-        seen = inside & (min(min(i00, i10), min(i01, i11)) >= zero)
+    for n in range(BATCH):
+        a, b = points[A + n], points[B + n]
+        i00, i10, i01, i11 = points[I00 + n], points[I10 + n], points[I01 + n], points[I11 + n]
+        seen = (i00 >= zero) & (i10 >= zero) & (i01 >= zero) & (i11 >= zero)
         du0, du1 = i10 - i00, i11 - i01
         top, low = i00 + a * du0, i01 + a * du1
-        value = top + b * (low - top)
-        change = value - intensity[v, u]
-        px, py, pz = points[0, u], points[1, u], points[2, u]
+        change = top + b * (low - top) - points[INTENSITY + n]
+        px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
         inv_z = one / max(pz, np.float32(NEAREST))
-        gx = (du0 + b * (du1 - du0)) * inverse_scale * model.fx * inv_z
-        gy = (low - top) * inverse_scale * model.fy * inv_z
+        gx = (du0 + b * (du1 - du0)) * fx * inv_z
+        gy = (low - top) * fy * inv_z
         gz = -(gx * px + gy * py) * inv_z
-        residual = change + brightness
-        weight = _tukey(residual / weights.intensity_noise, weights.photometric_scale) * strength
+        error = change + brightness
+        weight = _tukey(error / noise, scale) * strength
         weight = weight if seen else zero
-        J[0, width + u], J[1, width + u], J[2, width + u] = gx, gy, gz
-        J[3, width + u], J[4, width + u], J[5, width + u] = py * gz - pz * gy, pz * gx - px * gz, px * gy - py * gx
-        w[width + u] = weight
-        r[width + u] = residual
+        weighty = weight > zero
+        J[W + n] = weight
+        J[ERROR + n] = error if weighty else zero
+        J[J0 + n] = gx if weighty else zero
+        J[J1 + n] = gy if weighty else zero
+        J[J2 + n] = gz if weighty else zero
+        J[J3 + n] = py * gz - pz * gy if weighty else zero
+        J[J4 + n] = pz * gx - px * gz if weighty else zero
+        J[J5 + n] = px * gy - py * gx if weighty else zero
         compared += np.int32(1) if seen else np.int32(0)
-        weighed += np.int32(1) if weight > zero else np.int32(0)
+        weighed += np.int32(1) if weighty else np.int32(0)
         darker -= change if seen else zero
     return weighed, darker, compared
 
 
 @device
-def _add_row(J, w, r, weighted, total):
-    """Adds the sums of w J^T J (upper triangle) and w J^T r over a row to the total."""
-    size = w.shape[0]
-    n = 0
+def _add_products(J, total):
+    """Adds the sums of w J^T J (upper triangle) and w J^T r over a batch to the total."""
+    place = 0
     for i in range(6):
-        for u in range(size):
-            weighted[u] = w[u] * J[i, u]
+        for n in range(BATCH):
+            J[WEIGHTED + n] = J[W + n] * J[i * BATCH + n]
         for j in range(i, 6):
             product = np.float32(0.0)
-            for u in range(size):
-                product += weighted[u] * J[j, u]
-            total[n] += np.float64(product)
-            n += 1
+            for n in range(BATCH):
+                product += J[WEIGHTED + n] * J[j * BATCH + n]
+            total[place] += np.float64(product)
+            place += 1
         product = np.float32(0.0)
-        for u in range(size):
-            product += weighted[u] * r[u]
+        for n in range(BATCH):
+            product += J[WEIGHTED + n] * J[ERROR + n]
         total[21 + i] += np.float64(product)
 
 
@@ -249,49 +294,35 @@ def _accumulate(
 ):
     """Sums the normal equations over one pyramid level of the frame, by chunks of rows, into sums (CHUNKS, TERMS).
 
-    `R`, `t` are T_view_camera.
+    `R`, `t` are T_view_camera. `inverse_scale` is the width of model_intensity over that of the view.
     """
     height, width = depth.shape
-    terms = 2 * width if weights.color_weight > np.float32(0.0) else width
+    shape, level_shape = model.depth.shape, model_intensity.shape
+    size = np.int32(model.depth.size)
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)
-        points = np.empty((3, width), np.float32)
-        places = np.empty((2, width), np.float32)
-        pixels = np.empty(width, np.int32)
-        matched = np.empty(width, np.float32)
-        J = np.empty((6, terms), np.float32)
-        w, r, weighted = np.empty(terms, np.float32), np.empty(terms, np.float32), np.empty(terms, np.float32)
+        points = np.zeros(POINT_FIELDS * BATCH, np.float32)
+        J = np.empty(TERM_FIELDS * BATCH, np.float32)
+        pixel = np.empty(BATCH, np.int32)
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
-            _project(depth, v, fx, fy, cx, cy, model, R, t, points, places, pixels)
-            visible, weighed, close, behind = _add_geometry(
-                depth, normals, v, model, flat_depth, flat_normals, R, weights, points, pixels, matched, J, w, r
-            )
-            total[27] += visible
-            total[28] += weighed
-            total[29] += close
-            total[30] += behind
-            if terms > width:
-                weighed, darker, compared = _add_photometry(
-                    intensity,
-                    v,
-                    model,
-                    model_intensity,
-                    flat_intensity,
-                    inverse_scale,
-                    weights,
-                    brightness,
-                    points,
-                    places,
-                    matched,
-                    J,
-                    w,
-                    r,
-                )
-                total[31] += weighed
-                total[32] += np.float64(darker)
-                total[33] += compared
-            _add_row(J, w, r, weighted, total)
+            for u0 in range(0, width, BATCH):
+                _load(depth, intensity, normals, v, u0, points)
+                _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel)
+                _gather_model(flat_depth, flat_normals, size, pixel, points)
+                visible, weighed, close, behind = _add_geometry(model, R, weights, points, J)
+                _add_products(J, total)
+                total[27] += visible
+                total[28] += weighed
+                total[29] += close
+                total[30] += behind
+                if weights.color_weight > np.float32(0.0):
+                    _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
+                    weighed, darker, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
+                    _add_products(J, total)
+                    total[31] += weighed
+                    total[32] += np.float64(darker)
+                    total[33] += compared
         sums[chunk] = total
 
 
