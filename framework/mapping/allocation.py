@@ -149,8 +149,8 @@ def _number_blocks(grid, coords, region_count, depth, camera, sensor, stamp, fra
             continue
         for child in range(REGION_BLOCKS):
             block = grid.region_blocks[region, child]
-            if block < 0 or stamp[block] == frame:
-                continue
+            if block < 0 or not grid.solid[block] or stamp[block] == frame:
+                continue  # where nothing is behind a surface, there is no surface to be carved
             x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
             y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
             z = (np.float32(grid.block_coords[block, 2]) + half) * block_size

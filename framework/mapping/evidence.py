@@ -213,15 +213,16 @@ class EvidenceRows:
         self.row_count = 0
         self.evicted = 0  # slots given to another label so far
         self.evidence = Evidence(
-            instance_ids=np.zeros((64, BLOCK_VOXELS, SLOTS), np.int32),
-            instance_log=np.zeros((64, BLOCK_VOXELS, SLOTS), np.float32),
-            class_ids=np.full((64, BLOCK_VOXELS, SLOTS), -1, np.int16),
-            class_log=np.zeros((64, BLOCK_VOXELS, SLOTS), np.float32),
+            instance_ids=np.empty((64, BLOCK_VOXELS, SLOTS), np.int32),
+            instance_log=np.empty((64, BLOCK_VOXELS, SLOTS), np.float32),
+            class_ids=np.empty((64, BLOCK_VOXELS, SLOTS), np.int16),
+            class_log=np.empty((64, BLOCK_VOXELS, SLOTS), np.float32),
         )
 
     @property
     def byte_count(self) -> int:
-        return sum(array.nbytes for array in self.evidence)
+        """Of the rows in use."""
+        return sum(array[: self.row_count].nbytes for array in self.evidence)
 
     def update(self, active: Int32, near_pixel: Int32, measurement: Measurement) -> None:
         """Updates the voxels near the measured surface: `active` (A,) and `near_pixel` (A, 512) of
@@ -250,10 +251,15 @@ class EvidenceRows:
         if needed > len(self.evidence.instance_ids):
             capacity = max(needed, 2 * len(self.evidence.instance_ids))
             self.evidence = Evidence(
-                instance_ids=grown(self.evidence.instance_ids, capacity, 0),
-                instance_log=grown(self.evidence.instance_log, capacity, 0),
-                class_ids=grown(self.evidence.class_ids, capacity, -1),
-                class_log=grown(self.evidence.class_log, capacity, 0),
+                instance_ids=grown(self.evidence.instance_ids, capacity),
+                instance_log=grown(self.evidence.instance_log, capacity),
+                class_ids=grown(self.evidence.class_ids, capacity),
+                class_log=grown(self.evidence.class_log, capacity),
             )
+        new = slice(self.row_count, needed)
+        self.evidence.instance_ids[new] = 0
+        self.evidence.instance_log[new] = 0
+        self.evidence.class_ids[new] = -1
+        self.evidence.class_log[new] = 0
         self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
         self.row_count = needed

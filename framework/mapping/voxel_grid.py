@@ -147,6 +147,7 @@ def insert_blocks(grid, coords, start, region_count, block_count):
             grid.region_coords[region, 0] = bx >> 3
             grid.region_coords[region, 1] = by >> 3
             grid.region_coords[region, 2] = bz >> 3
+            grid.region_blocks[region] = -1
         child = child_number(bx, by, bz)
         if grid.region_blocks[region, child] < 0:
             if block_count == grid.block_coords.shape[0]:
@@ -155,6 +156,11 @@ def insert_blocks(grid, coords, start, region_count, block_count):
             grid.block_coords[block_count, 0] = bx
             grid.block_coords[block_count, 1] = by
             grid.block_coords[block_count, 2] = bz
+            grid.tsdf[block_count] = UNSEEN
+            grid.weight[block_count] = 0
+            grid.color[block_count] = 0
+            grid.solid[block_count] = 0
+            grid.label_row[block_count] = -1
             _link_neighbors(grid, block_count)
             block_count += 1
     return coords.shape[0], region_count, block_count
@@ -241,20 +247,37 @@ class VoxelGrid:
             tsdf_unit=np.float32(max_truncation / TSDF_MAX),
             table_keys=np.full(256, NO_KEY, np.int64),
             table_regions=np.full(256, -1, np.int32),
-            region_coords=np.zeros((64, 3), np.int32),
-            region_blocks=np.full((64, REGION_BLOCKS), -1, np.int32),
-            block_coords=np.zeros((first, 3), np.int32),
-            neighbors=np.full((first, 8), -1, np.int32),
-            tsdf=np.full((first, BLOCK_VOXELS), UNSEEN, np.int16),
-            weight=np.zeros((first, BLOCK_VOXELS), np.uint16),
-            color=np.zeros((first, BLOCK_VOXELS), np.uint32),
-            solid=np.zeros(first, np.uint8),
-            label_row=np.full(first, -1, np.int32),
+            region_coords=np.empty((64, 3), np.int32),
+            region_blocks=np.empty((64, REGION_BLOCKS), np.int32),
+            block_coords=np.empty((first, 3), np.int32),
+            neighbors=np.empty((first, 8), np.int32),
+            tsdf=np.empty((first, BLOCK_VOXELS), np.int16),
+            weight=np.empty((first, BLOCK_VOXELS), np.uint16),
+            color=np.empty((first, BLOCK_VOXELS), np.uint32),
+            solid=np.empty(first, np.uint8),
+            label_row=np.empty(first, np.int32),
         )
 
     @property
     def byte_count(self) -> int:
-        return sum(array.nbytes for array in self.grid[2:])
+        """Of what is in use: capacity that no block has been given yet takes no memory."""
+        grid = self.grid
+        table = (grid.table_keys, grid.table_regions)
+        regions = (grid.region_coords, grid.region_blocks)
+        blocks = (
+            grid.block_coords,
+            grid.neighbors,
+            grid.tsdf,
+            grid.weight,
+            grid.color,
+            grid.solid,
+            grid.label_row,
+        )
+        return (
+            sum(array.nbytes for array in table)
+            + sum(array[: self.region_count].nbytes for array in regions)
+            + sum(array[: self.block_count].nbytes for array in blocks)
+        )
 
     def allocate(self, coords: Int32) -> None:
         """Makes sure that the blocks at `coords` (N, 3) exist, numbering new ones in the order given.
@@ -281,18 +304,18 @@ class VoxelGrid:
         if self.block_count == len(grid.block_coords):
             more = min(2 * len(grid.block_coords), self.max_blocks)
             grid = grid._replace(
-                block_coords=grown(grid.block_coords, more, 0),
-                neighbors=grown(grid.neighbors, more, -1),
-                tsdf=grown(grid.tsdf, more, UNSEEN),
-                weight=grown(grid.weight, more, 0),
-                color=grown(grid.color, more, 0),
-                solid=grown(grid.solid, more, 0),
-                label_row=grown(grid.label_row, more, -1),
+                block_coords=grown(grid.block_coords, more),
+                neighbors=grown(grid.neighbors, more),
+                tsdf=grown(grid.tsdf, more),
+                weight=grown(grid.weight, more),
+                color=grown(grid.color, more),
+                solid=grown(grid.solid, more),
+                label_row=grown(grid.label_row, more),
             )
         if self.region_count == len(grid.region_blocks):
             grid = grid._replace(
-                region_coords=grown(grid.region_coords, 2 * self.region_count, 0),
-                region_blocks=grown(grid.region_blocks, 2 * self.region_count, -1),
+                region_coords=grown(grid.region_coords, 2 * self.region_count),
+                region_blocks=grown(grid.region_blocks, 2 * self.region_count),
             )
         if 2 * (self.region_count + 1) > len(grid.table_keys):
             keys = np.full(2 * len(grid.table_keys), NO_KEY, np.int64)
@@ -302,8 +325,13 @@ class VoxelGrid:
         self.grid = grid
 
 
-def grown(array: npt.NDArray[Element], length: int, fill: int) -> npt.NDArray[Element]:
-    """A copy of `array` with its first axis made `length` long, the new part filled with `fill`."""
-    longer = np.full((length, *array.shape[1:]), fill, array.dtype)
+def grown(array: npt.NDArray[Element], length: int, fill: int | None = None) -> npt.NDArray[Element]:
+    """A copy of `array` with its first axis made `length` long, the new part filled with `fill`.
+
+    Without `fill` the new part holds anything, and costs no memory before it is written.
+    """
+    longer = np.empty((length, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
+    if fill is not None:
+        longer[len(array) :] = fill
     return longer

@@ -138,8 +138,9 @@ class BayesianTsdf(MapFuser):
             (instance_ids == 0)
             & (clusters.scores >= self.create_score)
             & (overlaps.sizes >= self.create_points)
-            & ~cover_another(clusters, points, self.duplicate_overlap)
         )
+        if may_create.any():
+            may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
         for k in np.flatnonzero(may_create):
             instance_ids[k] = self.scene.table.create(len(clusters.classes), frame.index).id
         return instance_ids
