@@ -21,7 +21,7 @@ from framework.data import Camera, Float32, Float64, SurfaceView, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.frustum import bounds, extent
-from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
+from framework.mapping.sensor import Sensor, depth_noise, pinhole, ray_direction, seen_point
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     REGION_BLOCKS,
@@ -239,11 +239,12 @@ def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def cast_near(grid, view, tile_near, tile_far, readings, depth, normals):
-    """Like cast_fine(), with the search begun at the camera's own readings (H, W) m; nothing where there is none, nor
-    where the map's surface is more than MAX_SHIFT behind the reading.
+def cast_near(grid, view, tile_near, tile_far, max_depth, readings, depth, normals):
+    """Like cast_fine(), with the search begun at the camera's own readings (H, W) m; nothing where there is none, where
+    it is beyond what the map holds, nor where the map's surface is more than MAX_SHIFT behind it.
 
-    A wrong pose displaces all readings of a surface alike, so each pixel begins where its neighbor was put right.
+    Readings are noisy and a wrong pose displaces them. So where a reading fits the surface that the two pixels before
+    it have shown, the search begins there, and else where the last reading was displaced to.
     """
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
@@ -253,17 +254,26 @@ def cast_near(grid, view, tile_near, tile_far, readings, depth, normals):
         key = np.int64(-2)
         region = np.int32(-1)
         shift = zero
+        last = last_but_one = zero  # inverse depths of the pixels before, 0 = no surface
         for u in range(depth.shape[1]):
             z = nx = ny = nz = zero
-            if readings[v, u] > zero:
+            reading = readings[v, u]
+            if zero < reading < max_depth + np.float32(MAX_SHIFT) * voxel:
                 d, step = _ray(view, scale, u, v)
-                z, nx, ny, nz, key, region = _refined(grid, o, d, step, readings[v, u] + shift, key, region)
+                start = reading + shift
+                if last_but_one > zero and last > zero:
+                    ahead = one / max(last + last - last_but_one, np.float32(1e-3))
+                    if abs(ahead - start) < np.float32(REACH) * voxel + np.float32(3.0) * depth_noise(reading):
+                        start = ahead
+                z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, key, region)
                 if z == zero:
                     near = tile_near[v // TILE, u // TILE]
-                    far = min(tile_far[v // TILE, u // TILE], readings[v, u] + np.float32(MAX_SHIFT) * voxel)
+                    far = min(tile_far[v // TILE, u // TILE], reading + np.float32(MAX_SHIFT) * voxel)
                     z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near, far, key, region)
-                apart = z - readings[v, u]
+                apart = z - reading
                 shift = apart if z > zero and abs(apart) < np.float32(MAX_SHIFT) * voxel else zero
+            last_but_one = last
+            last = one / z if z > zero else zero
             norm = np.sqrt(nx * nx + ny * ny + nz * nz)
             norm = one / norm if z > zero else zero
             depth[v, u] = z
@@ -379,7 +389,7 @@ def render_near(
     view = pinhole(camera, T_world_camera)
     depth = np.empty(camera.shape, np.float32)
     normals = np.empty((*camera.shape, 3), np.float32)
-    cast_near(voxels.grid, view, tile_near, tile_far, readings, depth, normals)
+    cast_near(voxels.grid, view, tile_near, tile_far, sensor.max_depth, readings, depth, normals)
     color = np.empty((*camera.shape, 3), np.uint8)
     paint(voxels.grid, view, depth, color)
     return SurfaceView(camera, T_world_camera, depth, normals, color)

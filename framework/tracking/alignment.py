@@ -19,6 +19,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, SurfaceView
+from framework.mapping.sensor import depth_noise
 from framework.mapping.voxel_grid import device
 from framework.tracking.pyramid import PyramidLevel
 
@@ -88,12 +89,6 @@ class NormalEquations(NamedTuple):
     close: int  # of the visible, points whose depth in the view agrees with the model's
     behind: int  # of the visible, points so far behind the model that they could not be seen through it
     brightness: float  # mean of frame - model intensity: the change of exposure
-
-
-@device
-def depth_noise(z):
-    """Standard deviation (m) of a structured-light reading at depth z (m): Nguyen et al. 2012, eq. 3 (axial noise)."""
-    return np.float32(0.0012) + np.float32(0.0019) * (z - np.float32(0.4)) * (z - np.float32(0.4))
 
 
 @device

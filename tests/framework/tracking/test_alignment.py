@@ -7,7 +7,8 @@ import pytest
 
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
-from framework.tracking.alignment import ModelView, NormalEquations, Weights, depth_noise, linearise
+from framework.mapping.sensor import depth_noise
+from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearise
 from framework.tracking.pyramid import build_pyramid, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
 from tests.analytic_scene import CAMERA, Scene, pose
