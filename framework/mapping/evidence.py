@@ -21,6 +21,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32
+from framework.mapping.integration import SeenBlocks
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
 SLOTS = 4  # instances and classes that a voxel can tell apart
@@ -160,13 +161,14 @@ def update_voxel(evidence, row, n, measurement, point):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _find_blocks_under_clusters(grid, active, near_pixel, measurement, first_point, wants_row):
+def _find_blocks_under_clusters(grid, seen, measurement, first_point, wants_row):
     """Notes in wants_row (A,) the blocks without a row that have a voxel under some cluster with an instance."""
-    for a in prange(active.shape[0]):
+    for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
-        if grid.label_row[active[a]] < 0:
+        if seen.near[a] and grid.label_row[seen.blocks[a]] < 0:
             for n in range(BLOCK_VOXELS):
-                p = first_point[near_pixel[a, n]] if near_pixel[a, n] >= 0 else np.int32(-1)
+                pixel = seen.near_pixel[a, n]
+                p = first_point[pixel] if pixel >= 0 else np.int32(-1)
                 while p >= 0 and measurement.instance_id[measurement.cluster[p]] == 0:
                     p = measurement.next_point[p]
                 if p >= 0:
@@ -175,15 +177,16 @@ def _find_blocks_under_clusters(grid, active, near_pixel, measurement, first_poi
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _update(grid, active, near_pixel, evidence, measurement, first_point, evicted):
-    """Updates the near voxels of the active blocks that have a row; evicted (A,) counts slots given away."""
-    for a in prange(active.shape[0]):
+def _update(grid, seen, evidence, measurement, first_point, evicted):
+    """Updates the near voxels of the seen blocks that have a row; evicted (A,) counts slots given away."""
+    for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
-        row = grid.label_row[active[a]]
-        if row >= 0:
+        row = grid.label_row[seen.blocks[a]]
+        if seen.near[a] and row >= 0:
             for n in range(BLOCK_VOXELS):
-                if near_pixel[a, n] >= 0:
-                    evicted[a] += update_voxel(evidence, row, n, measurement, first_point[near_pixel[a, n]])
+                pixel = seen.near_pixel[a, n]
+                if pixel >= 0:
+                    evicted[a] += update_voxel(evidence, row, n, measurement, first_point[pixel])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -224,18 +227,16 @@ class EvidenceRows:
         """Of the rows in use."""
         return sum(array[: self.row_count].nbytes for array in self.evidence)
 
-    def update(self, active: Int32, near_pixel: Int32, measurement: Measurement) -> None:
-        """Updates the voxels near the measured surface: `active` (A,) and `near_pixel` (A, 512) of
-        Integrator.integrate.
-        """
+    def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
+        """Updates the voxels near the measured surface of the blocks that a frame has seen."""
         if not measurement.instance_id.any():
             return  # the frame says nothing, neither for an instance nor against one
         first_point = measurement.first_point.ravel()
-        wants_row = np.empty(len(active), np.bool_)
-        evicted = np.empty(len(active), np.int32)
-        _find_blocks_under_clusters(self.voxels.grid, active, near_pixel, measurement, first_point, wants_row)
-        self._add_rows(active[wants_row])
-        _update(self.voxels.grid, active, near_pixel, self.evidence, measurement, first_point, evicted)
+        wants_row = np.empty(len(seen.blocks), np.bool_)
+        evicted = np.empty(len(seen.blocks), np.int32)
+        _find_blocks_under_clusters(self.voxels.grid, seen, measurement, first_point, wants_row)
+        self._add_rows(seen.blocks[wants_row])
+        _update(self.voxels.grid, seen, self.evidence, measurement, first_point, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:

@@ -6,11 +6,13 @@ distance widens with depth as the sensor's noise does, and the weight of an obse
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import cv2
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Float64, Frame, Int32
+from framework.data import Bool, Float64, Frame, Int32
 from framework.geometry import inverse
 from framework.mapping.allocation import Allocator
 from framework.mapping.sensor import Sensor, pinhole
@@ -27,6 +29,7 @@ from framework.mapping.voxel_grid import (
 )
 
 FAR = 1e9  # m
+COLOR_BAND = 3.0  # voxels: colour is kept this near to the surface, where somebody may look
 LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
 
@@ -68,8 +71,10 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
 
 
 @device
-def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, scratch):
+def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
     """The running average of the distances and weights (512,) of a block.
+
+    Returns how many voxels get a colour, and how many are within near_band m of the measured surface.
 
     scratch[512:] holds each voxel's reading (m) and gets the new observation's share in the average of the colour, 0
     where there is none; scratch[:512] holds the depth (m) and gets the distance to the measured surface, m.
@@ -79,6 +84,8 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, scratch)
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
     most, least = np.float32(TSDF_MAX), np.float32(LEAST_BEHIND)
+    color_band = np.float32(COLOR_BAND) * voxel
+    colored = near = np.int32(0)
     for n in range(BLOCK_VOXELS):
         d = scratch[n + BLOCK_VOXELS]
         band = sensor.truncation + sensor.truncation_slope * d
@@ -98,7 +105,11 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, scratch)
         weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
         scratch[n] = sdf if seen else np.float32(FAR)
         # colour belongs to the surface, not to the air before it
-        scratch[n + BLOCK_VOXELS] = portion if sdf < band else zero
+        at_surface = seen & (abs(sdf) < min(band, color_band))
+        scratch[n + BLOCK_VOXELS] = portion if at_surface else zero
+        colored += np.int32(1) if at_surface else np.int32(0)
+        near += np.int32(1) if seen & (abs(sdf) <= near_band) else np.int32(0)
+    return colored, near
 
 
 @device
@@ -120,12 +131,13 @@ def _average_colors(packed, seen, rounding, scratch):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_pixel):
+def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near, near_pixel):
     """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
 
     `color` (H, W) holds a pixel's RGBA in its bytes, `camera` T_camera_world. `rounding` in [0, 1) is added before
-    values are truncated to integers. near_pixel (A, 512) gets the number of the pixel that sees each voxel within
-    near_band m of the measured surface, -1 for the others.
+    values are truncated to integers. near (A,) tells whether a block has voxels within near_band m of the measured
+    surface, and near_pixel (A, 512) gets, for such blocks, the number of the pixel that sees each such voxel, -1 for
+    the others.
 
     A block is done in passes over its 512 voxels that the compiler vectorises: they hold no branches, read images only
     in loops of their own, and share one scratch array, so that few arrays have to be proved not to overlap.
@@ -137,20 +149,34 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
     to_units = np.float32(1.0) / grid.tsdf_unit
     for a in prange(active.shape[0]):
         block = active[a]
-        tsdf, weight, packed, near = grid.tsdf[block], grid.weight[block], grid.color[block], near_pixel[a]
+        tsdf, weight, packed = grid.tsdf[block], grid.weight[block], grid.color[block]
         pixel = np.empty(BLOCK_VOXELS, np.int32)
-        seen = np.empty(BLOCK_VOXELS, np.uint32)
         scratch = np.empty(2 * BLOCK_VOXELS, np.float32)
         _project_voxels(grid, block, camera, sensor.min_depth, shape, pixel, scratch)
         for n in range(BLOCK_VOXELS):
             scratch[n + BLOCK_VOXELS] = depth[np.uint32(pixel[n])]
-        for n in range(BLOCK_VOXELS):
-            seen[n] = color[np.uint32(pixel[n])]
-        _average_distances(tsdf, weight, grid.voxel_size, to_units, sensor, rounding, scratch)
-        _average_colors(packed, seen, rounding, scratch)
-        for n in range(BLOCK_VOXELS):
-            near[n] = pixel[n] if abs(scratch[n]) <= near_band else np.int32(-1)
+        colored_voxels, near_voxels = _average_distances(
+            tsdf, weight, grid.voxel_size, to_units, sensor, rounding, near_band, scratch
+        )
         solid[block] = is_solid(tsdf)
+        if colored_voxels > 0:
+            seen = np.empty(BLOCK_VOXELS, np.uint32)
+            for n in range(BLOCK_VOXELS):
+                seen[n] = color[np.uint32(pixel[n])]
+            _average_colors(packed, seen, rounding, scratch)
+        near[a] = near_voxels > 0
+        if near_voxels > 0:
+            here = near_pixel[a]
+            for n in range(BLOCK_VOXELS):
+                here[n] = pixel[n] if abs(scratch[n]) <= near_band else np.int32(-1)
+
+
+class SeenBlocks(NamedTuple):
+    """The A blocks that a frame has updated; valid until the next frame."""
+
+    blocks: Int32  # (A,) their numbers
+    near: Bool  # (A,) whether a voxel lies near the measured surface
+    near_pixel: Int32  # (A, 512) where one does: the number v * width + u of the pixel that sees it, -1 for the others
 
 
 class Integrator:
@@ -163,12 +189,8 @@ class Integrator:
         self._allocator = Allocator(voxels, sensor)
         self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
 
-    def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> tuple[Int32, Int32]:
-        """Integrates one frame.
-
-        Returns the numbers of the blocks it saw, (A,), and for each of their voxels within near_band m of the measured
-        surface the number v * width + u of the pixel that sees it, -1 for the others, (A, 512); valid until the next
-        call.
+    def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
+        """Integrates one frame and tells what it saw within near_band m of the measured surface.
 
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
@@ -178,7 +200,7 @@ class Integrator:
         view = pinhole(frame.camera, inverse(T_world_camera))
         if len(self._near_pixel) < len(active):
             self._near_pixel = np.empty((2 * len(active), BLOCK_VOXELS), np.int32)
-        near_pixel = self._near_pixel[: len(active)]
+        seen = SeenBlocks(active, np.empty(len(active), np.bool_), self._near_pixel[: len(active)])
         _integrate(
             self.voxels.grid,
             active,
@@ -188,6 +210,7 @@ class Integrator:
             self.sensor,
             rounding,
             np.float32(near_band),
-            near_pixel,
+            seen.near,
+            seen.near_pixel,
         )
-        return active, near_pixel
+        return seen

@@ -106,11 +106,11 @@ class BayesianTsdf(MapFuser):
         overlaps = self._look_up(frame, pose, clusters)
         instance_ids = self._associate(overlaps, clusters, points, frame)
         band = self.label_band * self.voxel_size
-        active, near_pixel = self._integrator.integrate(frame, pose.T_world_camera, band)
+        seen = self._integrator.integrate(frame, pose.T_world_camera, band)
         self._observe(overlaps, clusters, instance_ids, frame)
-        self.scene.labels.update(active, near_pixel, self._measurement(clusters, points, instance_ids))
+        self.scene.labels.update(seen, self._measurement(clusters, points, instance_ids))
         self._merge_instances(overlaps, instance_ids)
-        self.scene.changed(active)
+        self.scene.changed(seen.blocks)
 
     def _agree_on_classes(self, classes: tuple[str, ...]) -> None:
         """The first frame's label space becomes the map's."""
@@ -135,9 +135,7 @@ class BayesianTsdf(MapFuser):
         match = match_one_to_one(overlaps.over_smaller(self.create_points), self.overlap)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (
-            (instance_ids == 0)
-            & (clusters.scores >= self.create_score)
-            & (overlaps.sizes >= self.create_points)
+            (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         )
         if may_create.any():
             may_create &= ~cover_another(clusters, points, self.duplicate_overlap)

@@ -19,11 +19,17 @@ def new_integrator() -> Integrator:
     return Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), SENSOR)
 
 
+def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The blocks that a frame has updated, and the pixels that see their voxels near the surface, -1 for the others."""
+    seen = integrator.integrate(frame, T_world_camera, VOXEL)
+    return seen.blocks, np.where(seen.near[:, None], seen.near_pixel, -1)
+
+
 def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     """Every voxel of the active blocks, in double precision and plain numpy."""
     frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
     integrator = new_integrator()
-    active, near_pixel = integrator.integrate(frame, frame.T_world_camera, VOXEL)
+    active, near_pixel = seen_by(integrator, frame, frame.T_world_camera)
     grid = integrator.voxels.grid
     i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
     offsets = np.stack([i, j, k], axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
@@ -87,7 +93,7 @@ def test_rounding_does_not_wrap_round(frame_number: int) -> None:
     integrator = Integrator(VoxelGrid(VOXEL, 0.08, 100_000), SENSOR._replace(truncation_slope=np.float32(0.0)))
     for number in (1, frame_number):
         integrator.frames = number - 1
-        active, near = integrator.integrate(frame, np.eye(4), VOXEL)
+        active, near = seen_by(integrator, frame, np.eye(4))
     grid = integrator.voxels.grid
     seen = grid.weight[active] > 0
     assert (grid.tsdf[active][seen] != UNSEEN).all()
@@ -113,7 +119,7 @@ def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
     frame.color[:] = (10, 200, 90)
     sensor = SENSOR._replace(truncation_slope=np.float32(0.0))
     integrator = Integrator(VoxelGrid(VOXEL, sensor.max_truncation, 100_000), sensor)
-    active, near = integrator.integrate(frame, np.eye(4), VOXEL)
+    active, near = seen_by(integrator, frame, np.eye(4))
     grid = integrator.voxels.grid
     assert np.abs(channels(grid.color[active][near >= 0]) - (10, 200, 90)).max() <= 0.25
     air = grid.tsdf[active] == TSDF_MAX
