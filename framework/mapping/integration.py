@@ -85,6 +85,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
     max_weight = sensor.max_weight * weight_one
     most, least = np.float32(TSDF_MAX), np.float32(LEAST_BEHIND)
     color_band = np.float32(COLOR_BAND) * voxel
+    ramp = one / max(sensor.truncation - voxel, np.float32(0.5) * voxel)
     colored = near = np.int32(0)
     for n in range(BLOCK_VOXELS):
         d = scratch[n + BLOCK_VOXELS]
@@ -92,7 +93,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
         # behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind
-        behind = max(least, min((band + sdf) / max(band - voxel, np.float32(1e-6)), one))
+        behind = max(least, min((band + sdf) * ramp, one))
         w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])
         portion = w_new / (w_old + w_new) if seen else zero
