@@ -37,10 +37,9 @@ TILE = 8  # px; one tile's rays share blocks in the cache
 REFINEMENTS = 4  # Newton steps at most: one meets a plane, two or three a curved surface
 CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter than this ends within some hundredths
 REACH = 3.0  # voxels, from where a refinement may start to the surface that it finds
-DETAIL = 3.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
+DETAIL = 4.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
 ONE_SURFACE = 8.0  # voxels of depth that a surface may rise between coarse rays
 MAX_SHIFT = 10.0  # voxels between a reading and the map's surface that may still be one surface seen from elsewhere
-TYPICAL_DEPTH = 2.0  # m, for the choice of the distance between coarse rays
 MAX_STRIDE = 8  # px between coarse rays
 
 
@@ -353,7 +352,7 @@ def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera:
     """(depth (H, W) m, normals (H, W, 3) world) of the surface that `camera` sees; depth 0 where there is none."""
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
-    stride = _stride(camera, float(voxels.grid.voxel_size))
+    stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
     rays_y, rays_x = ((side + stride - 1) // stride + 1 for side in camera.shape)
     coarse = np.empty((rays_y, rays_x), np.float32)
     cast_coarse(voxels.grid, view, tile_near, tile_far, stride, camera.shape, coarse)
@@ -363,9 +362,9 @@ def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera:
     return depth, normals
 
 
-def _stride(camera: Camera, voxel_size: float) -> int:
-    """The pixels between coarse rays, a power of 2: so many that details of the map at a typical depth are resolved."""
-    resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / TYPICAL_DEPTH
+def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
+    """The pixels between coarse rays, a power of 2: so many that details of the map are resolved at any depth."""
+    resolved = DETAIL * voxel_size * min(camera.fx, camera.fy) / max_depth
     return 1 << int(np.log2(min(max(resolved, 1.0), MAX_STRIDE)))
 
 
