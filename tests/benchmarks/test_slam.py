@@ -83,7 +83,7 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
         ],
         [
             f"Frames {FIRST} to {LAST - 1} of {LAST}, {TURN} each in turns in one process; lost: {duel.ours.lost}. "
-            f"Open3D without labels, ours with {np.mean([len(d) for d in recording.detections]):.1f} detections a frame.",
+            f"Open3D without labels, ours with {np.mean([len(d) for d in recording.detections]):.1f} masks a frame.",
             "The last column is the ratio of the 10th percentiles, which a busy machine disturbs less than medians.",
             f"The whole loop leaves out lifting the masks to points, {ms(duel.lifting())} ms of ours; detection and "
             "refinement are other stages.",
