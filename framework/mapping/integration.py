@@ -29,7 +29,6 @@ from framework.mapping.voxel_grid import (
 )
 
 FAR = 1e9  # m
-COLOR_BAND = 3.0  # voxels: colour is kept this near to the surface, where somebody may look
 LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
 
@@ -84,7 +83,6 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
     weight_one = np.float32(WEIGHT_ONE)
     max_weight = sensor.max_weight * weight_one
     most, least = np.float32(TSDF_MAX), np.float32(LEAST_BEHIND)
-    color_band = np.float32(COLOR_BAND) * voxel
     ramp = one / max(sensor.truncation - voxel, np.float32(0.5) * voxel)
     colored = near = np.int32(0)
     for n in range(BLOCK_VOXELS):
@@ -106,7 +104,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
         scratch[n] = sdf if seen else np.float32(FAR)
         # colour belongs to the surface, not to the air before it
-        at_surface = seen & (abs(sdf) < min(band, color_band))
+        at_surface = seen & (sdf < band)
         scratch[n + BLOCK_VOXELS] = portion if at_surface else zero
         colored += np.int32(1) if at_surface else np.int32(0)
         near += np.int32(1) if seen & (abs(sdf) <= near_band) else np.int32(0)
