@@ -19,13 +19,16 @@ from typing import Any
 
 from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
-from omegaconf import DictConfig, OmegaConf
+from hydra.errors import HydraException
+from hydra.types import RunMode
+from omegaconf import OmegaConf
 
 from framework.build import STAGES, find_class
-from framework.command_line import CONF, one_line_errors
+from framework.command_line import CONF, one_line, one_line_errors
 from framework.errors import ConfigError
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
+_HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 
 @dataclass(frozen=True)
@@ -46,7 +49,7 @@ class Option:
     name: str
     target: str
     provider: str  # who put it on Hydra's search path: main, or the third-party package
-    documentation: str  # the class's first line; why it cannot be used, where it cannot
+    documentation: str  # the class's first line, and what an option that inherits changes; why it cannot be used, if so
     parameters: tuple[Parameter, ...]
 
 
@@ -54,21 +57,25 @@ def registered(stage: str) -> Iterator[Option]:
     """The options of a config group, by name."""
     with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
-        names = loader.get_group_options(stage)
-        found = [(name, loader.repository.load_config(f"{stage}/{name}")) for name in names]  # type: ignore[attr-defined]
-    for name, result in found:
-        yield _option(stage, name, result.provider, result.config, _text(result.path, f"{stage}/{name}.yaml"))
+        found = [_option(loader, stage, name) for name in loader.get_group_options(stage)]
+    yield from found
 
 
-def _option(stage: str, name: str, provider: str, node: DictConfig, text: str) -> Option:
-    target = str(node.get("_target_"))
+def _option(loader: Any, stage: str, name: str) -> Option:
+    own = loader.repository.load_config(f"{stage}/{name}")
+    target = str(own.config.get("_target_"))
     try:
+        defaults = loader.compute_defaults_list(f"{stage}/{name}", [], RunMode.RUN).defaults
+        inherited = {entry.config_path: entry.package for entry in defaults}  # in order, and the option's own file
+        files = {path: loader.repository.load_config(path) for path, package in inherited.items() if package == stage}
+        given = OmegaConf.to_container(OmegaConf.merge(*(file.config for file in files.values())), resolve=False)
+        assert isinstance(given, dict)
+        target = str(given.get("_target_"))
         plugin_class = find_class(STAGES[stage], target)
-    except ConfigError as error:
-        return Option(stage, name, target, provider, f"cannot be used: {error}", ())
-    comments = {match["key"]: match["comment"] for match in _COMMENTED_KEY.finditer(text)}
-    given = OmegaConf.to_container(node, resolve=False)
-    assert isinstance(given, dict)
+    except (ConfigError, HydraException) as error:
+        return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
+    texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
+    comments = {match["key"]: match["comment"] for text in texts for match in _COMMENTED_KEY.finditer(text)}
     parameters = tuple(
         Parameter(
             name=field.name,
@@ -80,7 +87,10 @@ def _option(stage: str, name: str, provider: str, node: DictConfig, text: str) -
         if field.init
     )
     documentation = (inspect.getdoc(plugin_class) or "").partition("\n\n")[0].replace("\n", " ")
-    return Option(stage, name, target, provider, documentation, parameters)
+    change = _HEAD.match(_text(own.path, f"{stage}/{name}.yaml"))
+    if change and len(files) > 1:
+        documentation += f" Here: {change['comment']}."
+    return Option(stage, name, target, own.provider, documentation, parameters)
 
 
 def _default(field: dataclasses.Field[Any]) -> object:

@@ -24,12 +24,9 @@ from tests.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereD
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 README = (CHECKOUT / "README.md").read_text()
-COMMANDS = [
-    line
-    for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL)
-    for line in block.splitlines()
-    if line.startswith("python -m framework ")
-]
+LINES = [line for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
+COMMANDS = [line for line in LINES if line.startswith("python -m framework ")]
+BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
 
 
 def block(language: str, containing: str) -> str:
@@ -110,6 +107,14 @@ def test_every_command_composes(command: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for k in range(max(map(len, choices), default=1)):
             compose("config", overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides])
+
+
+@pytest.mark.parametrize("command", BENCHMARKS)
+def test_every_benchmark_is_there(command: str) -> None:
+    """Running them takes minutes: pytest's status is 5 where nothing would be run."""
+    line = [sys.executable, *shlex.split(command)[1:], "--collect-only", "--quiet"]
+    done = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
 
 
 def _kth(override: str, k: int) -> str:

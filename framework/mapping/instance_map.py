@@ -27,7 +27,7 @@ from framework.mapping.raycasting import render, render_near
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
-FORMAT = 1  # of the saved file; a change of meaning counts it up
+FORMAT = 2  # of the saved file; a change of meaning counts it up
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)
 ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
@@ -207,19 +207,19 @@ def _write(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
 
 
 def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """The header and the arrays of a saved map. Raises DataError unless every checksum holds."""
+    """The header and the arrays of a saved map. Raises DataError for another format or a checksum that fails."""
     try:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
         if damaged is not None:
             raise DataError(f"{path}: the checksum of {damaged} does not hold; the file is damaged, map again")
         with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in ("header", *ARRAYS)}
-        header = json.loads(arrays.pop("header").tobytes())
+            header = json.loads(file["header"].tobytes())
+            if header.get("format") != FORMAT:  # its arrays may have other names
+                raise DataError(f"{path} has map format {header.get('format')}, this version reads {FORMAT}; map again")
+            arrays = {name: file[name] for name in ARRAYS}
     except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{path} is not a map that can be read: {error}") from error
-    if header.get("format") != FORMAT:
-        raise DataError(f"{path} has map format {header.get('format')}, this version reads {FORMAT}")
     return header, arrays
 
 

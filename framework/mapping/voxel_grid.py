@@ -8,8 +8,10 @@ at a time.
 Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest:
 voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
 
-Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block, plus 2 KiB of block numbers a region (at most
-512 blocks).
+Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block. Beside its voxels a block takes 49 (neighbors 32,
+coordinates 12, label row 4, solid 1), and its region 2 KiB of block numbers, 12 of coordinates and 24 to 48 of the hash
+table for up to 512 blocks: measured 117 blocks a region in a dense room and 73 in a real kitchen, so 18 and 29 a block.
+Together 8.15 bytes a voxel. Labels take 56 more, only in blocks where something was detected (evidence.py).
 """
 
 from __future__ import annotations

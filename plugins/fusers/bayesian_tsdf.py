@@ -41,7 +41,7 @@ class BayesianTsdf(MapFuser):
     max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
     max_weight: float = 200.0  # observations, 1 to 255: how slowly an old surface gives way
     full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
-    max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.4 GB, about 1000 m^2 of surface at 1 cm
+    max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
     label_band: float = 2.0  # voxels, >= 1: label evidence goes to voxels within this distance of the measured surface
     overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap over the smaller of the two
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one

@@ -1,4 +1,4 @@
-"""Milliseconds and memory of the detectors on one 640x480 image: `pytest tests/benchmarks --benchmark-only`."""
+"""Milliseconds and memory of the detectors on one 640x480 image: `python -m pytest tests/benchmarks -k detectors`."""
 
 import resource
 from pathlib import Path

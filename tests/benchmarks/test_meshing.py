@@ -1,6 +1,6 @@
 """The mesh of a real kitchen at 1 cm: from scratch, after one more frame, and Open3D's from the same voxels.
 
-Run with `python -m pytest tests/benchmarks/test_meshing.py --benchmark-only -s`.
+Run with `python -m pytest tests/benchmarks/test_meshing.py -s`.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Speed of the refiners: ten masks in a 640x480 frame, and gmm_em's mixtures beside scikit-learn's.
 
-Run with `python -m pytest tests/benchmarks/test_refiners.py --benchmark-only -s`.
+Run with `python -m pytest tests/benchmarks/test_refiners.py -s`.
 """
 
 from __future__ import annotations

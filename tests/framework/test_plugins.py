@@ -63,8 +63,16 @@ PACKAGE = {
         _target_: acme.everything.Everything
         score: 0.75 # in [0, 1], of the one object
     """,
+    "acme/conf/detector/acme_certain.yaml": """
+        # acme_everything without doubt
+        defaults: [acme_everything, _self_]
+        score: 1.0
+    """,
     "acme/conf/detector/acme_broken.yaml": """
         _target_: acme.missing.Detector
+    """,
+    "acme/conf/detector/acme_orphan.yaml": """
+        defaults: [acme_nobody, _self_]
     """,
     "hydra_plugins/acme_search_path.py": """
         from hydra.core.config_search_path import ConfigSearchPath
@@ -108,7 +116,16 @@ def test_an_installed_package_is_listed(environment: dict[str, str], tmp_path: P
         "      score: float = 0.75  # in [0, 1], of the one object",
         "",
     ]
+    at = lines.index("  acme_certain  [from acme]")
+    assert lines[at + 1 : at + 4] == [
+        "      The whole image is one object. Here: acme_everything without doubt.",
+        "      score: float = 1.0  # in [0, 1], of the one object",
+        "",
+    ]
     assert "cannot be used: detector acme.missing.Detector: there is no module acme.missing" in done.stdout
+    at = lines.index("  acme_orphan  [from acme]")
+    assert lines[at + 1].startswith("      cannot be used: ")
+    assert "acme_nobody" in lines[at + 1]
 
 
 def test_an_installed_package_runs(environment: dict[str, str], tmp_path: Path) -> None:

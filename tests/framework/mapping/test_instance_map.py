@@ -1,5 +1,7 @@
 """Mesh, instances, saving and loading of a small map with two objects."""
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import lift
-from framework.mapping.instance_map import InstanceMap, _oriented_box
+from framework.mapping.instance_map import FORMAT, InstanceMap, _oriented_box
 from framework.mapping.integration import Integrator
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.analytic_scene import Scene, room, walk
@@ -133,6 +135,16 @@ def test_a_damaged_file_is_refused(scene_map: InstanceMap, tmp_path: Path) -> No
         InstanceMap.load(path)
     with pytest.raises(DataError, match="absent"):
         InstanceMap.load(tmp_path / "absent.npz")
+
+
+@pytest.mark.parametrize("other", [FORMAT - 1, FORMAT + 1])
+def test_a_file_of_another_format_is_refused(other: int, tmp_path: Path) -> None:
+    """Before anything else is expected of it: other versions have other arrays."""
+    path = tmp_path / "map.npz"
+    np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
+    told = re.escape(f"{path} has map format {other}, this version reads {FORMAT}; map again")
+    with pytest.raises(DataError, match=f"^{told}$"):
+        InstanceMap.load(path)
 
 
 @pytest.mark.parametrize("threshold", [{"min_observations": 13}, {"min_confidence": 0.95}, {"min_vertices": 10_000}])
