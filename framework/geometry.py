@@ -99,7 +99,7 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
 
 @njit(cache=True, nogil=True, parallel=True)
 def _count_readings(masks: Bool, depth: Float32, counts: npt.NDArray[np.int64]) -> None:
-    """Adds to counts (N * H + 1,) how many pixels of each row of each mask have a reading, one place on."""
+    """Sets counts (N * H + 1,) to how many pixels of each row of each mask have a reading, one place on."""
     height = depth.shape[0]
     for row in prange(masks.shape[0] * height):
         k, v = row // height, row % height

@@ -29,6 +29,7 @@ from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
+    COLORED,
     TSDF_MAX,
     WEIGHT_ONE,
     VoxelGrid,
@@ -101,7 +102,7 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
         # behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind
-        behind = max(least, min((band + sdf) * ramp, one))
+        behind = max(least, min(one + (sdf + voxel) * ramp, one))
         w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])
         portion = w_new / (w_old + w_new) if seen else zero
@@ -125,9 +126,12 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 def _average_colors(packed, seen, rounding, scratch):
     """The running average of the packed colours (512,) of a block with those seen (512,), RGBA in their bytes."""
     byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
-    four, brightest = np.float32(4.0), np.float32(4 * 255)
+    zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
+    no_color = np.uint32(0)
     for n in range(BLOCK_VOXELS):
         share = scratch[n + BLOCK_VOXELS]
+        first = (share > zero) & ((packed[n] & COLORED) == no_color)  # air has weight, but no colour to average with
+        share = one if first else share
         new = np.int32(seen[n])
         red, green, blue = unpack_color(packed[n])
         red += share * (four * np.float32(new & byte) - red)
@@ -136,7 +140,7 @@ def _average_colors(packed, seen, rounding, scratch):
         mean = pack_color(
             min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
         )
-        packed[n] = mean if share > np.float32(0.0) else packed[n]
+        packed[n] = mean if share > zero else packed[n]
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")

@@ -159,8 +159,8 @@ def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_f
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
-    """Fills depth (ceil(H / stride) + 1, ceil(W / stride) + 1) m of every stride-th pixel of an image (H, W) and of its
-    last ones, by a full search; 0 = no surface. `view` holds T_world_camera.
+    """Fills depth (ceil((H - 1) / stride) + 1, ceil((W - 1) / stride) + 1) m of every stride-th pixel of an image
+    (H, W) and of its last ones, by a full search; 0 = no surface. `view` holds T_world_camera.
     """
     scale = np.float32(1.0) / grid.voxel_size
     for y in prange(depth.shape[0]):
@@ -353,7 +353,7 @@ def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera:
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
-    rays_y, rays_x = ((side + stride - 1) // stride + 1 for side in camera.shape)
+    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)
     coarse = np.empty((rays_y, rays_x), np.float32)
     cast_coarse(voxels.grid, view, tile_near, tile_far, stride, camera.shape, coarse)
     depth = np.empty(camera.shape, np.float32)

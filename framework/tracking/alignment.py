@@ -34,7 +34,6 @@ POINT_FIELDS = 21
 # ... and of its terms
 J0, J1, J2, J3, J4, J5, W, ERROR, WEIGHTED = (field * BATCH for field in range(9))
 TERM_FIELDS = 9
-CLOSE = 0.05  # m, or 3 standard deviations: a reading this far from the model's depth agrees with it
 NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
 
 
@@ -71,16 +70,17 @@ class Weights(NamedTuple):
     """How residuals are weighed."""
 
     max_distance: np.float32  # m, of a point from its model point
+    close_distance: np.float32  # m, or 3 standard deviations: a reading this far from the model's depth agrees with it
     min_normal_dot: np.float32  # cosine between the frame's and the model's normal
     geometric_scale: np.float32  # standard deviations at which Tukey's weight reaches 0
     photometric_scale: np.float32  # likewise
     intensity_noise: np.float32  # standard deviation of an intensity difference, of [0, 1]
     color_weight: np.float32  # lambda; 0 = geometry alone
-    depth_weight: np.float32  # 1, or 0 = colour alone
+    depth_weight: np.float32  # 0 = colour alone
 
 
 class NormalEquations(NamedTuple):
-    """The linearised problem, and what it is made of."""
+    """The linearized problem, and what it is made of."""
 
     A: Float64  # (6, 6)
     b: Float64  # (6,)
@@ -162,6 +162,7 @@ def _add_geometry(model, R, weights, points, J):
     R00, R01, R02, R10, R11, R12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
     R20, R21, R22 = R[2, 0], R[2, 1], R[2, 2]
     max_distance2 = weights.max_distance * weights.max_distance
+    close_distance = weights.close_distance
     min_dot, scale, strength = weights.min_normal_dot, weights.geometric_scale, weights.depth_weight
     visible = weighed = close = behind = np.int32(0)
     for n in range(BATCH):
@@ -195,7 +196,7 @@ def _add_geometry(model, R, weights, points, J):
         J[J3 + n] = py * nz - pz * ny if weighty else zero
         J[J4 + n] = pz * nx - px * nz if weighty else zero
         J[J5 + n] = px * ny - py * nx if weighty else zero
-        apart = max(np.float32(CLOSE), np.float32(3.0) * sigma)
+        apart = max(close_distance, np.float32(3.0) * sigma)
         visible += np.int32(1) if mapped else np.int32(0)
         weighed += np.int32(1) if weighty else np.int32(0)
         close += np.int32(1) if mapped & (abs(ez) < apart) else np.int32(0)
@@ -321,7 +322,7 @@ def _accumulate(
         sums[chunk] = total
 
 
-def linearise(
+def linearize(
     level: PyramidLevel,
     model: ModelView,
     model_intensity: Float32,
@@ -335,7 +336,7 @@ def linearise(
     """
     sums = np.empty((CHUNKS, TERMS))
     camera: Camera = level.camera
-    scale = round(model.depth.shape[1] / model_intensity.shape[1])  # a power of 2
+    scale = 1 << round(np.log2(model.depth.shape[1] / model_intensity.shape[1]))  # odd columns are dropped
     _accumulate(
         level.depth,
         level.intensity,

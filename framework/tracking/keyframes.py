@@ -40,7 +40,7 @@ class Keyframes:
     """A bounded database of keyframes.
 
     `add` is offered every trusted frame; only one that shows something new costs more than a few microseconds.
-    `relocalise` costs the same whatever the number of keyframes, but for the comparison of their bags of words.
+    `relocalize` costs the same whatever the number of keyframes, but for the comparison of their bags of words.
 
     Measured on 640x480 frames of redkitchen on one core: a frame that is not new takes 0.02 ms, one that is added
     20 ms, a lost one 30 to 50 ms (of which features 20; the bags of 200 keyframes 4). With keyframes from frames 0 to
@@ -120,7 +120,7 @@ class Keyframes:
             return False
         return bool(self._separation(self._barren[None], T_world_camera)[0] < BARREN_SEPARATION)
 
-    def relocalise(self, frame: Frame) -> AbsolutePose | None:
+    def relocalize(self, frame: Frame) -> AbsolutePose | None:
         """The pose of `frame`, wherever it was taken, with the inliers that speak for it; None if it is not known."""
         if not self._keyframes:
             return None

@@ -9,16 +9,19 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Float64, Frame, Pose
+from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
-from framework.tracking.alignment import NormalEquations, Weights, linearise, model_view
+from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
 LEVELS = 3
 FINE_ENOUGH = 1e-4  # m and rad: a shorter step ends the finest level, four times as long a one the level before, ...
 SAME_PLACE = 0.05  # m and rad: two alignments that end nearer to each other than this have found the same pose
+SMALLEST = 8  # px, of the sides of the coarsest level
+CHANGED_SCENE = 0.95  # share of the points not behind the map's surface that agree with it, where a thing was removed
 VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
 VISITED_APART = 0.1  # m and rad
 
@@ -28,6 +31,7 @@ class Alignment(NamedTuple):
 
     T_world_camera: Float64
     agreement: float  # share of the points in view that agree with the map
+    beside: float  # likewise, of those that are not behind the map's surface
     reason: str  # why it is impossible, empty if it is not
     doubt: str  # why it takes the keyframes' word to trust it, empty if it does not
 
@@ -41,6 +45,7 @@ class VoxelHashingIcp(PoseTracker):
     iterations_middle: int = 6  # >= 0, at 1/2
     iterations_fine: int = 4  # >= 1
     max_distance: float = 0.1  # m, > 0: of a point from its model point
+    close_distance: float = 0.05  # m, > 0: a reading this near to the map's surface agrees with it; a voxel at least
     min_normal_dot: float = 0.7  # in [-1, 1]: cosine between the normals of a point and its model point
     geometric_scale: float = 4.0  # standard deviations, > 0: Tukey's cut-off of a distance
     photometric_scale: float = 4.0  # standard deviations, > 0: Tukey's cut-off of an intensity difference
@@ -49,13 +54,13 @@ class VoxelHashingIcp(PoseTracker):
     depth_weight: float = 1.0  # 1, or 0 = colour alone
     max_step: float = 0.3  # m, > 0: a frame that seems to have moved farther is lost
     max_turn: float = 0.35  # rad, > 0: likewise
-    min_visible: float = 0.15  # in [0, 1]: share of the frame's points that must fall on the map
+    min_visible: float = 0.05  # in [0, 1]: share of the points that must fall on the map; some are out of its range
     min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
     min_information: float = 1e-3  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
     min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
     max_behind: float = 0.015  # in [0, 1]: ... and behind it; what fails must be confirmed by the keyframes
-    relocalise: bool = True  # by features of keyframes, when lost or in doubt
-    seed: int = 0  # of the relocalisation's random samples
+    relocalize: bool = True  # by features of keyframes, and from visited places, when lost or in doubt
+    seed: int = 0  # of the relocalization's random samples
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -65,6 +70,7 @@ class VoxelHashingIcp(PoseTracker):
             iterations_middle=(0, 1000),
             iterations_fine=(1, 1000),
             max_distance=(1e-4, 10.0),
+            close_distance=(1e-4, 10.0),
             min_normal_dot=(-1.0, 1.0),
             geometric_scale=(1e-3, 1e3),
             photometric_scale=(1e-3, 1e3),
@@ -82,6 +88,7 @@ class VoxelHashingIcp(PoseTracker):
         require(np.log2(self.finest) % 1 == 0, "VoxelHashingIcp.finest", self.finest, "1, 1/2, 1/4, ...")
         self._weights = Weights(
             max_distance=np.float32(self.max_distance),
+            close_distance=np.float32(self.close_distance),
             min_normal_dot=np.float32(self.min_normal_dot),
             geometric_scale=np.float32(self.geometric_scale),
             photometric_scale=np.float32(self.photometric_scale),
@@ -96,29 +103,49 @@ class VoxelHashingIcp(PoseTracker):
         self._visited: deque[Float64] = deque(maxlen=VISITED)
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        if self._T_world_last is None:
-            T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
-            if not frame.depth.any():  # a world that starts with nothing in it would have nothing to be tracked by
-                return Pose(T_world_camera, lost=True, reason="the frame has no depth")
-            return self._trusted(frame, T_world_camera)
+        if self._T_world_last is None or scene.voxel_count == 0:
+            return self._first(frame)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
         if self._lost_frames:
             alignment = self._align_twice(levels, scene, self._T_world_last)
         else:
-            alignment = self._align(levels, scene, self._T_world_last @ self._T_last_next, self._T_world_last)
+            T_world_predicted = self._T_world_last @ self._T_last_next
+            alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
+            if _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE) and alignment.beside >= CHANGED_SCENE:
+                alignment = alignment._replace(doubt="")  # what is behind the map's surface was removed from before it
         if (self._lost_frames or alignment.reason or alignment.doubt) and levels[0].depth.any():
             alignment = self._searched(alignment, frame, levels, scene)
         if alignment.reason or alignment.doubt:
             self._lost_frames += 1
             self._T_last_next = np.eye(4)
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
-        self._T_last_next = np.eye(4) if self._lost_frames else inverse(self._T_world_last) @ alignment.T_world_camera
+        T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
+        self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         return self._trusted(frame, alignment.T_world_camera)
+
+    def _first(self, frame: Frame) -> Pose:
+        """The pose that defines the world, of the first frame with something in it to be tracked by."""
+        if min(frame.camera.shape) * self.finest < SMALLEST * 2 ** (LEVELS - 1):
+            raise DataError(
+                f"images of {frame.camera.width}x{frame.camera.height} px are too small for tracker.finest="
+                f"{self.finest:g}: {LEVELS} levels from there leave less than {SMALLEST} px"
+            )
+        T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
+        readings = np.count_nonzero(frame.depth) / frame.depth.size
+        if readings < max(self.min_visible, 1 / frame.depth.size):
+            reason = "the frame has no depth" if readings == 0 else f"the first frame has depth in only {readings:.1%}"
+            return Pose(T_world_camera, lost=True, reason=reason)
+        return self._trusted(frame, T_world_camera)
+
+    def _is_jump(self, T_last_next: Float64) -> bool:
+        """Whether this is farther than a camera moves from one frame to the next."""
+        step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
+        return bool(step > self.max_step or turn > self.max_turn)
 
     def _trusted(self, frame: Frame, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera
         self._lost_frames = 0
-        if self.relocalise:
+        if self.relocalize:
             self._keyframes.add(frame, T_world_camera)
             if not any(_near(T, T_world_camera, VISITED_APART) for T in self._visited):
                 self._visited.append(T_world_camera)
@@ -126,7 +153,8 @@ class VoxelHashingIcp(PoseTracker):
 
     def _searched(self, alignment: Alignment, frame: Frame, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
         """The best pose of a frame that is lost or in doubt: asks the keyframes, then goes through visited places."""
-        found = self._keyframes.relocalise(frame) if self.relocalise else None
+        asks_keyframes = self.relocalize and self._lost_frames % 2 == 0  # the other frames try a visited place
+        found = self._keyframes.relocalize(frame) if asks_keyframes else None
         if found is not None:
             again = self._align(levels, scene, found.T_world_camera, found.T_world_camera)
             if not again.reason and _near(again.T_world_camera, found.T_world_camera, self.max_distance):
@@ -134,8 +162,8 @@ class VoxelHashingIcp(PoseTracker):
                     alignment = again
                 if _near(again.T_world_camera, alignment.T_world_camera, SAME_PLACE):
                     return alignment._replace(doubt="")
-        if (alignment.reason or alignment.doubt) and self._visited:
-            T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
+        if (alignment.reason or alignment.doubt) and self._visited and not asks_keyframes:
+            T_world_visited = self._visited[-1 - self._lost_frames // 2 % len(self._visited)]
             again = self._align_twice(levels, scene, T_world_visited)
             if not (again.reason or again.doubt):
                 return again
@@ -165,7 +193,7 @@ class VoxelHashingIcp(PoseTracker):
         for level in reversed(range(LEVELS)):
             weights = self._weights_at(level)
             for _ in range(iterations[level]):
-                equations = linearise(levels[level], model, intensities[level], T_view_camera, weights, brightness)
+                equations = linearize(levels[level], model, intensities[level], T_view_camera, weights, brightness)
                 brightness = equations.brightness
                 xi = _solved(equations)
                 T_view_camera = exp_se3(xi) @ T_view_camera
@@ -180,7 +208,8 @@ class VoxelHashingIcp(PoseTracker):
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_behind:
             doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
-        return Alignment(T_world_camera, agreement, reason, doubt)
+        beside = equations.close / max(equations.visible - equations.behind, 1)
+        return Alignment(T_world_camera, agreement, beside, reason, doubt)
 
     def _weights_at(self, level: int) -> Weights:
         """What is an outlier where the pose is known to a fraction of a voxel need not be one on the way there."""
@@ -199,9 +228,8 @@ class VoxelHashingIcp(PoseTracker):
             return f"{equations.visible / points:.0%} of the frame's points fall on the map"
         if equations.matched < self.min_matched * equations.visible:
             return f"{equations.matched / equations.visible:.0%} of the points in view agree with the map"
-        step = float(np.linalg.norm(T_from_camera[:3, 3]))
-        turn = rotation_angle(T_from_camera[:3, :3])
-        if step > self.max_step or turn > self.max_turn:
+        if self._is_jump(T_from_camera):
+            step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
             return f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
         information = np.linalg.eigvalsh(equations.A)
         if information[0] < self.min_information * information.mean():

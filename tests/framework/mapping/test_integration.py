@@ -57,7 +57,7 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     near = np.where(seen & (np.abs(d - p[..., 2]) <= VOXEL), row * CAMERA.width + column, -1)
     clear_band = clear & (np.abs(np.abs(d - p[..., 2]) - VOXEL) > 1e-4)
     assert (near_pixel == near)[clear_band].all()
-    behind = np.clip((band + d - p[..., 2]) / (SENSOR.truncation - VOXEL), LEAST_BEHIND, 1)
+    behind = np.interp(d - p[..., 2], [-SENSOR.truncation, -VOXEL], [0, 1]).clip(LEAST_BEHIND)
     expected_weight = behind * np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
     assert np.abs(grid.weight[active] - np.maximum(expected_weight, 1))[both].max() < 1.001
 
@@ -125,6 +125,20 @@ def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
     air = grid.tsdf[active] == TSDF_MAX
     assert air.sum() > 1000
     assert (grid.color[active][air] == 0).all()
+
+
+def test_air_has_no_colour_to_be_averaged_with() -> None:
+    """A wall comes nearer to where air was seen before: its colour is its own, not a mixture with black."""
+    integrator = new_integrator()
+    for depth, frames in ((1.5, 5), (1.4, 13)):
+        wall = np.full(CAMERA.shape, depth, np.float32)
+        frame = Frame(0, 0.0, np.full((*CAMERA.shape, 3), 200, np.uint8), wall, CAMERA)
+        for _ in range(frames):
+            integrator.integrate(frame, np.eye(4), VOXEL)
+    grid = integrator.voxels.grid
+    packed = grid.color[: integrator.voxels.block_count]
+    assert (packed == 0).any()
+    assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
 
 
 def test_old_surfaces_give_way_at_the_greatest_weight() -> None:

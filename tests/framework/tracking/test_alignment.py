@@ -8,14 +8,14 @@ import pytest
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
 from framework.mapping.sensor import depth_noise
-from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearise
+from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize
 from framework.tracking.pyramid import build_pyramid, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
 from tests.analytic_scene import CAMERA, Scene, pose
 
 WALL = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
-COLOR = Weights(*map(np.float32, (0.1, 0.7, 4.0, 4.0, 0.05, 1.0, 0.0)))
-DEPTH = Weights(*map(np.float32, (0.1, 0.7, 4.0, 4.0, 0.05, 0.0, 1.0)))
+COLOR = Weights(*map(np.float32, (0.1, 0.05, 0.7, 4.0, 4.0, 0.05, 1.0, 0.0)))
+DEPTH = Weights(*map(np.float32, (0.1, 0.05, 0.7, 4.0, 4.0, 0.05, 0.0, 1.0)))
 T_VIEW = pose(0.02, -0.03, 0.01, (0.01, 0.02, -0.01))
 
 
@@ -36,7 +36,7 @@ def step(
     view = dataclasses.make_dataclass("Seen", ["color", "depth"])(view_frame.color, depth)
     intensity = model_intensities(view, 3)[level]
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
-    equations = linearise(pyramid[level], model, intensity, T_view_camera, weights, brightness)
+    equations = linearize(pyramid[level], model, intensity, T_view_camera, weights, brightness)
     return _solved(equations), equations
 
 

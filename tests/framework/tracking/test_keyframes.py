@@ -71,7 +71,7 @@ def test_a_frame_without_features_is_not_looked_at_again_and_again() -> None:
 def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
     for k, yaw in enumerate(np.linspace(0.1, 6, 7)):
         T_world_camera = exp_se3(np.array([0.1 - 0.03 * k, 0.05, 0.1, 0.05, yaw, 0.1]))
-        found = keyframes.relocalise(papered_frame(T_world_camera))
+        found = keyframes.relocalize(papered_frame(T_world_camera))
         assert found is not None
         distance, angle = apart(found.T_world_camera, T_world_camera)
         assert distance < 0.01
@@ -81,7 +81,7 @@ def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
 
 def test_the_same_frame_is_found_at_the_same_place(keyframes: Keyframes) -> None:
     frame = papered_frame(pose(0.1, 0.4))
-    found = [keyframes.relocalise(frame) for _ in range(2)]
+    found = [keyframes.relocalize(frame) for _ in range(2)]
     np.testing.assert_array_equal(found[0].T_world_camera, found[1].T_world_camera)
 
 
@@ -90,11 +90,11 @@ def test_what_was_never_seen_is_not_found(keyframes: Keyframes) -> None:
     frame = papered_frame(pose(0))
     noise = rng.integers(0, 255, (*CAMERA.shape, 3)).astype(np.uint8)
     for color in (np.zeros_like(noise), noise, cv2.GaussianBlur(noise, (0, 0), 3), frame.color[:, ::-1]):
-        assert keyframes.relocalise(replace(frame, color=np.ascontiguousarray(color))) is None
-    assert keyframes.relocalise(papered_frame(pose(0), paper=1)) is None, "another room"
+        assert keyframes.relocalize(replace(frame, color=np.ascontiguousarray(color))) is None
+    assert keyframes.relocalize(papered_frame(pose(0), paper=1)) is None, "another room"
     twice_as_far = replace(frame, depth=frame.depth * 2)
-    assert keyframes.relocalise(twice_as_far) is None, "a picture of the room is not the room"
-    assert Keyframes().relocalise(frame) is None
+    assert keyframes.relocalize(twice_as_far) is None, "a picture of the room is not the room"
+    assert Keyframes().relocalize(frame) is None
 
 
 def test_the_database_is_bounded_and_keeps_what_is_apart() -> None:
@@ -136,7 +136,7 @@ def test_real_video_is_found_and_other_places_are_not() -> None:
     for k in range(0, 150, 10):
         keyframes.add(kitchen[k], kitchen[k].T_world_camera)
     for k in range(5, 300, 30):
-        found = keyframes.relocalise(kitchen[k])
+        found = keyframes.relocalize(kitchen[k])
         assert found is not None, f"frame {k}"
         distance, angle = apart(found.T_world_camera, kitchen[k].T_world_camera)
         assert distance < 0.15, f"frame {k}"
@@ -144,4 +144,4 @@ def test_real_video_is_found_and_other_places_are_not() -> None:
     elsewhere = [("mit76", range(5)), ("redwood5", range(5)), ("replica_floor2", range(0, 123, 20))]
     for name, chosen in elsewhere:
         sequence = RgbdFolder(SHARED / name)
-        assert not [k for k in chosen if keyframes.relocalise(sequence[k]) is not None], name
+        assert not [k for k in chosen if keyframes.relocalize(sequence[k]) is not None], name

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame, PointClusters, Pose
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
 from framework.geometry import inverse, rotation_angle
 from framework.interfaces import SceneMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.analytic_scene import Scene, room, walk
+from tests.analytic_scene import CAMERA, Scene, room, walk
 
 NOTHING = PointClusters(
     np.zeros((0, 3), np.float32),
@@ -63,7 +63,7 @@ def test_colour_holds_what_geometry_does_not() -> None:
 
 
 def test_lost_frames_are_told_and_tracking_resumes() -> None:
-    frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
+    frames = [room().frame(T, k) for k, T in enumerate(walk(30)[:16])]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
     poses, _ = run(VoxelHashingIcp(finest=1.0), frames[:10] + covered + frames[14:])
     assert [pose.lost for pose in poses] == [False] * 10 + [True] * 4 + [False] * 16
@@ -78,7 +78,7 @@ def test_a_jump_is_found_by_keyframes_or_lost_and_not_integrated() -> None:
     frames.append(room().frame(away, 20))
     poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
     assert poses[-1].lost or drift(poses[-1], frames[-1])[0] < 0.03
-    poses, scene = run(VoxelHashingIcp(finest=1.0, relocalise=False), frames)
+    poses, scene = run(VoxelHashingIcp(finest=1.0, relocalize=False), frames)
     assert poses[-1].lost
     assert np.array_equal(poses[-1].T_world_camera, poses[-2].T_world_camera)
     assert np.median(room().distance(scene.mesh().vertices.astype(float))) < 0.004
@@ -136,3 +136,45 @@ def test_a_step_beyond_what_is_plausible_is_lost(bound: dict[str, float]) -> Non
     assert poses[1].lost
     assert "not plausible" in poses[1].reason
     assert np.array_equal(poses[1].T_world_camera, poses[0].T_world_camera)
+
+
+def spoilt_beginnings() -> dict[str, np.ndarray]:
+    corner = np.zeros(CAMERA.shape, np.float32)
+    corner[:10, :10] = 1.0
+    return {"nothing": np.zeros_like(corner), "a corner": corner, "out of range": np.full_like(corner, 9.0)}
+
+
+@pytest.mark.parametrize("name", spoilt_beginnings())
+def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str) -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
+    frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
+    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    assert not any(pose.lost for pose in poses[1:])
+    assert drift(poses[-1], frames[-1])[0] < 0.004
+
+
+def test_a_thing_taken_away_leaves_no_ghost_that_tracking_is_lost_by() -> None:
+    """No texture, so no keyframe can confirm the pose; the ball covers several per cent of the view."""
+    planes = room().planes
+    with_ball, without = (Scene(planes, spheres, contrast=0.0) for spheres in ([(np.array([0, 0.1, 1.3]), 0.2)], []))
+    frames = [(with_ball if k < 10 else without).frame(T, k) for k, T in enumerate(walk(30)[:16])]
+    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    assert not any(pose.lost for pose in poses)
+    assert drift(poses[-1], frames[-1])[0] < 0.006
+
+
+def test_the_motion_of_a_jump_is_not_expected_to_go_on() -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
+    away = walk(1)[0].copy()
+    away[:3, 3] += (0.0, 0.0, -1.2)
+    tracker = VoxelHashingIcp(finest=1.0)
+    poses, _ = run(tracker, [*frames, room().frame(away, 20)])
+    assert not poses[-1].lost
+    assert np.array_equal(tracker._T_last_next, np.eye(4))
+
+
+def test_images_too_small_for_the_levels_are_refused_in_one_line() -> None:
+    camera = Camera(30, 23, 25.0, 25.0, 14.5, 11.0)
+    frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
+    with pytest.raises(DataError, match=r"30x23 px are too small for tracker\.finest=0\.5"):
+        VoxelHashingIcp(finest=0.5).track(frame, BayesianTsdf().scene)
