@@ -98,8 +98,9 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         band = sensor.truncation + sensor.truncation_slope * d
         sdf = d - scratch[n]
         seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
-        # behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind
-        behind = max(least, min(one + (sdf + voxel) * ramp, one))
+        # Behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind.
+        # The band has widened with the noise, and only its far end loses weight: noise would push surfaces away else.
+        behind = max(least, min((band + sdf) * ramp, one))
         w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
         w_old = np.float32(weight[n])
         portion = w_new / (w_old + w_new) if seen else zero

@@ -57,7 +57,7 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     near = np.where(seen & (np.abs(d - p[..., 2]) <= VOXEL), row * CAMERA.width + column, -1)
     clear_band = clear & (np.abs(np.abs(d - p[..., 2]) - VOXEL) > 1e-4)
     assert (near_pixel == near)[clear_band].all()
-    behind = np.interp(d - p[..., 2], [-SENSOR.truncation, -VOXEL], [0, 1]).clip(LEAST_BEHIND)
+    behind = np.clip((band + d - p[..., 2]) / (SENSOR.truncation - VOXEL), LEAST_BEHIND, 1)
     expected_weight = behind * np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
     assert np.abs(grid.weight[active] - np.maximum(expected_weight, 1))[both].max() < 1.001
 

@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from framework.data import Camera
+from framework.data import Camera, Frame
 from framework.mapping.evidence import EvidenceRows
 from framework.mapping.integration import Integrator
 from framework.mapping.raycasting import TILE, cast_coarse, cast_view, render, tile_bounds
-from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.sensor import Sensor, depth_noise, pinhole
 from framework.mapping.voxel_grid import VoxelGrid
 from framework.mapping.voxel_walk import inverses, leave_cell
 from tests.analytic_scene import Scene, pose, room, walk
@@ -39,6 +39,21 @@ def test_depth_of_a_slanted_plane_is_unbiased(slant: float) -> None:
     assert np.median(np.abs(error)) < 0.1 * VOXEL
     assert abs(np.median(error)) < 0.05 * VOXEL
     assert np.median(view.normals_world[both] @ n) > 0.999
+
+
+def test_noise_does_not_push_a_far_wall_away() -> None:
+    """Readings too near and too far must weigh alike around a surface, where noise is wider than a voxel."""
+    voxel, depth = 0.01, 4.0
+    sensor = Sensor(*map(np.float32, (4 * voxel, 0.01, 0.2, 5.0, 200.0, 1.5)))
+    integrator = Integrator(VoxelGrid(voxel, sensor.max_truncation, 100_000), sensor)
+    rng = np.random.default_rng(0)
+    camera = Camera(80, 60, 65.5, 65.5, 39.5, 29.5)
+    for _ in range(60):
+        wall = rng.normal(depth, depth_noise(np.float32(depth)), camera.shape).astype(np.float32)
+        frame = Frame(0, 0.0, np.zeros((*camera.shape, 3), np.uint8), wall, camera)
+        integrator.integrate(frame, np.eye(4), voxel)
+    seen, _ = cast_view(integrator.voxels, sensor, camera, np.eye(4))
+    assert abs(np.median(seen[seen > 0]) - depth) < 0.2 * voxel
 
 
 def test_depth_of_spheres_and_coverage() -> None:
