@@ -52,8 +52,8 @@ def _ray(view, scale, u, v):
 
 
 @device
-def _refined(grid, o, d, step, z, key, region):
-    """(z, nx, ny, nz, key, region): the zero of the trilinear field near depth z, z = 0 if there is none.
+def _refined(grid, o, d, step, z, reach, key, region):
+    """(z, nx, ny, nz, key, region): the zero of the trilinear field within `reach` of depth z, m; z = 0 if none.
 
     (nx, ny, nz) is the field's gradient there, in stored units for each voxel. A zero at which the field rises along
     the ray is the back of a surface.
@@ -73,7 +73,7 @@ def _refined(grid, o, d, step, z, key, region):
             break
         change = -value / slope
         z += change
-        if not abs(z - first) < np.float32(REACH) * step:
+        if not abs(z - first) < reach:
             break
         if abs(change) < np.float32(CONVERGED) * step:
             return z, nx, ny, nz, key, region
@@ -85,6 +85,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
     """(z, nx, ny, nz, key, region) where the ray first meets the surface from the front; z = 0 if it does not."""
     zero, one, half = np.float32(0.0), np.float32(1.0), np.float32(0.5)
     to_voxels = grid.tsdf_unit / grid.voxel_size
+    reach = np.float32(REACH) * step
     block_side = np.float32(BLOCK_SIDE)
     region_side = np.float32(BLOCK_SIDE * REGION_SIDE)
     inverse_d = inverses(d)
@@ -111,7 +112,7 @@ def _first_surface(grid, o, d, step, near, far, key, region):
             continue
         distance = np.float32(stored) * to_voxels
         if abs(distance) < one or (from_front and stored < 0):
-            hit, nx, ny, nz, key, region = _refined(grid, o, d, step, z + distance * step, key, region)
+            hit, nx, ny, nz, key, region = _refined(grid, o, d, step, z + distance * step, reach, key, region)
             if zero < hit < far:
                 return hit, nx, ny, nz, key, region
         from_front = stored > 0
@@ -226,7 +227,8 @@ def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
                         d, step = _ray(view, scale, u, v)
                         if smooth:
                             start = one / (left + across * np.float32(u - u0))
-                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, key, region)
+                            reach = np.float32(REACH) * step
+                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, reach, key, region)
                         if z == zero:
                             z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near, far, key, region)
                     norm = np.sqrt(nx * nx + ny * ny + nz * nz)
@@ -260,11 +262,12 @@ def cast_near(grid, view, tile_near, tile_far, max_depth, readings, depth, norma
             if zero < reading < max_depth + np.float32(MAX_SHIFT) * voxel:
                 d, step = _ray(view, scale, u, v)
                 start = reading + shift
+                reach = np.float32(REACH) * voxel + np.float32(3.0) * depth_noise(reading)
                 if last_but_one > zero and last > zero:
                     ahead = one / max(last + last - last_but_one, np.float32(1e-3))
-                    if abs(ahead - start) < np.float32(REACH) * voxel + np.float32(3.0) * depth_noise(reading):
+                    if abs(ahead - start) < reach:
                         start = ahead
-                z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, key, region)
+                z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, reach, key, region)
                 if z == zero:
                     near = tile_near[v // TILE, u // TILE]
                     far = min(tile_far[v // TILE, u // TILE], reading + np.float32(MAX_SHIFT) * voxel)
