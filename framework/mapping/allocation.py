@@ -12,13 +12,11 @@ from numba import njit, prange
 
 from framework.data import Camera, Float64, Frame, Int32
 from framework.geometry import inverse
-from framework.mapping.frustum import bounds, extent
+from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.sensor import Sensor, pinhole, ray_direction
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     NO_KEY,
-    REGION_BLOCKS,
-    REGION_SIDE,
     VoxelGrid,
     device,
     find_block,
@@ -107,8 +105,9 @@ def _unpack(keys, coords):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _sees_through(depth, sensor, z0, u0, u1, v0, v1):
+def _sees_through(depth, sensor, z0, pixels):
     """Whether one of some readings within the block's part of the image lies behind the block's front, at depth z0."""
+    u0, u1, v0, v1 = pixels
     for row in range(PROBES):
         v = v0 + (v1 - v0) * row // (PROBES - 1)
         for column in range(PROBES):
@@ -122,8 +121,7 @@ def _sees_through(depth, sensor, z0, u0, u1, v0, v1):
 def _number_blocks(grid, coords, region_count, depth, camera, sensor, stamp, frame, active):
     """The blocks at `coords` and those that the frame sees through, each once, into `active`; returns how many.
 
-    `camera` holds T_camera_world. Like the ray-caster's bounds, it costs a test a region of the map and one a block of
-    those in view.
+    `camera` holds T_camera_world.
     """
     n = 0
     key = np.int64(-2)
@@ -134,31 +132,16 @@ def _number_blocks(grid, coords, region_count, depth, camera, sensor, stamp, fra
             stamp[block] = frame
             active[n] = block
             n += 1
-    voxel = grid.voxel_size
-    block_size = np.float32(BLOCK_SIDE) * voxel
-    region_size = np.float32(REGION_SIDE) * block_size
-    block_extent = extent(camera, block_size, voxel)
-    region_extent = extent(camera, region_size, voxel)
-    near, far = sensor.min_depth, sensor.max_depth
-    half = np.float32(0.5)
-    for region in range(region_count):
-        x = (np.float32(grid.region_coords[region, 0]) + half) * region_size
-        y = (np.float32(grid.region_coords[region, 1]) + half) * region_size
-        z = (np.float32(grid.region_coords[region, 2]) + half) * region_size
-        if not bounds(camera, x, y, z, region_extent, near, far, depth.shape)[0]:
-            continue
-        for child in range(REGION_BLOCKS):
-            block = grid.region_blocks[region, child]
-            if block < 0 or not grid.solid[block] or stamp[block] == frame:
-                continue  # where nothing is behind a surface, there is no surface to be carved
-            x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
-            y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
-            z = (np.float32(grid.block_coords[block, 2]) + half) * block_size
-            visible, z0, _, u0, u1, v0, v1 = bounds(camera, x, y, z, block_extent, near, far, depth.shape)
-            if visible and _sees_through(depth, sensor, z0, u0, u1, v0, v1):
-                stamp[block] = frame
-                active[n] = block
-                n += 1
+    # where nothing is behind a surface, there is no surface to be carved
+    blocks, depths, pixels = solid_blocks_in_view(
+        grid, region_count, stamp.shape[0], camera, sensor.min_depth, sensor.max_depth, depth.shape
+    )
+    for i in range(blocks.shape[0]):
+        block = blocks[i]
+        if stamp[block] != frame and _sees_through(depth, sensor, depths[i, 0], pixels[i]):
+            stamp[block] = frame
+            active[n] = block
+            n += 1
     return n
 
 

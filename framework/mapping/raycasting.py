@@ -20,11 +20,10 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, SurfaceView, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
-from framework.mapping.frustum import bounds, extent
+from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.sensor import Sensor, depth_noise, pinhole, ray_direction, seen_point
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
-    REGION_BLOCKS,
     REGION_SIDE,
     UNSEEN,
     VoxelGrid,
@@ -120,42 +119,15 @@ def _first_surface(grid, o, d, step, near, far, key, region):
     return zero, zero, zero, zero, key, region
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _bound_tiles(grid, region_count, camera, near, far, shape, tile_near, tile_far):
-    """Fills tile_near and tile_far (Y, X) m with the depths between which a tile's rays can meet a surface.
-
-    Regions and blocks are taken for the boxes along the camera's axes that hold them, so the bounds are never too
-    tight. `camera` holds T_camera_world. The cost is a test a region of the map (0.26 m^3 at 1 cm voxels) and one a
-    block of those in view.
-    """
-    tile_near[:] = far
-    tile_far[:] = near
-    voxel = grid.voxel_size
-    block_size = np.float32(BLOCK_SIDE) * voxel
-    region_size = np.float32(REGION_SIDE) * block_size
-    block_extent = extent(camera, block_size, voxel)
-    region_extent = extent(camera, region_size, voxel)
-    half = np.float32(0.5)
-    for region in range(region_count):
-        x = (np.float32(grid.region_coords[region, 0]) + half) * region_size
-        y = (np.float32(grid.region_coords[region, 1]) + half) * region_size
-        z = (np.float32(grid.region_coords[region, 2]) + half) * region_size
-        if not bounds(camera, x, y, z, region_extent, near, far, shape)[0]:
-            continue
-        for child in range(REGION_BLOCKS):
-            block = grid.region_blocks[region, child]
-            if block < 0 or not grid.solid[block]:
-                continue
-            x = (np.float32(grid.block_coords[block, 0]) + half) * block_size
-            y = (np.float32(grid.block_coords[block, 1]) + half) * block_size
-            z = (np.float32(grid.block_coords[block, 2]) + half) * block_size
-            visible, z0, z1, u0, u1, v0, v1 = bounds(camera, x, y, z, block_extent, near, far, shape)
-            if not visible:
-                continue
-            for ty in range(v0 // TILE, v1 // TILE + 1):
-                for tx in range(u0 // TILE, u1 // TILE + 1):
-                    tile_near[ty, tx] = min(tile_near[ty, tx], z0)
-                    tile_far[ty, tx] = max(tile_far[ty, tx], z1)
+@njit(cache=True, nogil=True)
+def _bound_tiles(depths, pixels, tile_near, tile_far):
+    """Narrows tile_near and tile_far (Y, X) m to the depths between which a tile's rays can meet a block's surface."""
+    for n in range(depths.shape[0]):
+        u0, u1, v0, v1 = pixels[n]
+        for ty in range(v0 // TILE, v1 // TILE + 1):
+            for tx in range(u0 // TILE, u1 // TILE + 1):
+                tile_near[ty, tx] = min(tile_near[ty, tx], depths[n, 0])
+                tile_far[ty, tx] = max(tile_far[ty, tx], depths[n, 1])
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -337,17 +309,17 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:
     """(near, far), each (Y, X) m: the depths between which the rays of each tile can meet a block."""
     tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
-    tile_near, tile_far = np.empty(tiles, np.float32), np.empty(tiles, np.float32)
-    _bound_tiles(
+    tile_near, tile_far = np.full(tiles, sensor.max_depth), np.full(tiles, sensor.min_depth)
+    _, depths, pixels = solid_blocks_in_view(
         voxels.grid,
         voxels.region_count,
+        voxels.block_count,
         pinhole(camera, inverse(T_world_camera)),
         sensor.min_depth,
         sensor.max_depth,
         camera.shape,
-        tile_near,
-        tile_far,
     )
+    _bound_tiles(depths, pixels, tile_near, tile_far)
     return tile_near, tile_far
 
 
