@@ -151,6 +151,25 @@ def _gather_model(depth, normals, size, pixel, points):
 
 
 @device
+def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
+    """Point n's term into J: its weight, its error, and the error's derivative by a twist of the view's frame.
+
+    (gx, gy, gz) is the error's derivative by the point (px, py, pz). What has no weight may be anything, also NaN, from
+    a pixel that it does not have.
+    """
+    zero = np.float32(0.0)
+    weighty = weight > zero
+    J[W + n] = weight
+    J[ERROR + n] = error if weighty else zero
+    J[J0 + n] = gx if weighty else zero
+    J[J1 + n] = gy if weighty else zero
+    J[J2 + n] = gz if weighty else zero
+    J[J3 + n] = py * gz - pz * gy if weighty else zero
+    J[J4 + n] = pz * gx - px * gz if weighty else zero
+    J[J5 + n] = px * gy - py * gx if weighty else zero
+
+
+@device
 def _add_geometry(model, R, weights, points, J):
     """The point-to-plane terms of a batch into J; returns (visible, weighed, close, behind).
 
@@ -187,15 +206,7 @@ def _add_geometry(model, R, weights, points, J):
         weight = weight if near & (dot > min_dot) else zero
         weighty = weight > zero
         points[NEAR + n] = one if near else zero
-        J[W + n] = weight
-        # what has no weight may hold anything, also NaN, from the pixel that it does not have
-        J[ERROR + n] = distance if weighty else zero
-        J[J0 + n] = nx if weighty else zero
-        J[J1 + n] = ny if weighty else zero
-        J[J2 + n] = nz if weighty else zero
-        J[J3 + n] = py * nz - pz * ny if weighty else zero
-        J[J4 + n] = pz * nx - px * nz if weighty else zero
-        J[J5 + n] = px * ny - py * nx if weighty else zero
+        _write_term(J, n, weight, distance, nx, ny, nz, px, py, pz)
         apart = max(close_distance, np.float32(3.0) * sigma)
         visible += np.int32(1) if mapped else np.int32(0)
         weighed += np.int32(1) if weighty else np.int32(0)
@@ -251,14 +262,7 @@ def _add_photometry(model, inverse_scale, weights, brightness, points, J):
         weight = _tukey(error / noise, scale) * strength
         weight = weight if seen else zero
         weighty = weight > zero
-        J[W + n] = weight
-        J[ERROR + n] = error if weighty else zero
-        J[J0 + n] = gx if weighty else zero
-        J[J1 + n] = gy if weighty else zero
-        J[J2 + n] = gz if weighty else zero
-        J[J3 + n] = py * gz - pz * gy if weighty else zero
-        J[J4 + n] = pz * gx - px * gz if weighty else zero
-        J[J5 + n] = px * gy - py * gx if weighty else zero
+        _write_term(J, n, weight, error, gx, gy, gz, px, py, pz)
         compared += np.int32(1) if seen else np.int32(0)
         weighed += np.int32(1) if weighty else np.int32(0)
         darker -= change if seen else zero
