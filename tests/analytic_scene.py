@@ -7,9 +7,19 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from framework.data import Camera, Frame, FrameTruth
+from framework.data import Camera, Frame, FrameTruth, PointClusters
 
 CAMERA = Camera(160, 120, 131.0, 131.0, 79.5, 59.5)
+
+
+NOTHING = PointClusters(  # a frame in which nothing was detected
+    np.zeros((0, 3), np.float32),
+    np.zeros((0, 2), np.int32),
+    np.zeros(0, np.int32),
+    np.zeros((0, 1), np.float32),
+    np.zeros(0, np.float32),
+    ("chair",),
+)
 
 
 @dataclass

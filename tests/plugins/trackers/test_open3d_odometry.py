@@ -7,23 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from framework.data import Frame, PointClusters, Pose
+from framework.data import Frame, Pose
 from framework.errors import ConfigError
 from framework.geometry import exp_se3, inverse, rotation_angle
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.open3d_odometry import Method, Open3dOdometry, Reference
 from tests import registered
-from tests.analytic_scene import walk
+from tests.analytic_scene import NOTHING, walk
 from tests.papered_room import CAMERA, papered_frame
 
-NOTHING = PointClusters(
-    np.zeros((0, 3), np.float32),
-    np.zeros((0, 2), np.int32),
-    np.zeros(0, np.int32),
-    np.zeros((0, 1), np.float32),
-    np.zeros(0, np.float32),
-    ("chair",),
-)
 LOOKING_INTO_A_CORNER = exp_se3(np.array([0, 0, 0, 0.5, 0.6, 0]))
 BEST = [
     ({}, 0.01),

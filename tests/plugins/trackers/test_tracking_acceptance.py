@@ -14,7 +14,7 @@ import numpy as np
 import open3d as o3d
 import pytest
 
-from framework.data import Frame, PointClusters, Pose
+from framework.data import Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.synthetic import Synthetic
 from framework.evaluation.trajectory import evaluate
@@ -22,16 +22,8 @@ from framework.geometry import inverse
 from framework.interfaces import SceneMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.analytic_scene import CAMERA, Scene, pose
+from tests.analytic_scene import CAMERA, NOTHING, Scene, pose
 
-NOTHING = PointClusters(
-    np.zeros((0, 3), np.float32),
-    np.zeros((0, 2), np.int32),
-    np.zeros(0, np.int32),
-    np.zeros((0, 1), np.float32),
-    np.zeros(0, np.float32),
-    ("chair",),
-)
 VOXEL = 0.02  # m, of the small images here
 WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as lost, is a lie
 

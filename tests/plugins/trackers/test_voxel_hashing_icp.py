@@ -5,22 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from framework.data import Camera, Frame, PointClusters, Pose
+from framework.data import Camera, Frame, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import inverse, rotation_angle
 from framework.interfaces import SceneMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.analytic_scene import CAMERA, Scene, room, walk
-
-NOTHING = PointClusters(
-    np.zeros((0, 3), np.float32),
-    np.zeros((0, 2), np.int32),
-    np.zeros(0, np.int32),
-    np.zeros((0, 1), np.float32),
-    np.zeros(0, np.float32),
-    ("chair",),
-)
+from tests.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:
