@@ -30,7 +30,8 @@ from framework.mapping.voxel_grid import (
     device,
     find_block,
 )
-from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, trilinear_color, voxel_number
+from framework.mapping.voxel_rows import blend_colors, gather_corners, points_of_row, step_to_surface
+from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, voxel_number
 
 TILE = 8  # px; one tile's rays share blocks in the cache
 REFINEMENTS = 4  # Newton steps at most: one meets a plane, two or three a curved surface
@@ -38,6 +39,7 @@ CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter tha
 REACH = 3.0  # voxels, from where a refinement may start to the surface that it finds
 DETAIL = 4.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
 ONE_SURFACE = 8.0  # voxels of depth that a surface may rise between coarse rays
+STEEPEST = 24.0
 MAX_SHIFT = 10.0  # voxels between a reading and the map's surface that may still be one surface seen from elsewhere
 MAX_STRIDE = 8  # px between coarse rays
 
@@ -150,88 +152,137 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 
 
 @device
-def _first_and_last(z00, z01, z10, z11):
-    """The least and the greatest depth of four, of which 0 is none."""
-    none = np.float32(np.inf)
-    nearest = min(
-        min(z00 if z00 > 0 else none, z01 if z01 > 0 else none), min(z10 if z10 > 0 else none, z11 if z11 > 0 else none)
-    )
-    return nearest, max(max(z00, z01), max(z10, z11))
+def _search_cells(above, below, row_near, row_far, stride, margin, resolved, near, far, corners):
+    """What the coarse depths of two rows (X + 1,) m tell of the cells (X,) of pixels between them.
+
+    near and far get the depths, m, between which a cell can show a surface; far 0 = nowhere. corners (4, X) gets the
+    inverse depths of that surface, in the order of the rows, where there is just one, and 0 where there is none or it
+    is not clear.
+    """
+    zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
+    rise = np.float32(STEEPEST) / np.float32(ONE_SURFACE) * margin
+    for x in range(near.shape[0]):
+        near[x], far[x] = row_near[x * stride // TILE], row_far[x * stride // TILE]
+        corners[0, x], corners[1, x], corners[2, x], corners[3, x] = above[x], above[x + 1], below[x], below[x + 1]
+        nearest, farthest, total = none, zero, zero
+        hits = 0
+        for c in range(4):
+            z = corners[c, x]
+            if z > zero:
+                nearest, farthest = min(nearest, z), max(farthest, z)
+                corners[c, x] = one / z
+                total += one / z
+                hits += 1
+        if hits == 0:
+            far[x] = zero if far[x] < resolved else far[x]
+        elif (farthest if hits == 4 else far[x]) < resolved:
+            near[x], far[x] = max(near[x], nearest - margin), min(far[x], farthest + margin)
+        if hits == 0 or farthest > resolved or farthest - nearest > rise:
+            corners[0, x] = corners[1, x] = corners[2, x] = corners[3, x] = zero
+        elif hits < 4:
+            # the inverse of depth is linear across the image of a plane: three corners tell the fourth
+            for c in range(4):
+                if corners[c, x] == zero:
+                    corners[c, x] = total - np.float32(2.0) * corners[3 - c, x] if hits == 3 else total / np.float32(hits)
+
+
+@device
+def _start_row(corners, b, stride, limits, depth):
+    """Fills depth (W,) m with the surface between the corners (4, X) of cells, a part b of the way down; 0 where it is
+    not known.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    width = depth.shape[0]
+    for x in range(corners.shape[1]):
+        u0, u1 = x * stride, min((x + 1) * stride, width - 1)
+        left = corners[0, x] + b * (corners[2, x] - corners[0, x])
+        right = corners[1, x] + b * (corners[3, x] - corners[1, x])
+        across = (right - left) / np.float32(max(u1 - u0, 1))
+        for u in range(u0, u1 + 1 if u1 == width - 1 else u1):
+            z = one / (left + across * np.float32(u - u0))
+            depth[u] = z if zero < z < limits[u] else zero
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def cast_fine(grid, view, tile_near, tile_far, stride, coarse, depth, normals):
+def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals):
     """Fills depth (H, W) m and normals (H, W, 3), world, of the surface that `view` (T_world_camera) sees; 0 = none.
 
-    `coarse` is what cast_coarse() found. Normals are the gradient of the trilinear field.
+    `coarse` is what cast_coarse() or cast_near() found. No pixel is searched beyond its limit (H, W) m. Normals are the
+    gradient of the trilinear field.
     """
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
     scale = one / voxel
-    rise = np.float32(ONE_SURFACE) * voxel
+    margin = np.float32(ONE_SURFACE) * voxel
     # the depth up to which coarse rays are near enough to each other to show all there is
     resolved = np.float32(DETAIL) * voxel * min(view.fx, view.fy) / np.float32(stride)
+    cells = coarse.shape[1] - 1
     for y in prange(coarse.shape[0] - 1):
         o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
         key = np.int64(-2)
         region = np.int32(-1)
+        near, far = np.empty(cells, np.float32), np.empty(cells, np.float32)
+        corners = np.empty((4, cells), np.float32)
+        points, gradients = np.empty((3, width), np.float32), np.empty((3, width), np.float32)
+        found = np.empty((8, width), np.int16)
         v0, v1 = y * stride, min((y + 1) * stride, height - 1)
-        for x in range(coarse.shape[1] - 1):
-            u0, u1 = x * stride, min((x + 1) * stride, width - 1)
-            near, far = tile_near[v0 // TILE, u0 // TILE], tile_far[v0 // TILE, u0 // TILE]
-            z00, z01, z10, z11 = coarse[y, x], coarse[y, x + 1], coarse[y + 1, x], coarse[y + 1, x + 1]
-            nearest, farthest = _first_and_last(z00, z01, z10, z11)
-            all_hit = min(min(z00, z01), min(z10, z11)) > zero
-            empty = farthest == zero and far < resolved
-            smooth = all_hit and farthest < resolved and farthest - nearest < rise
-            if farthest > zero and (farthest if all_hit else far) < resolved:
-                near, far = max(near, nearest - rise), min(far, farthest + rise)
-            for v in range(v0, v1 + 1 if v1 == height - 1 else v1):
-                # the inverse of depth is linear across the image of a plane
-                b = np.float32(v - v0) / np.float32(max(v1 - v0, 1))
-                left = one / z00 + b * (one / z10 - one / z00) if smooth else zero
-                right = one / z01 + b * (one / z11 - one / z01) if smooth else zero
-                across = (right - left) / np.float32(max(u1 - u0, 1))
-                for u in range(u0, u1 + 1 if u1 == width - 1 else u1):
-                    z = nx = ny = nz = zero
-                    if not empty:
+        row_near, row_far = tile_near[v0 // TILE], tile_far[v0 // TILE]
+        _search_cells(coarse[y], coarse[y + 1], row_near, row_far, stride, margin, resolved, near, far, corners)
+        for v in range(v0, v1 + 1 if v1 == height - 1 else v1):
+            row = depth[v]
+            _start_row(corners, np.float32(v - v0) / np.float32(max(v1 - v0, 1)), stride, limits[v], row)
+            points_of_row(view, scale, v, row, points)
+            gather_corners(grid, grid.tsdf, row, points, np.int16(UNSEEN), found)
+            step_to_surface(
+                view, scale, v, found, points, np.float32(CONVERGED), np.float32(REACH), row, gradients
+            )
+            for u in range(width):
+                z = row[u]
+                if z <= zero:
+                    nx = ny = nz = zero
+                    x = min(u // stride, cells - 1)
+                    if far[x] > zero and limits[v, u] > zero:
                         d, step = _ray(view, scale, u, v)
-                        if smooth:
-                            start = one / (left + across * np.float32(u - u0))
+                        if z < zero:
                             reach = np.float32(REACH) * step
-                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, reach, key, region)
+                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, -z, reach, key, region)
                         if z == zero:
-                            z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near, far, key, region)
+                            last = min(far[x], limits[v, u])
+                            z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near[x], last, key, region)
                     norm = np.sqrt(nx * nx + ny * ny + nz * nz)
                     norm = one / norm if z > zero else zero  # the field falls along the ray, so it is not 0
-                    depth[v, u] = z
-                    normals[v, u, 0] = nx * norm
-                    normals[v, u, 1] = ny * norm
-                    normals[v, u, 2] = nz * norm
+                    row[u] = z
+                    gradients[0, u], gradients[1, u], gradients[2, u] = nx * norm, ny * norm, nz * norm
+                normals[v, u, 0] = gradients[0, u]
+                normals[v, u, 1] = gradients[1, u]
+                normals[v, u, 2] = gradients[2, u]
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def cast_near(grid, view, tile_near, tile_far, max_depth, readings, depth, normals):
-    """Like cast_fine(), with the search begun at the camera's own readings (H, W) m; nothing where there is none, where
-    it is beyond what the map holds, nor where the map's surface is more than MAX_SHIFT behind it.
+def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
+    """Like cast_coarse(), with the search begun at the camera's own readings (H, W) m; no pixel is searched beyond its
+    limit (H, W) m, 0 = not at all.
 
     Readings are noisy and a wrong pose displaces them. So where a reading fits the surface that the two pixels before
     it have shown, the search begins there, and else where the last reading was displaced to.
     """
+    height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
     scale = one / voxel
-    for v in prange(depth.shape[0]):
+    for y in prange(depth.shape[0]):
         o = (view.t[0] * scale, view.t[1] * scale, view.t[2] * scale)
         key = np.int64(-2)
         region = np.int32(-1)
         shift = zero
         last = last_but_one = zero  # inverse depths of the pixels before, 0 = no surface
-        for u in range(depth.shape[1]):
-            z = nx = ny = nz = zero
+        v = min(y * stride, height - 1)
+        for x in range(depth.shape[1]):
+            u = min(x * stride, width - 1)
+            z = zero
             reading = readings[v, u]
-            if zero < reading < max_depth + np.float32(MAX_SHIFT) * voxel:
+            if limits[v, u] > zero:
                 d, step = _ray(view, scale, u, v)
                 start = reading + shift
                 reach = np.float32(REACH) * voxel + np.float32(3.0) * depth_noise(reading)
@@ -239,21 +290,15 @@ def cast_near(grid, view, tile_near, tile_far, max_depth, readings, depth, norma
                     ahead = one / max(last + last - last_but_one, np.float32(1e-3))
                     if abs(ahead - start) < reach:
                         start = ahead
-                z, nx, ny, nz, key, region = _refined(grid, o, d, step, start, reach, key, region)
+                z, _, _, _, key, region = _refined(grid, o, d, step, start, reach, key, region)
                 if z == zero:
-                    near = tile_near[v // TILE, u // TILE]
-                    far = min(tile_far[v // TILE, u // TILE], reading + np.float32(MAX_SHIFT) * voxel)
-                    z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near, far, key, region)
+                    near, far = tile_near[v // TILE, u // TILE], min(tile_far[v // TILE, u // TILE], limits[v, u])
+                    z, _, _, _, key, region = _first_surface(grid, o, d, step, near, far, key, region)
                 apart = z - reading
                 shift = apart if z > zero and abs(apart) < np.float32(MAX_SHIFT) * voxel else zero
             last_but_one = last
             last = one / z if z > zero else zero
-            norm = np.sqrt(nx * nx + ny * ny + nz * nz)
-            norm = one / norm if z > zero else zero
-            depth[v, u] = z
-            normals[v, u, 0] = nx * norm
-            normals[v, u, 1] = ny * norm
-            normals[v, u, 2] = nz * norm
+            depth[y, x] = z
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -261,23 +306,12 @@ def paint(grid, view, depth, color):
     """Fills color (H, W, 3) with the map's colour at the surface that `depth` (H, W) m, seen from `view`, describes."""
     height, width = depth.shape
     scale = np.float32(1.0) / grid.voxel_size
-    half = np.float32(0.5)
     for v in prange(height):
-        key = np.int64(-2)
-        region = np.int32(-1)
-        for u in range(width):
-            red = green = blue = -half
-            z = depth[v, u]
-            if z > np.float32(0.0):
-                x, y, w = seen_point(view, u, v, z)
-                x, y, w = x * scale, y * scale, w * scale
-                i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(w))
-                block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
-                if block >= 0:
-                    red, green, blue = trilinear_color(grid, block, x, y, w)
-            color[v, u, 0] = np.uint8(red + half)
-            color[v, u, 1] = np.uint8(green + half)
-            color[v, u, 2] = np.uint8(blue + half)
+        points = np.empty((3, width), np.float32)
+        found = np.empty((8, width), np.uint32)
+        points_of_row(view, scale, v, depth[v], points)
+        gather_corners(grid, grid.color, depth[v], points, np.uint32(0), found)
+        blend_colors(found, points, color[v])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -328,13 +362,19 @@ def cast_view(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera:
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
-    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)
-    coarse = np.empty((rays_y, rays_x), np.float32)
+    coarse = _coarse(camera, stride)
     cast_coarse(voxels.grid, view, tile_near, tile_far, stride, camera.shape, coarse)
     depth = np.empty(camera.shape, np.float32)
     normals = np.empty((*camera.shape, 3), np.float32)
-    cast_fine(voxels.grid, view, tile_near, tile_far, stride, coarse, depth, normals)
+    limits = np.full(camera.shape, sensor.max_depth)
+    cast_fine(voxels.grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals)
     return depth, normals
+
+
+def _coarse(camera: Camera, stride: int) -> Float32:
+    """Room for the depths of every stride-th pixel and of the image's last row and column."""
+    rays_y, rays_x = (max(1, -(-(side - 1) // stride)) + 1 for side in camera.shape)
+    return np.empty((rays_y, rays_x), np.float32)
 
 
 def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
@@ -361,9 +401,14 @@ def render_near(
     """The surface that `camera` sees at its `readings` (H, W) m, or in front of them."""
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
+    stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
+    coarse = _coarse(camera, stride)
+    shift = np.float32(MAX_SHIFT) * voxels.grid.voxel_size
+    limits = np.where((readings > 0) & (readings < sensor.max_depth + shift), readings + shift, np.float32(0.0))
+    cast_near(voxels.grid, view, tile_near, tile_far, limits, stride, readings, coarse)
     depth = np.empty(camera.shape, np.float32)
     normals = np.empty((*camera.shape, 3), np.float32)
-    cast_near(voxels.grid, view, tile_near, tile_far, sensor.max_depth, readings, depth, normals)
+    cast_fine(voxels.grid, view, tile_near, tile_far, limits, stride, coarse, depth, normals)
     color = np.empty((*camera.shape, 3), np.uint8)
     paint(voxels.grid, view, depth, color)
     return SurfaceView(camera, T_world_camera, depth, normals, color)

@@ -86,16 +86,8 @@ def corners(grid, values, block, i, j, k, missing):
 
 
 @device
-def trilinear(grid, block, x, y, z):
-    """(value, d/dx, d/dy, d/dz, valid): the field of stored distances at (x, y, z), in voxels, and its gradient.
-
-    `block` holds the voxel at the floor of the point. Valid when all eight voxels around it were seen.
-    """
-    i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
-    fx, fy, fz = x - np.float32(i), y - np.float32(j), z - np.float32(k)
-    s = corners(grid, grid.tsdf, block, i, j, k, np.int16(UNSEEN))
-    seen = min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
-    # along x, then y, then z
+def interpolate(s, fx, fy, fz):
+    """(value, d/dx, d/dy, d/dz) between eight corners, x fastest, at the fractions (fx, fy, fz) of a voxel."""
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
     dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
@@ -106,11 +98,29 @@ def trilinear(grid, block, x, y, z):
     dy0, dy1 = x10 - x00, x11 - x01
     y0, y1 = x00 + fy * dy0, x01 + fy * dy1
     dx0, dx1 = dx00 + fy * (dx10 - dx00), dx01 + fy * (dx11 - dx01)
-    return y0 + fz * (y1 - y0), dx0 + fz * (dx1 - dx0), dy0 + fz * (dy1 - dy0), y1 - y0, seen
+    return y0 + fz * (y1 - y0), dx0 + fz * (dx1 - dx0), dy0 + fz * (dy1 - dy0), y1 - y0
 
 
 @device
-def _blend(red, green, blue, total, packed, share):
+def all_seen(s):
+    """Whether eight corners' distances were all seen."""
+    return min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
+
+
+@device
+def trilinear(grid, block, x, y, z):
+    """(value, d/dx, d/dy, d/dz, valid): the field of stored distances at (x, y, z), in voxels, and its gradient.
+
+    `block` holds the voxel at the floor of the point. Valid when all eight voxels around it were seen.
+    """
+    i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
+    s = corners(grid, grid.tsdf, block, i, j, k, np.int16(UNSEEN))
+    value, dx, dy, dz = interpolate(s, x - np.float32(i), y - np.float32(j), z - np.float32(k))
+    return value, dx, dy, dz, all_seen(s)
+
+
+@device
+def _add_color(red, green, blue, total, packed, share):
     """Adds a packed colour with its share; a voxel without a colour has no say."""
     share = share if packed & COLORED else np.float32(0.0)
     r, g, b = unpack_color(packed)
@@ -118,20 +128,17 @@ def _blend(red, green, blue, total, packed, share):
 
 
 @device
-def trilinear_color(grid, block, x, y, z):
-    """(red, green, blue) at (x, y, z), in voxels, between the voxels that have a colour. `block` as in trilinear()."""
-    i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
-    x1, y1, z1 = x - np.float32(i), y - np.float32(j), z - np.float32(k)
+def blend(p, x1, y1, z1):
+    """(red, green, blue) at the fractions (x1, y1, z1) between eight packed colours, of those that are colours."""
     one, zero = np.float32(1.0), np.float32(0.0)
     x0, y0, z0 = one - x1, one - y1, one - z1
-    p = corners(grid, grid.color, block, i, j, k, np.uint32(0))
-    r, g, b, total = _blend(zero, zero, zero, zero, p[0], x0 * y0 * z0)
-    r, g, b, total = _blend(r, g, b, total, p[1], x1 * y0 * z0)
-    r, g, b, total = _blend(r, g, b, total, p[2], x0 * y1 * z0)
-    r, g, b, total = _blend(r, g, b, total, p[3], x1 * y1 * z0)
-    r, g, b, total = _blend(r, g, b, total, p[4], x0 * y0 * z1)
-    r, g, b, total = _blend(r, g, b, total, p[5], x1 * y0 * z1)
-    r, g, b, total = _blend(r, g, b, total, p[6], x0 * y1 * z1)
-    r, g, b, total = _blend(r, g, b, total, p[7], x1 * y1 * z1)
+    r, g, b, total = _add_color(zero, zero, zero, zero, p[0], x0 * y0 * z0)
+    r, g, b, total = _add_color(r, g, b, total, p[1], x1 * y0 * z0)
+    r, g, b, total = _add_color(r, g, b, total, p[2], x0 * y1 * z0)
+    r, g, b, total = _add_color(r, g, b, total, p[3], x1 * y1 * z0)
+    r, g, b, total = _add_color(r, g, b, total, p[4], x0 * y0 * z1)
+    r, g, b, total = _add_color(r, g, b, total, p[5], x1 * y0 * z1)
+    r, g, b, total = _add_color(r, g, b, total, p[6], x0 * y1 * z1)
+    r, g, b, total = _add_color(r, g, b, total, p[7], x1 * y1 * z1)
     scale = np.float32(0.25) / max(total, np.float32(1e-6))
     return r * scale, g * scale, b * scale
