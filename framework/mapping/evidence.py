@@ -22,7 +22,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32
 from framework.mapping.integration import SeenBlocks
-from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more
 
 SLOTS = 4  # instances and classes that a voxel can tell apart
 NEW_CLASSES = 4  # a detection can bring its best so many classes into a voxel's slots
@@ -166,8 +166,13 @@ def _find_blocks_under_clusters(grid, seen, measurement, first_point, wants_row)
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
         if seen.near[a] and grid.label_row[seen.blocks[a]] < 0:
-            for n in range(BLOCK_VOXELS):
-                pixel = seen.near_pixel[a, n]
+            pixels = seen.near_pixel[a]
+            under = np.int32(0)
+            for n in range(BLOCK_VOXELS):  # without a branch, so that it is vectorised: most blocks are under none
+                pixel = pixels[n]
+                under = one_more(under, (pixel >= 0) & (first_point[max(pixel, np.int32(0))] >= 0))
+            for n in range(BLOCK_VOXELS if under > 0 else 0):
+                pixel = pixels[n]
                 p = first_point[pixel] if pixel >= 0 else np.int32(-1)
                 while p >= 0 and measurement.instance_id[measurement.cluster[p]] == 0:
                     p = measurement.next_point[p]

@@ -22,6 +22,7 @@ from numba import njit, prange
 from framework.data import Bool, Float64, Frame, Int32
 from framework.geometry import inverse
 from framework.mapping.allocation import Allocator
+from framework.mapping.prefetching import prefetch_row
 from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
@@ -32,6 +33,7 @@ from framework.mapping.voxel_grid import (
     VoxelGrid,
     device,
     is_solid,
+    one_more,
     pack_color,
     unpack_color,
 )
@@ -115,8 +117,8 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
         # colour belongs to the surface, not to the air before it
         at_surface = seen & (sdf < band)
         scratch[n + BLOCK_VOXELS] = portion if at_surface else zero
-        colored += np.int32(1) if at_surface else np.int32(0)
-        near += np.int32(1) if seen & (abs(sdf) <= near_band) else np.int32(0)
+        colored = one_more(colored, at_surface)
+        near = one_more(near, seen & (abs(sdf) <= near_band))
     return colored, near
 
 
@@ -132,9 +134,9 @@ def _average_colors(packed, seen, rounding, scratch):
         share = one if first else share
         new = np.int32(seen[n])
         red, green, blue = unpack_color(packed[n])
-        red += share * (four * np.float32(new & byte) - red)
-        green += share * (four * np.float32((new >> one_byte) & byte) - green)
-        blue += share * (four * np.float32((new >> two_bytes) & byte) - blue)
+        red += share * (four * np.float32(np.int32(new & byte)) - red)
+        green += share * (four * np.float32(np.int32((new >> one_byte) & byte)) - green)
+        blue += share * (four * np.float32(np.int32((new >> two_bytes) & byte)) - blue)
         mean = pack_color(
             min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
         )
@@ -160,6 +162,10 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
     to_units = np.float32(1.0) / grid.tsdf_unit
     for a in prange(active.shape[0]):
         block = active[a]
+        after = np.int64(active[min(a + 1, active.shape[0] - 1)])
+        prefetch_row(grid.tsdf, after)
+        prefetch_row(grid.weight, after)
+        prefetch_row(grid.color, after)
         tsdf, weight, packed = grid.tsdf[block], grid.weight[block], grid.color[block]
         pixel = np.empty(BLOCK_VOXELS, np.int32)
         scratch = np.empty(2 * BLOCK_VOXELS, np.float32)

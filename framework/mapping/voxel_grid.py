@@ -40,6 +40,12 @@ NO_KEY = -1
 # Grid up and down at each call wait for each other.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
+@device
+def one_more(count, condition):
+    """`count`, int32, and one where the condition holds. numba adds in 64 bits, and half as many fit into a vector."""
+    return np.int32(count + (np.int32(1) if condition else np.int32(0)))
+
+
 _KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
 _KEY_OFFSET = 1 << (_KEY_BITS - 1)
 _KEY_MASK = (1 << _KEY_BITS) - 1
@@ -183,7 +189,7 @@ def _link_neighbors(grid, block):
             grid.neighbors[before, c] = block
 
 
-# numpy's numbers, because with a literal numba computes in 64 bits
+# numpy's numbers, and their results cast, because numba computes in 64 bits else: half as many fit into a vector
 _CHANNEL = np.int32(1023)
 _GREEN = np.int32(10)
 _BLUE = np.int32(20)
@@ -201,9 +207,9 @@ def unpack_color(packed):
     """(red, green, blue) float32 in quarters of a level."""
     bits = np.int32(packed)
     return (
-        np.float32(bits & _CHANNEL),
-        np.float32((bits >> _GREEN) & _CHANNEL),
-        np.float32((bits >> _BLUE) & _CHANNEL),
+        np.float32(np.int32(bits & _CHANNEL)),
+        np.float32(np.int32((bits >> _GREEN) & _CHANNEL)),
+        np.float32(np.int32((bits >> _BLUE) & _CHANNEL)),
     )
 
 

@@ -20,7 +20,7 @@ from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, SurfaceView
 from framework.mapping.sensor import depth_noise
-from framework.mapping.voxel_grid import device
+from framework.mapping.voxel_grid import device, one_more
 from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
@@ -208,10 +208,10 @@ def _add_geometry(model, R, weights, points, J):
         points[NEAR + n] = one if near else zero
         _write_term(J, n, weight, distance, nx, ny, nz, px, py, pz)
         apart = max(close_distance, np.float32(3.0) * sigma)
-        visible += np.int32(1) if mapped else np.int32(0)
-        weighed += np.int32(1) if weighty else np.int32(0)
-        close += np.int32(1) if mapped & (abs(ez) < apart) else np.int32(0)
-        behind += np.int32(1) if mapped & (ez > apart + apart) else np.int32(0)
+        visible = one_more(visible, mapped)
+        weighed = one_more(weighed, weighty)
+        close = one_more(close, mapped & (abs(ez) < apart))
+        behind = one_more(behind, mapped & (ez > apart + apart))
     return visible, weighed, close, behind
 
 
@@ -263,8 +263,8 @@ def _add_photometry(model, inverse_scale, weights, brightness, points, J):
         weight = weight if seen else zero
         weighty = weight > zero
         _write_term(J, n, weight, error, gx, gy, gz, px, py, pz)
-        compared += np.int32(1) if seen else np.int32(0)
-        weighed += np.int32(1) if weighty else np.int32(0)
+        compared = one_more(compared, seen)
+        weighed = one_more(weighed, weighty)
         darker -= change if seen else zero
     return weighed, darker, compared
 
