@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
@@ -32,16 +34,21 @@ def skew(v: Float64) -> Float64:
 def exp_se3(xi: Float64) -> Float64:
     """The rigid motion exp(xi^) of a twist xi = (translation part, rotation part), (6,) m and rad."""
     rho, phi = np.asarray(xi[:3], np.float64), np.asarray(xi[3:], np.float64)
-    theta = float(np.linalg.norm(phi))
+    theta = math.sqrt(phi @ phi)
     W = skew(phi)
-    A = np.sinc(theta / np.pi)  # sin(theta) / theta
-    B = np.sinc(theta / 2 / np.pi) ** 2 / 2  # (1 - cos(theta)) / theta^2, which would cancel
+    WW = W @ W
+    A = _sinc(theta)
+    B = _sinc(theta / 2) ** 2 / 2  # (1 - cos(theta)) / theta^2, which would cancel
     # (theta - sin(theta)) / theta^3, as a series where the difference would cancel: what it leaves out is theta^6
-    C = (theta - np.sin(theta)) / theta**3 if theta > 1e-2 else 1 / 6 - theta**2 / 120 + theta**4 / 5040
+    C = (theta - math.sin(theta)) / theta**3 if theta > 1e-2 else 1 / 6 - theta**2 / 120 + theta**4 / 5040
     T = np.eye(4)
-    T[:3, :3] = np.eye(3) + A * W + B * W @ W
-    T[:3, 3] = (np.eye(3) + B * W + C * W @ W) @ rho
+    T[:3, :3] += A * W + B * WW
+    T[:3, 3] = rho + B * (W @ rho) + C * (WW @ rho)
     return T
+
+
+def _sinc(x: float) -> float:
+    return math.sin(x) / x if x else 1.0
 
 
 def rotation_angle(R: Float64) -> float:

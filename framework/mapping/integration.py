@@ -38,6 +38,7 @@ from framework.mapping.voxel_grid import (
     unpack_color,
 )
 
+LAYER_VOXELS = BLOCK_SIDE**2
 FAR = 1e9  # m
 LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
@@ -61,22 +62,23 @@ def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
     R20, R21, R22, t2 = camera.R[2, 0] * voxel, camera.R[2, 1] * voxel, camera.R[2, 2] * voxel, camera.t[2]
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx + half, camera.cy + half
     right, bottom = np.float32(shape[1]), np.float32(shape[0])
-    for row in range(BLOCK_VOXELS // BLOCK_SIDE):
-        m = np.int32(row)
-        y, z = y0 + np.float32(m & seven), z0 + np.float32(m >> three)
-        row_x = R00 * x0 + R01 * y + R02 * z + t0
-        row_y = R10 * x0 + R11 * y + R12 * z + t1
-        row_z = R20 * x0 + R21 * y + R22 * z + t2
-        for i in range(BLOCK_SIDE):
-            x = np.float32(np.int32(i))
-            px, py, pz = row_x + R00 * x, row_y + R10 * x, row_z + R20 * x
+    for layer in range(BLOCK_SIDE):
+        z = z0 + np.float32(np.int32(layer))
+        layer_x, layer_y, layer_z = R02 * z + t0, R12 * z + t1, R22 * z + t2
+        first = layer * LAYER_VOXELS
+        for n in range(LAYER_VOXELS):
+            m = np.int32(n)
+            x, y = x0 + np.float32(np.int32(m & seven)), y0 + np.float32(np.int32(m >> three))
+            px = R00 * x + R01 * y + layer_x
+            py = R10 * x + R11 * y + layer_y
+            pz = R20 * x + R21 * y + layer_z
             w = one / max(pz, min_depth)
             u = fx * px * w + cx
             v = fy * py * w + cy
             inside = (pz > min_depth) & (u > zero) & (v > zero) & (u < right) & (v < bottom)
-            number = np.int32(v) * width + np.int32(u)
-            pixel[row * BLOCK_SIDE + i] = number if inside else np.int32(0)
-            scratch[row * BLOCK_SIDE + i] = pz if inside else np.float32(FAR)
+            number = np.int32(np.int32(v) * width + np.int32(u))
+            pixel[first + n] = number if inside else np.int32(0)
+            scratch[first + n] = pz if inside else np.float32(FAR)
 
 
 @device

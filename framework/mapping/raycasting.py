@@ -2,9 +2,9 @@
 
 First the blocks in view are projected to image tiles, which bounds the depths that each tile's rays must search. Then
 every few pixels a ray crosses absent regions and blocks in one step each, walks the truncated distance field by steps
-of the distance itself, and finds the surface where the field changes from positive to negative. Between four such
-rays that meet one surface, the depth of the pixels is interpolated. All are refined on the trilinear field (Newton's
-method), and where that fails, the pixel gets a full search of its own.
+of the distance itself, and finds the surface where the field changes from positive to negative. Between such rays that
+meet one surface, the depth of the pixels is interpolated, and refined on the trilinear field (Newton's method), a row
+of the image at a time. Where that fails, the pixel gets a full search of its own.
 
 A surface narrower than the distance between the coarse rays could be overlooked by interpolation. So that distance is
 kept below the size of the map's own details, and where it is not, all pixels are searched.
@@ -38,8 +38,8 @@ REFINEMENTS = 4  # Newton steps at most: one meets a plane, two or three a curve
 CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter than this ends within some hundredths
 REACH = 3.0  # voxels, from where a refinement may start to the surface that it finds
 DETAIL = 4.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
-ONE_SURFACE = 8.0  # voxels of depth that a surface may rise between coarse rays
-STEEPEST = 24.0
+MARGIN = 8.0  # voxels that a surface may come out from between the coarse rays that meet it
+STEEPEST = 24.0  # voxels of depth that one surface may rise between coarse rays: a floor far away does
 MAX_SHIFT = 10.0  # voxels between a reading and the map's surface that may still be one surface seen from elsewhere
 MAX_STRIDE = 8  # px between coarse rays
 
@@ -152,7 +152,7 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 
 
 @device
-def _search_cells(above, below, row_near, row_far, stride, margin, resolved, near, far, corners):
+def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near, far, corners):
     """What the coarse depths of two rows (X + 1,) m tell of the cells (X,) of pixels between them.
 
     near and far get the depths, m, between which a cell can show a surface; far 0 = nowhere. corners (4, X) gets the
@@ -160,7 +160,7 @@ def _search_cells(above, below, row_near, row_far, stride, margin, resolved, nea
     is not clear.
     """
     zero, one, none = np.float32(0.0), np.float32(1.0), np.float32(np.inf)
-    rise = np.float32(STEEPEST) / np.float32(ONE_SURFACE) * margin
+    margin, rise = np.float32(MARGIN) * voxel, np.float32(STEEPEST) * voxel
     for x in range(near.shape[0]):
         near[x], far[x] = row_near[x * stride // TILE], row_far[x * stride // TILE]
         corners[0, x], corners[1, x], corners[2, x], corners[3, x] = above[x], above[x + 1], below[x], below[x + 1]
@@ -183,7 +183,9 @@ def _search_cells(above, below, row_near, row_far, stride, margin, resolved, nea
             # the inverse of depth is linear across the image of a plane: three corners tell the fourth
             for c in range(4):
                 if corners[c, x] == zero:
-                    corners[c, x] = total - np.float32(2.0) * corners[3 - c, x] if hits == 3 else total / np.float32(hits)
+                    corners[c, x] = (
+                        total - np.float32(2.0) * corners[3 - c, x] if hits == 3 else total / np.float32(hits)
+                    )
 
 
 @device
@@ -214,7 +216,6 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
     zero, one = np.float32(0.0), np.float32(1.0)
     voxel = grid.voxel_size
     scale = one / voxel
-    margin = np.float32(ONE_SURFACE) * voxel
     # the depth up to which coarse rays are near enough to each other to show all there is
     resolved = np.float32(DETAIL) * voxel * min(view.fx, view.fy) / np.float32(stride)
     cells = coarse.shape[1] - 1
@@ -228,15 +229,13 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
         found = np.empty((8, width), np.int16)
         v0, v1 = y * stride, min((y + 1) * stride, height - 1)
         row_near, row_far = tile_near[v0 // TILE], tile_far[v0 // TILE]
-        _search_cells(coarse[y], coarse[y + 1], row_near, row_far, stride, margin, resolved, near, far, corners)
+        _search_cells(coarse[y], coarse[y + 1], row_near, row_far, stride, voxel, resolved, near, far, corners)
         for v in range(v0, v1 + 1 if v1 == height - 1 else v1):
             row = depth[v]
             _start_row(corners, np.float32(v - v0) / np.float32(max(v1 - v0, 1)), stride, limits[v], row)
             points_of_row(view, scale, v, row, points)
             gather_corners(grid, grid.tsdf, row, points, np.int16(UNSEEN), found)
-            step_to_surface(
-                view, scale, v, found, points, np.float32(CONVERGED), np.float32(REACH), row, gradients
-            )
+            step_to_surface(view, scale, v, found, points, np.float32(CONVERGED), np.float32(REACH), row, gradients)
             for u in range(width):
                 z = row[u]
                 if z <= zero:
@@ -404,7 +403,7 @@ def render_near(
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))
     coarse = _coarse(camera, stride)
     shift = np.float32(MAX_SHIFT) * voxels.grid.voxel_size
-    limits = np.where((readings > 0) & (readings < sensor.max_depth + shift), readings + shift, np.float32(0.0))
+    limits = np.where((readings > 0) & (readings < sensor.max_depth), readings + shift, np.float32(0.0))
     cast_near(voxels.grid, view, tile_near, tile_far, limits, stride, readings, coarse)
     depth = np.empty(camera.shape, np.float32)
     normals = np.empty((*camera.shape, 3), np.float32)

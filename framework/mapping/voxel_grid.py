@@ -40,6 +40,7 @@ NO_KEY = -1
 # Grid up and down at each call wait for each other.
 device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
 
+
 @device
 def one_more(count, condition):
     """`count`, int32, and one where the condition holds. numba adds in 64 bits, and half as many fit into a vector."""

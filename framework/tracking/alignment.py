@@ -13,6 +13,7 @@ of one array, and other loops that only fetch from images. A point that does not
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -25,6 +26,7 @@ from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
 TERMS = 27 + 7  # of a chunk's sums: 21 + 6 of the normal equations, then the counts below
+UPPER = np.triu_indices(6)  # where the first 21 of them belong
 BATCH = 160  # points; divides the usual widths
 # where the fields of a batch begin: of its points in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
@@ -340,7 +342,7 @@ def linearize(
     """
     sums = np.empty((CHUNKS, TERMS))
     camera: Camera = level.camera
-    scale = 1 << round(np.log2(model.depth.shape[1] / model_intensity.shape[1]))  # odd columns are dropped
+    scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # odd columns are dropped
     _accumulate(
         level.depth,
         level.intensity,
@@ -359,9 +361,8 @@ def linearize(
         sums,
     )
     total = sums.sum(axis=0)
-    A = np.zeros((6, 6))
-    A[np.triu_indices(6)] = total[:21]
-    A = A + np.triu(A, 1).T
+    A = np.empty((6, 6))
+    A[UPPER] = A.T[UPPER] = total[:21]
     return NormalEquations(
         A=A,
         b=total[21:27],

@@ -117,9 +117,9 @@ def test_bounds_and_interpolation_lose_nothing(k: int) -> None:
     cast_coarse(voxels.grid, pinhole(camera, T), near, far, 1, camera.shape, exhaustive)
     exhaustive = exhaustive[:-1, :-1]
     assert (exhaustive > 0).mean() > 0.1
-    assert ((depth > 0) != (exhaustive > 0)).mean() < 1e-2, (
-        "at ragged borders of the map, where a step starts decides about a hair's breadth"
-    )
+    # at ragged borders of the map, where a step starts decides about a hair's breadth
+    assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
+    assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
     both = (depth > 0) & (exhaustive > 0)
     assert np.quantile(np.abs(depth - exhaustive)[both], 0.99) < 0.05 * VOXEL
 
