@@ -24,6 +24,7 @@ SMALLEST = 8  # px, of the sides of the coarsest level
 CHANGED_SCENE = 0.95  # share of the points not behind the map's surface that agree with it, where a thing was removed
 VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
 VISITED_APART = 0.1  # m and rad
+SURER = 2.0  # times min_information is what ends a loss: the next frame may well have more
 
 
 class Alignment(NamedTuple):
@@ -232,7 +233,8 @@ class VoxelHashingIcp(PoseTracker):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
             return f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
         information = np.linalg.eigvalsh(equations.A)
-        if information[0] < self.min_information * information.mean():
+        least = self.min_information * (SURER if self._lost_frames else 1.0)
+        if information[0] < least * information.mean():
             return "the surface in view does not determine the motion"
         return ""
 
