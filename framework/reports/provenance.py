@@ -20,7 +20,6 @@ WITHOUT_EFFECT = ("hydra", "debug", "ahead", "detection_cache", "detection_cache
 """Keys of the config that change no result."""
 
 
-
 def config_hash(resolved: Mapping[str, Any]) -> str:
     """SHA-256 of what a config says about results, whatever the order of its keys and wherever the run is written."""
     told = {key: value for key, value in resolved.items() if key not in WITHOUT_EFFECT}
