@@ -23,17 +23,18 @@ jobs = Jobs()
 @jobs.reported
 def job(config: DictConfig) -> None:
     """Builds the dataset and the detector that the config names, and writes what the one finds in the other."""
-    from framework.build import build
-    from framework.detection.cache import with_cache
-    from framework.label_spaces import COCO
-    from framework.run import Settings
-
-    Settings.of(config).apply()
     if config.out is None:
         raise ConfigError("out must be given: out=detections.json")
     out = Path(config.out).expanduser().absolute()
     if not out.parent.is_dir():
         raise ConfigError(f"out: there is no folder {out.parent}")
+
+    from framework.build import build  # here, so that such faults are answered before the heavy libraries load
+    from framework.detection.cache import with_cache
+    from framework.label_spaces import COCO
+    from framework.run import Settings
+
+    Settings.of(config).apply()
     sequence = build(RGBDSequence, config.dataset)  # type: ignore[type-abstract]
     detector = with_cache(build(Detector, config.detector), config)  # type: ignore[type-abstract]
     found = write_detections(out, detector, sequence)

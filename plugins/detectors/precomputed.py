@@ -48,6 +48,8 @@ class Precomputed(Detector):
     score_threshold: float = 0.0  # in [0, 1]: detections below are dropped
     spread: float = 1.0  # in [0, 1]: how much of what a score lacks to 1 goes to the other classes
 
+    reads = ("index", "camera")
+
     def __post_init__(self) -> None:
         check_bounds(self, score_threshold=(0.0, 1.0), spread=(0.0, 1.0))
         self.path = Path(self.path).expanduser()
