@@ -37,8 +37,7 @@ def job(config: DictConfig) -> None:
     Settings.of(config).apply()
     sequence = build(RGBDSequence, config.dataset)  # type: ignore[type-abstract]
     detector = with_cache(build(Detector, config.detector), config)  # type: ignore[type-abstract]
-    found = write_detections(out, detector, sequence)
-    log.info("%s: %d detections in %d frames of %s", out, found, len(sequence), sequence.name)
+    write_detections(out, detector, sequence)
     how = f"detector=precomputed detector.path={out}"
     if detector.classes != COCO:
         how += f" detector.labels={write_labels(out, detector.classes)}"
@@ -68,6 +67,8 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
                 log.warning("frame skipped: %s", error)
         if skipped == len(sequence):
             raise DataError(f"{sequence.name}: none of the {skipped} frames can be used")
+    frames = len(sequence) - skipped
+    log.info("%s: %d detections in %d frames of %s", path, results.count, frames, sequence.name)
     return results.count
 
 

@@ -46,7 +46,7 @@ def test_what_it_writes_is_what_cocos_evaluation_reads(tmp_path: Path) -> None:
     truth = COCO()
     truth.dataset = {
         "info": {},
-        "images": [{"id": k} for k in range(6)],
+        "images": [{"id": k, "height": 72, "width": 96} for k in range(6)],
         "annotations": [],
         "categories": [{"id": 1, "name": "chair"}, {"id": 2, "name": "couch"}],
     }
