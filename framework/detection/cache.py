@@ -41,7 +41,7 @@ class CachedDetector(Detector):
     An entry is found by what the answer depends on: the detector's `fingerprint()`, its classes, and the fields of the
     frame that it `reads`. So a changed parameter, weight or image misses, and the same image of another video hits.
     Several processes may share a folder: entries are written whole, and two that write one write the same. A damaged
-    entry is told in the log and computed again.
+    entry is told in the log and computed again. Entries are never removed here; whoever needs the disk may delete any.
     """
 
     detector: Detector

@@ -16,7 +16,7 @@ from framework.detection.coco_results import CategoryIds, read_results
 from framework.detection.mask_folder import read_mask_folder
 from framework.detection.masks import tight_boxes
 from framework.detection.stored_detection import StoredDetection
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
 from framework.label_spaces import read_labels, to_coco
 from framework.parameters import check_bounds
@@ -55,7 +55,7 @@ class Precomputed(Detector):
         self.path = Path(self.path).expanduser()
         self._labels = read_labels(self.labels)
         if len(set(self._labels)) < len(self._labels):
-            raise DataError(f"labels: {self.labels} has a name twice")
+            raise ConfigError(f"detector.labels: {self.labels} has a name twice")
         if self.path.is_dir():
             stored = read_mask_folder(self.path, self._labels)
         else:
@@ -63,6 +63,8 @@ class Precomputed(Detector):
         if not stored:
             raise DataError(f"{self.path} holds no detection")
         probabilities, known = self._distributions(stored)
+        if not known.any():
+            raise DataError(f"{self.path}: none of the {len(stored)} detections is of a class of COCO's")
         if not known.all():
             lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
             log.info("%s: %d of %d detections are of no class of COCO's and are dropped: %s",

@@ -26,7 +26,7 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
 
 
-def test_writes_a_file_that_the_main_job_reads(tmp_path: Path) -> None:
+def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.unreadable=1", "out=found.json")
     assert done.returncode == 0, done.stderr
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]

@@ -309,3 +309,11 @@ def test_parameters_are_checked(tmp_path: Path) -> None:
     for wrong in ({"spread": 1.5}, {"score_threshold": -0.1}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             Precomputed(write(tmp_path, entry()), **wrong)
+
+
+def test_a_file_of_no_class_that_counts_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="none of the 1 detections is of a class"):
+        Precomputed(write(tmp_path, entry(category_name="wall")), labels="nyu40")
+    (tmp_path / "labels.txt").write_text("chair\nchair\n")
+    with pytest.raises(ConfigError, match="has a name twice"):
+        Precomputed(write(tmp_path, entry()), labels=str(tmp_path / "labels.txt"))
