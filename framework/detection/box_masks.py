@@ -38,9 +38,9 @@ def masks_in_boxes(
     """The masks (N, H, W) of the objects in boxes, and (N,) whether there was enough depth for one.
 
     borders (N, 4) x1 y1 x2 y2 px with pixel centres at integers; depth (H, W) m, 0 = no reading. `significance`: share
-    of the centre-weighted readings that the foreground has at least. `max_slant`: degrees between
-    the image plane and a surface, at most. `min_readings`: share of the box's pixels that must have a reading. A mask without enough depth
-    is empty.
+    of the centre-weighted readings that the foreground has at least. `max_slant`: degrees between the image plane and
+    a surface, at most. `min_readings`: share of the box's pixels in the image that must have a reading. A mask without
+    enough depth is empty.
     """
     masks = np.zeros((len(borders), *depth.shape), np.bool_)
     step = math.tan(math.radians(max_slant)) / min(camera.fx, camera.fy)
@@ -78,7 +78,7 @@ def _tent(start, end, first, stop):
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """The interval of depth (near, far) in m of the nearest significant mode; the heaviest where none is significant."""
+    """The interval of depth (near, far), m, of the nearest significant mode; of the heaviest where none is."""
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
     total = 0.0

@@ -156,8 +156,8 @@ def _decode_ssd(layout: Layout, outputs: Mapping[str, Float32], shape: tuple[int
         if not by_class and len(scores) == len(labels) == 1:
             return _ssd_candidates(layout, xyxy, _spread(scores[0], labels[0], classes), shape)
     raise DataError(
-        f"a network of the layout {layout.value} with {classes} classes must have outputs named boxes (K, 4), and either"
-        f" scores (K, {classes} or {classes + 1}), or scores (K,) and labels (K,); found {described(outputs)}"
+        f"a network of the layout {layout.value} with {classes} classes must have outputs named boxes (K, 4), and"
+        f" either scores (K, {classes} or {classes + 1}), or scores (K,) and labels (K,); found {described(outputs)}"
     )
 
 
@@ -173,8 +173,8 @@ def _ssd_candidates(layout: Layout, boxes: Float32, class_scores: Float32, shape
 def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
     """Scores by class (K, C) from one score and one label (K,), from 1, each.
 
-    What the score leaves to 1 is shared evenly among the other classes, but none of them gets more than the label, which
-    stays the best. Rows of the background, and of score 0 as padding, are all 0.
+    What the score leaves to 1 is shared evenly among the other classes, but none of them gets more than the label,
+    which stays the best. Rows of the background, and of score 0 as padding, are all 0.
     """
     column = np.rint(labels).astype(np.int64) - 1
     used = (column != -1) & (scores > 0)

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-
 from framework.errors import DataError
 
 # Field numbers of onnx.proto

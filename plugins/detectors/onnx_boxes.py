@@ -30,7 +30,9 @@ class OnnxBoxes(Detector):
     `boxes_without_depth`. The parameters of the default network are those of YOLOX-nano (Megvii, COCO).
     """
 
-    weights: Path = Path("../shared/weights/yolox_nano/yolox_nano.onnx")  # relative: to the working, then project folder
+    weights: Path = Path(
+        "../shared/weights/yolox_nano/yolox_nano.onnx"
+    )  # relative: to the working, then project folder
     sha256: str = ""  # what the file must have; "" = whatever it is
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
     layout: Layout = Layout.yolox  # what the outputs are
