@@ -25,8 +25,8 @@ def fingerprint(detector: object) -> str:
 
     Code is the module of its class and of each base class, framework.detection, and the versions of the numerical
     libraries. A path counts by what is there, not by its name: a relative one is looked for in the working, then in the
-    project folder, and of a folder every file below it is read. `device: auto` counts as the device that it means.
-    The number of threads is not part of it.
+    project folder, and of a folder every file below it is read. So does a str that names a file or folder.
+    `device: auto` counts as the device that it means. The number of threads is not part of it.
 
     Raises ConfigError when a path does not exist, or code has no file (a notebook's): such a class must say itself what
     identifies it, with a method `fingerprint`.
@@ -67,8 +67,22 @@ def _parameters(detector: object) -> Iterator[str]:
             yield f"{field.name} {value.name}"
         else:
             yield f"{field.name} {value!r}"
+            if isinstance(value, str) and _is_path(value):
+                yield f"{field.name} {content_hash(Path(value))}"
         if field.name == "device" and value in ("auto", "cuda"):
             yield _device()
+
+
+def _is_path(value: str) -> bool:
+    """Whether a parameter that may be a name or a path (labels, a model) is a path, and not a word like `auto`."""
+    return value not in ("", ".") and any(_exists(place / value) for place in (Path.cwd(), PROJECT_ROOT))
+
+
+def _exists(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):  # too long for a file's name
+        return False
 
 
 def _device() -> str:

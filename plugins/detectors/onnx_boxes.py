@@ -51,6 +51,7 @@ class OnnxBoxes(Detector):
     min_readings: float = 0.1  # share in [0, 1] of the box's pixels with depth; with fewer it is dropped
     runtime: Runtime = Runtime.auto  # auto = onnxruntime where installed, else OpenCV
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where the runtime has it
+    reads = ("color", "depth", "camera")
 
     def __post_init__(self) -> None:
         require(0 < self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in (0, 1)")

@@ -46,6 +46,7 @@ class OnnxSegmentation(Detector):
     white: float = 1.0  # what it gets for 255
     runtime: Runtime = Runtime.auto  # auto = onnxruntime where installed, else OpenCV
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where the runtime has it
+    reads = ("color",)
 
     def __post_init__(self) -> None:
         require(0 < self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in (0, 1)")

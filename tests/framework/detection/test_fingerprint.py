@@ -28,6 +28,7 @@ class Network:
     threshold: float = 0.5
     color: Color = Color.RED
     device: str = "cpu"
+    labels: str = "coco"
 
 
 @dataclass
@@ -105,3 +106,13 @@ def test_the_device_that_auto_means_counts(monkeypatch: pytest.MonkeyPatch) -> N
     on_cpu = fingerprint(Network(device="auto"))
     monkeypatch.setattr(module, "_device", lambda: "NVIDIA H200")
     assert fingerprint(Network(device="auto")) != on_cpu
+
+
+def test_a_name_that_is_a_file_counts_by_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Labels may be `coco` or a file; a model a name or a folder."""
+    monkeypatch.chdir(tmp_path)
+    before = fingerprint(Network(labels="labels.txt"))
+    (tmp_path / "labels.txt").write_text("chair")
+    chair = fingerprint(Network(labels="labels.txt"))
+    (tmp_path / "labels.txt").write_text("bed")
+    assert len({before, chair, fingerprint(Network(labels="labels.txt"))}) == 3
