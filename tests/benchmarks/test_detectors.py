@@ -1,58 +1,81 @@
-"""Milliseconds and memory of the detectors on one 640x480 image: `python -m pytest tests/benchmarks -k detectors`."""
+"""Time and memory of every detector that can run here, at 640x480: `python -m pytest tests/benchmarks -k detectors`.
 
+Each runs in a process of its own, so that its peak of memory is its own.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
 import resource
-from pathlib import Path
+import time
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import pytest
 import torch
+from pytest_benchmark.fixture import BenchmarkFixture
 
-from framework.data import Camera, Frame, FrameTruth
-from plugins.detectors.ground_truth import GroundTruthDetector
-from plugins.detectors.maskrcnn2go import MaskRCNN2Go
-from plugins.detectors.none import NoDetections
-from plugins.detectors.simulated import SimulatedDetector
+from framework.datasets.synthetic import Synthetic
+from framework.errors import ConfigError, DataError
+from tests import registered
+from tests.benchmarks.comparison import Table
 
-SHARED = Path(__file__).resolve().parents[3] / "shared"
-CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 THREADS = 2
+FRAMES = 8
+ROUNDS = 3  # over the frames, after one to warm up
 
 
-@pytest.fixture
-def threads():
-    before = torch.get_num_threads()
+@dataclass(frozen=True)
+class Measured:
+    """What a detector took."""
+
+    seconds: list[float]  # an image
+    detections: float  # an image
+    mib: float  # by which the process grew at its peak
+    fault: str = ""  # why it cannot run here
+
+
+def measure(name: str) -> Measured:
+    """Builds detector=`name` and runs it on frames of the synthetic room."""
     torch.set_num_threads(THREADS)
-    yield
-    torch.set_num_threads(before)
-
-
-def labelled_frame():
-    """Twelve rectangles of 100x100 px, each a chair."""
-    ids = np.zeros((480, 640), np.int32)
-    for k in range(12):
-        v, u = 20 + 150 * (k // 4), 20 + 150 * (k % 4)
-        ids[v : v + 100, u : u + 100] = k + 1
-    truth = FrameTruth(ids, dict.fromkeys(range(1, 13), "chair"))
-    return Frame(0, 0.0, np.zeros((480, 640, 3), np.uint8), np.ones((480, 640), np.float32), CAMERA, truth=truth)
-
-
-@pytest.mark.parametrize("index", [0, 150, 290])
-def test_maskrcnn2go(benchmark, threads, index):
-    path = SHARED / "data" / "redkitchen" / "color" / f"{index:06d}.jpg"
-    if not path.exists() or not (SHARED / "weights" / "maskrcnn2go_int8").is_dir():
-        pytest.skip(f"{path} or the weights are absent")
-    color = cv2.imread(str(path))[..., ::-1].copy()
-    frame = Frame(index, 0.0, color, np.ones((480, 640), np.float32), CAMERA)
+    room = Synthetic(frames=240, stride=240 // FRAMES)
+    frames = list(room)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    detector = MaskRCNN2Go(device="cpu")
-    detections = benchmark.pedantic(detector.detect, (frame,), warmup_rounds=3, rounds=20)
+    try:
+        detector = registered.built("detector", name, f"threads={THREADS}")
+    except (ConfigError, DataError) as absent:
+        return Measured([], 0.0, 0.0, str(absent))
+    found = [len(detector.detect(frame)) for frame in frames]
+    seconds = []
+    for _ in range(ROUNDS):
+        for frame in frames:
+            began = time.perf_counter()
+            detector.detect(frame)
+            seconds.append(time.perf_counter() - began)
     grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
-    benchmark.extra_info.update(threads=THREADS, detections=len(detections), peak_rss_growth_mib=round(grown / 1024))
+    return Measured(seconds, float(np.mean(found)), grown / 1024)
 
 
-@pytest.mark.parametrize(
-    "detector", [NoDetections(), GroundTruthDetector(), SimulatedDetector()], ids=lambda d: type(d).__name__
-)
-def test_label_detectors(benchmark, detector):
-    benchmark.pedantic(detector.detect, (labelled_frame(),), warmup_rounds=2, rounds=20)
+@pytest.fixture(scope="module")
+def table(tables: list[Table]) -> Table:
+    table = Table(
+        "Detectors, synthetic room at 640x480",
+        ["detector", "ms", "images a second", "peak memory, MiB", "detections"],
+        notes=[f"Medians over {FRAMES * ROUNDS} images, {THREADS} threads. Memory: what the process grew by."],
+    )
+    tables.append(table)
+    return table
+
+
+@pytest.mark.parametrize("name", registered.names("detector"))
+def test_detectors(benchmark: BenchmarkFixture, table: Table, name: str) -> None:
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
+        measured: Measured = benchmark.pedantic(process.submit(measure, name).result, rounds=1)
+    if measured.fault:
+        pytest.skip(measured.fault)
+    median = float(np.median(measured.seconds))
+    table.rows.append(
+        [name, f"{1e3 * median:.1f}", f"{1 / median:.0f}", f"{measured.mib:.0f}", f"{measured.detections:.1f}"]
+    )
+    benchmark.extra_info.update(ms=1e3 * median, peak_rss_growth_mib=measured.mib, detections=measured.detections)
