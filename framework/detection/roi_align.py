@@ -66,8 +66,8 @@ class Samples:
 
     def of(self, chosen: Tensor) -> Samples:
         """Those of the boxes that an index chooses."""
-        arrays = (self.start, self.size, self.counts, self.windows)
-        return Samples(*(array[chosen] for array in arrays), self.bins, self.cells)
+        start, size, counts, windows = (array[chosen] for array in (self.start, self.size, self.counts, self.windows))
+        return Samples(start, size, counts, windows, self.bins, self.cells)
 
     def weights(self) -> tuple[Tensor, Tensor]:
         """(first cell (N, bins) int64, weights (N, bins, window)) of the window in which each bin's samples lie."""
