@@ -13,13 +13,13 @@ from framework.data import Detections, Frame, FrameTruth, PointClusters, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
-from tests import registered
+from tests import detector_files, registered
 from tests.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 
 
-def built(stage: str, name: str) -> Any:
+def built(stage: str, name: str, *overrides: str) -> Any:
     try:
-        return registered.built(stage, name)
+        return registered.built(stage, name, *overrides)
     except (DataError, ConfigError) as absent:
         pytest.skip(str(absent))
 
@@ -59,8 +59,8 @@ def test_dataset_is_in_order(sequence: RGBDSequence) -> None:
 
 
 @pytest.fixture(params=registered.names("detector"))
-def detector(request: pytest.FixtureRequest) -> Detector:
-    detector: Detector = built("detector", request.param)
+def detector(request: pytest.FixtureRequest, tmp_path: Path) -> Detector:
+    detector: Detector = built("detector", request.param, *detector_files.overrides(request.param, tmp_path))
     return detector
 
 

@@ -46,7 +46,7 @@ class MaskRCNNDetector(Detector):
     )
     max_detections: int = 100  # >= 1, an image
     short_side: int = 0  # px >= 32, to which images are resized; 0 = as in the network's training
-    long_side: int = 0  # px >= short_side, bound on the other side; 0 = as in the network's training
+    long_side: int = 0  # px >= short_side, bound on the other side; 0 = in the proportion of the network's training
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
     half: bool = True  # half precision on CUDA; the CPU always computes in single
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
@@ -72,7 +72,8 @@ class MaskRCNNDetector(Detector):
         architecture = network.architecture
         self.classes = architecture.classes
         self._short_side = self.short_side or architecture.short_side
-        self._long_side = self.long_side or max(architecture.long_side, self._short_side)
+        proportion = architecture.long_side / architecture.short_side
+        self._long_side = self.long_side or round(self._short_side * proportion)
         require(
             self._long_side >= self._short_side, "detector.long_side", self.long_side, f"at least {self._short_side} px"
         )
