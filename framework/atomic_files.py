@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -17,7 +18,8 @@ def written_whole(path: Path) -> Iterator[Path]:
     The temporary name keeps the suffix, because image and mesh writers choose their format by it. Raises DataError when
     the disk does not take the file.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.partial{path.suffix}")
+    # a process id is not enough: containers that share a folder have the same ones
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
         yield temporary
         with temporary.open("rb") as file:

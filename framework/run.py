@@ -17,6 +17,7 @@ from omegaconf import DictConfig
 from threadpoolctl import threadpool_limits
 
 from framework.build import STAGES, build
+from framework.detection.cache import cache_metrics, with_cache
 from framework.errors import ConfigError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from framework.journal import RunResult
@@ -37,7 +38,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     Settings.of(config).apply()
     sequence = build(RGBDSequence, config.dataset)
     pipeline = Pipeline(
-        detector=build(Detector, config.detector),
+        detector=with_cache(build(Detector, config.detector), config),
         tracker=build(PoseTracker, config.tracker),
         refiner=build(ClusterRefiner, config.refiner),
         fuser=build(MapFuser, config.fuser),
@@ -47,7 +48,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)
     result = pipeline.run(sequence)
-    record.write(sequence, result)
+    record.write(sequence, result, cache_metrics(pipeline.detector))
     if result.stopped_by is not None:
         raise result.stopped_by
     return result

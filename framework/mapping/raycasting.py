@@ -34,7 +34,7 @@ from framework.mapping.voxel_rows import blend_colors, gather_corners, points_of
 from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, voxel_number
 
 TILE = 8  # px; one tile's rays share blocks in the cache
-REFINEMENTS = 4  # Newton steps at most: one meets a plane, two or three a curved surface
+REFINEMENTS = 4  # Newton steps of a ray at most: one meets a plane, two or three a curved surface
 CONVERGED = 0.2  # voxels; the field is so nearly linear that a step shorter than this ends within some hundredths
 REACH = 3.0  # voxels, from where a refinement may start to the surface that it finds
 DETAIL = 4.0  # voxels between coarse rays at most: what is narrower than the truncation band is hardly in the map
@@ -153,7 +153,7 @@ def cast_coarse(grid, view, tile_near, tile_far, stride, shape, depth):
 
 @device
 def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near, far, corners):
-    """What the coarse depths of two rows (X + 1,) m tell of the cells (X,) of pixels between them.
+    """What the coarse depths of two rows (X + 1,) m, -1 = not searched, tell of the cells (X,) of pixels between them.
 
     near and far get the depths, m, between which a cell can show a surface; far 0 = nowhere. corners (4, X) gets the
     inverse depths of that surface, in the order of the rows, where there is just one, and 0 where there is none or it
@@ -166,6 +166,7 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
         corners[0, x], corners[1, x], corners[2, x], corners[3, x] = above[x], above[x + 1], below[x], below[x + 1]
         nearest, farthest, total = none, zero, zero
         hits = 0
+        known = True
         for c in range(4):
             z = corners[c, x]
             if z > zero:
@@ -173,8 +174,11 @@ def _search_cells(above, below, row_near, row_far, stride, voxel, resolved, near
                 corners[c, x] = one / z
                 total += one / z
                 hits += 1
+            elif z < zero:
+                known = False
+                corners[c, x] = zero
         if hits == 0:
-            far[x] = zero if far[x] < resolved else far[x]
+            far[x] = zero if known and far[x] < resolved else far[x]
         elif (farthest if hits == 4 else far[x]) < resolved:
             near[x], far[x] = max(near[x], nearest - margin), min(far[x], farthest + margin)
         if hits == 0 or farthest > resolved or farthest - nearest > rise:
@@ -235,7 +239,8 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
             _start_row(corners, np.float32(v - v0) / np.float32(max(v1 - v0, 1)), stride, limits[v], row)
             points_of_row(view, scale, v, row, points)
             gather_corners(grid, grid.tsdf, row, points, np.int16(UNSEEN), found)
-            step_to_surface(view, scale, v, found, points, np.float32(CONVERGED), np.float32(REACH), row, gradients)
+            converged, reach = np.float32(CONVERGED), np.float32(REACH)
+            step_to_surface(view, scale, v, found, points, converged, reach, limits[v], row, gradients)
             for u in range(width):
                 z = row[u]
                 if z <= zero:
@@ -244,8 +249,8 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
                     if far[x] > zero and limits[v, u] > zero:
                         d, step = _ray(view, scale, u, v)
                         if z < zero:
-                            reach = np.float32(REACH) * step
-                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, -z, reach, key, region)
+                            z, nx, ny, nz, key, region = _refined(grid, o, d, step, -z, reach * step, key, region)
+                            z = z if zero < z < limits[v, u] else zero
                         if z == zero:
                             last = min(far[x], limits[v, u])
                             z, nx, ny, nz, key, region = _first_surface(grid, o, d, step, near[x], last, key, region)
@@ -261,10 +266,10 @@ def cast_fine(grid, view, tile_near, tile_far, limits, stride, coarse, depth, no
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
     """Like cast_coarse(), with the search begun at the camera's own readings (H, W) m; no pixel is searched beyond its
-    limit (H, W) m, 0 = not at all.
+    limit (H, W) m, 0 = not at all: its depth is then -1, for it may have neighbors that are.
 
-    Readings are noisy and a wrong pose displaces them. So where a reading fits the surface that the two pixels before
-    it have shown, the search begins there, and else where the last reading was displaced to.
+    Readings are noisy and a wrong pose displaces them. So where a reading fits the surface that the two rays before it
+    have shown, the search begins there, and else where the last reading was displaced to.
     """
     height, width = readings.shape
     zero, one = np.float32(0.0), np.float32(1.0)
@@ -275,7 +280,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
         key = np.int64(-2)
         region = np.int32(-1)
         shift = zero
-        last = last_but_one = zero  # inverse depths of the pixels before, 0 = no surface
+        last = last_but_one = zero  # inverse depths of the rays before, 0 = no surface
         v = min(y * stride, height - 1)
         for x in range(depth.shape[1]):
             u = min(x * stride, width - 1)
@@ -297,7 +302,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
                 shift = apart if z > zero and abs(apart) < np.float32(MAX_SHIFT) * voxel else zero
             last_but_one = last
             last = one / z if z > zero else zero
-            depth[y, x] = z
+            depth[y, x] = z if z > zero or limits[v, u] > zero else -one
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -397,7 +402,10 @@ def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera
 def render_near(
     voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64, readings: Float32
 ) -> SurfaceView:
-    """The surface that `camera` sees at its `readings` (H, W) m, or in front of them."""
+    """The surface that `camera` sees at its `readings` (H, W) m, or in front of them.
+
+    Readings beyond the sensor's farthest depth are not looked for: the map has not taken them either.
+    """
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))

@@ -21,8 +21,8 @@ def directions(view, scale, v):
     `scale` is voxels a m.
     """
     x, y, z = ray_direction(view, 0, v)
-    next_x, next_y, next_z = ray_direction(view, 1, v)
-    return (x * scale, y * scale, z * scale), ((next_x - x) * scale, (next_y - y) * scale, (next_z - z) * scale)
+    change = scale / view.fx  # not the difference of two rays, whose rounding would grow along the row
+    return (x * scale, y * scale, z * scale), (view.R[0, 0] * change, view.R[1, 0] * change, view.R[2, 0] * change)
 
 
 @device
@@ -66,7 +66,7 @@ def gather_corners(grid, values, depth, points, missing, found):
 
 
 @device
-def step_to_surface(view, scale, v, found, points, converged, reach, depth, normals):
+def step_to_surface(view, scale, v, found, points, converged, reach, limits, depth, normals):
     """One Newton step of each pixel's depth (W,) m, along its ray, towards the zero of the trilinear field.
 
     `found` (8, W) holds the distances around `points` (3, W). depth becomes 0 where the field is unknown, does not fall
@@ -89,8 +89,9 @@ def step_to_surface(view, scale, v, found, points, converged, reach, depth, norm
         normals[2, n] = nz * norm
         after = depth[n] + step
         length = abs(step) * np.sqrt(dx * dx + dy * dy + dz * dz)
+        good = all_seen(s) & (slope < zero) & (length < reach) & (after > zero) & (after < limits[n])
         after = after if length < converged else -after
-        depth[n] = after if all_seen(s) & (slope < zero) & (length < reach) else zero
+        depth[n] = after if good else zero
 
 
 @device

@@ -16,7 +16,8 @@ import framework
 
 PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
-WITHOUT_EFFECT = ("hydra", "debug", "ahead")  # keys of the config that change no result
+WITHOUT_EFFECT = ("hydra", "debug", "ahead", "detection_cache", "detection_cache_dir")
+"""Keys of the config that change no result."""
 
 
 def config_hash(resolved: Mapping[str, Any]) -> str:

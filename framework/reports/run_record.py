@@ -56,8 +56,11 @@ class RunRecord:
         _reset_peak_memory()
         return cls(directory, {str(key): value for key, value in resolved.items()}, choices)
 
-    def write(self, sequence: RGBDSequence, result: RunResult) -> Metrics:
-        """Writes everything that the run found, and says the main figures in the log."""
+    def write(self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None) -> Metrics:
+        """Writes everything that the run found, and says the main figures in the log.
+
+        `counts` are further figures for metrics.json, by key.
+        """
         scene, classes = result.scene, result.scene.classes
         mesh, instances = scene.mesh(), scene.instances()
         names = {key: class_name(instance, classes) for key, instance in instances.items()}
@@ -67,6 +70,7 @@ class RunRecord:
             "sequence": sequence.name,
             **{f"choice.{group}": self.choices.get(group) for group in STAGES},
             **run_metrics(result),
+            **(counts or {}),
             **instance_metrics(sequence, mesh, instances, classes),
             **trajectory_metrics(result),
             "peak_rss_bytes": peak_memory(),

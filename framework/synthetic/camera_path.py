@@ -39,7 +39,7 @@ class CameraPath:
 
     def pose_at(self, phase: float) -> Float64:
         position, yaw, pitch, roll = self._state(np.array([phase]))
-        return _look(position[0], float(yaw[0]), float(pitch[0]), float(roll[0]))
+        return look(position[0], float(yaw[0]), float(pitch[0]), float(roll[0]))
 
     def _state(self, phase: Float64) -> tuple[Float64, Float64, Float64, Float64]:
         """Position (N, 3) m and yaw, pitch, roll (N,) rad. Whole harmonics, so that the walk closes."""
@@ -129,7 +129,7 @@ def _best_start(path: CameraPath, sweep: float, labels: LabelView, wanted: set[i
     return float(phases[int(score.argmax())])
 
 
-def _look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
+def look(position: Float64, yaw: float, pitch: float, roll: float) -> Float64:
     """T_world_camera of a camera at `position`; world z is up, yaw 0 looks along +x."""
     forward = np.array([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)])
     right = np.array([np.sin(yaw), -np.cos(yaw), 0.0])

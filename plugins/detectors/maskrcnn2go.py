@@ -63,6 +63,8 @@ class MaskRCNN2Go(Detector):
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
 
+    reads = ("color",)
+
     def __post_init__(self) -> None:
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")

@@ -6,7 +6,7 @@ import pytest
 from framework.data import Camera, Frame
 from framework.mapping.evidence import EvidenceRows
 from framework.mapping.integration import Integrator
-from framework.mapping.raycasting import TILE, cast_coarse, cast_view, render, tile_bounds
+from framework.mapping.raycasting import TILE, cast_coarse, cast_view, render, render_near, tile_bounds
 from framework.mapping.sensor import Sensor, depth_noise, pinhole
 from framework.mapping.voxel_grid import VoxelGrid
 from framework.mapping.voxel_walk import inverses, leave_cell
@@ -111,17 +111,53 @@ def test_bounds_and_interpolation_lose_nothing(k: int) -> None:
     rng = np.random.default_rng(k)
     T = pose(*rng.uniform(-0.8, 0.8, 3), tuple(rng.uniform(-0.7, 0.7, 3)))
     depth, _ = cast_view(voxels, SENSOR, camera, T)
-    tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
-    near, far = (np.full(tiles, bound, np.float32) for bound in (SENSOR.min_depth, SENSOR.max_depth))
-    exhaustive = np.empty((camera.height + 1, camera.width + 1), np.float32)
-    cast_coarse(voxels.grid, pinhole(camera, T), near, far, 1, camera.shape, exhaustive)
-    exhaustive = exhaustive[:-1, :-1]
+    exhaustive = every_ray(voxels, T, camera)
     assert (exhaustive > 0).mean() > 0.1
     # at ragged borders of the map, where a step starts decides about a hair's breadth
     assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
     assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
     both = (depth > 0) & (exhaustive > 0)
     assert np.quantile(np.abs(depth - exhaustive)[both], 0.99) < 0.05 * VOXEL
+
+
+@pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
+def test_what_has_a_reading_is_found_near_it(sparse: str) -> None:
+    """Also where the readings miss all the coarse rays."""
+    voxels = mapped(room(), [pose()])
+    T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
+    exhaustive = every_ray(voxels, T)
+    readings = np.where(exhaustive > 0, exhaustive + np.float32(0.3 * VOXEL), np.float32(0))
+    if sparse == "every fourth column":
+        readings[:, np.arange(readings.shape[1]) % 4 != 1] = 0
+    elif sparse == "one in ten":
+        readings[np.random.default_rng(0).uniform(size=readings.shape) > 0.1] = 0
+    depth = render_near(voxels, SENSOR, CAMERA, T, readings).depth
+    given = readings > 0
+    assert given.sum() > 500
+    assert (depth[~given] == 0).all()
+    assert (depth[given] > 0).mean() > 0.99
+    found = given & (depth > 0)
+    assert np.quantile(np.abs(depth - exhaustive)[found], 0.99) < 0.05 * VOXEL
+
+
+def test_nothing_is_seen_beyond_the_sensors_reach() -> None:
+    """Of a map that a farther-sighted sensor has made."""
+    voxels = mapped(room(), [pose()])
+    farthest = cast_view(voxels, SENSOR, CAMERA, pose())[0].max()
+    short = SENSOR._replace(max_depth=np.float32(0.8 * farthest))
+    for k in range(4):
+        depth, _ = cast_view(voxels, short, CAMERA, pose(rotvec=(0, 0.1 * k, 0)))
+        assert (depth > 0).any()
+        assert depth.max() <= short.max_depth
+
+
+def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
+    """(H, W) m: every pixel searched from the nearest to the farthest depth."""
+    tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
+    near, far = (np.full(tiles, bound, np.float32) for bound in (SENSOR.min_depth, SENSOR.max_depth))
+    depth = np.empty((camera.height + 1, camera.width + 1), np.float32)
+    cast_coarse(voxels.grid, pinhole(camera, T), near, far, 1, camera.shape, depth)
+    return depth[:-1, :-1]
 
 
 def test_a_block_beside_the_camera_does_not_unbound_every_tile() -> None:

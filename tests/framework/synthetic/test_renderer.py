@@ -3,7 +3,7 @@
 import numpy as np
 
 from framework.data import Camera
-from framework.synthetic.camera_path import _look
+from framework.synthetic.camera_path import look
 from framework.synthetic.lights import globe
 from framework.synthetic.piece import Furniture
 from framework.synthetic.renderer import Renderer, to_srgb
@@ -27,7 +27,7 @@ def scene(*solids):
 def test_depth_of_a_slanted_plane_is_exact():
     wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
     renderer = Renderer(scene(wall), [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))])
-    T = _look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
+    T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
     picture = renderer.render(CAMERA, T)
     u, v = np.meshgrid(np.arange(64.0), np.arange(48.0))
     ray = np.stack([(u - 30.7) / 50, (v - 22.9) / 55, np.ones_like(u)], axis=-1) @ T[:3, :3].T
@@ -46,7 +46,7 @@ def test_ids_and_nothing():
     floor = panel(3.0, 3.0).turned("x", np.pi / 2).moved(y=1.5, z=-0.5)
     renderer = Renderer(scene(floor, box), [globe(np.array([2.0, 2.0, 3.0]), 0.1, (1, 1, 1))])
     camera = Camera(9, 9, 9.0, 9.0, 4.0, 4.0)
-    picture = renderer.render(camera, _look(np.array([-3.0, 0, 0]), 0.0, 0.0, 0.0))
+    picture = renderer.render(camera, look(np.array([-3.0, 0, 0]), 0.0, 0.0, 0.0))
     assert picture.instance_ids[4, 4] == 1
     assert picture.depth[4, 4] == np.float32(2.5)
     assert picture.depth[0, 4] == 0  # above the box there is nothing
@@ -60,7 +60,7 @@ def test_a_lamp_casts_a_shadow():
     plate = rounded_box(1.0, 1.0, 0.02, 0.004).moved(z=1.0)
     floor = panel(6.0, 6.0).turned("x", np.pi / 2).moved(y=3.0)
     renderer = Renderer(scene(floor, plate), [globe(np.array([0.0, 0.0, 2.0]), 0.05, (1, 1, 1))])
-    above = _look(np.array([0.0, 0.0, 0.9]), 0.0, -np.pi / 2, 0.0)  # between plate and floor, looking down
+    above = look(np.array([0.0, 0.0, 0.9]), 0.0, -np.pi / 2, 0.0)  # between plate and floor, looking down
     camera = Camera(101, 101, 30.0, 30.0, 50.0, 50.0)
     light = renderer.render(camera, above).color.astype(float).mean(axis=-1)
     # The plate's shadow reaches 1 m from the middle: 33 px at 0.9 m.

@@ -1,0 +1,190 @@
+"""Box candidates: what the outputs of the usual box detectors mean, and which candidates survive.
+
+All boxes are x1 y1 x2 y2 in px of the network's input, in borders: 0 is the left border of the first pixel.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+import numpy as np
+
+from framework.data import Float32, Int32
+from framework.detection.boxes import LARGEST_LOG_SCALE
+from framework.detection.nms import suppress_boxes
+from framework.errors import DataError
+
+YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
+
+
+class Layout(Enum):
+    """What a box detector's outputs are: K candidates, C classes, optionally an axis of length 1 in front."""
+
+    yolox = "yolox"  # (K, 5 + C): dx, dy, log w, log h in cells; objectness; C class scores
+    yolo = "yolo"  # (4 + C, K) or (K, 4 + C): centre x, y, width, height in px; C class scores (Ultralytics, from v8)
+    yolo_objectness = "yolo_objectness"  # (K, 5 + C) or (5 + C, K): objectness before the class scores (YOLOv5, v7)
+    ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores, and labels or scores by class
+    ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; the same
+    ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; the same
+
+
+@dataclass(frozen=True)
+class Candidates:
+    """K boxes with a score for each of C classes; a candidate's own score is the largest of them."""
+
+    boxes: Float32  # (K, 4) px
+    class_scores: Float32  # (K, C) in [0, 1]; the objectness is multiplied in
+
+    def best(self, threshold: float, nms: float, limit: int) -> Int32:
+        """The indices of the at most `limit` candidates that score above `threshold` and that survive, best first.
+
+        A candidate falls to a better one of the same best class when their IoU is above `nms`.
+        """
+        scores = self.class_scores.max(axis=1)
+        x1, y1, x2, y2 = self.boxes.T
+        chosen = np.flatnonzero((scores > threshold) & (x2 > x1) & (y2 > y1))
+        label = self.class_scores[chosen].argmax(axis=1).astype(np.int32)
+        kept = suppress_boxes(self.boxes[chosen], scores[chosen], nms, label, limit=limit, extent=0.0)
+        return chosen[kept].astype(np.int32)
+
+
+def decode(layout: Layout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
+    """The candidates in a network's `outputs` by name, for an input of `shape` (height, width) px and C classes.
+
+    Raises DataError when the outputs do not have the layout.
+    """
+    if layout is Layout.yolox:
+        candidates = _decode_yolox(rows_of(only(outputs), 5 + classes), shape)
+    elif layout is Layout.yolo:
+        candidates = decode_yolo(rows_of(only(outputs), 4 + classes, "yolo_objectness"), objectness=False)
+    elif layout is Layout.yolo_objectness:
+        candidates = decode_yolo(rows_of(only(outputs), 5 + classes, "yolo"), objectness=True)
+    else:
+        candidates = _decode_ssd(layout, outputs, shape, classes)
+    return candidates
+
+
+def check_scores(class_scores: Float32) -> None:
+    """Raises DataError unless all are in [0, 1]: a network that leaves the sigmoid or softmax to its user."""
+    if class_scores.size and (class_scores.min() < -1e-3 or class_scores.max() > 1 + 1e-3):
+        raise DataError(
+            f"the network's scores must be in [0, 1], found {class_scores.min():.3g} to {class_scores.max():.3g}:"
+            " choose another detector.layout, or export the network with its sigmoid or softmax"
+        )
+
+
+def only(outputs: Mapping[str, Float32]) -> Float32:
+    """The one output that there is. Raises DataError when there are more."""
+    if len(outputs) != 1:
+        raise DataError(f"the network must have one output, found {described(outputs)}: choose another detector.layout")
+    return next(iter(outputs.values()))
+
+
+def described(outputs: Mapping[str, Float32]) -> str:
+    """The names and shapes of outputs, for messages."""
+    return ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
+
+
+def rows_of(output: Float32, columns: int, other_layout: str = "") -> Float32:
+    """The candidates (K, columns) of an output (1, K, columns) or (1, columns, K); the axis in front may be absent."""
+    table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
+    if table.ndim == 2 and table.shape[1] == columns:
+        return table
+    if table.ndim == 2 and table.shape[0] == columns:
+        return table.T
+    hint = f"detector.labels or detector.layout (perhaps {other_layout})" if other_layout else "detector.labels"
+    raise DataError(
+        f"the network's output must have {columns} columns for its box and classes, found the shape {output.shape}:"
+        f" choose other {hint}"
+    )
+
+
+def corners(boxes: Float32) -> Float32:
+    """Boxes (K, 4) given as centre x, y, width, height as x1 y1 x2 y2."""
+    half = boxes[:, 2:] / 2
+    return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
+
+
+def decode_yolo(rows: Float32, objectness: bool) -> Candidates:
+    """Rows (K, 4 + C) of a box, centre x, y, width, height in px, and class scores; (K, 5 + C) with an objectness."""
+    class_scores = rows[:, 4:5] * rows[:, 5:] if objectness else rows[:, 4:]
+    check_scores(class_scores)
+    return Candidates(corners(rows[:, :4]), class_scores)
+
+
+def _decode_yolox(rows: Float32, shape: tuple[int, int]) -> Candidates:
+    """Source: Ge et al., "YOLOX", 2021; github.com/Megvii-BaseDetection/YOLOX, yolox/utils/demo_utils.py."""
+    cells, strides = [], []
+    for stride in YOLOX_STRIDES:
+        y, x = np.indices((shape[0] // stride, shape[1] // stride), np.float32).reshape(2, -1)
+        cells.append(np.stack([x, y], axis=1))
+        strides.append(np.full((len(x), 1), stride, np.float32))
+    cell, stride_of = np.concatenate(cells), np.concatenate(strides)
+    if len(cell) != len(rows):
+        raise DataError(
+            f"a YOLOX of input {shape[0]}x{shape[1]} has {len(cell)} candidates, the network's output has {len(rows)}:"
+            " choose another detector.layout"
+        )
+    centers = (rows[:, :2] + cell) * stride_of
+    sizes = np.exp(np.minimum(rows[:, 2:4], np.float32(LARGEST_LOG_SCALE))) * stride_of
+    class_scores = rows[:, 4:5] * rows[:, 5:]
+    check_scores(class_scores)
+    return Candidates(corners(np.concatenate([centers, sizes], axis=1)), class_scores)
+
+
+def _decode_ssd(layout: Layout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
+    """Boxes, and scores by class where the network has them, else a score and a label for each box.
+
+    Outputs are known by their names, as in TensorFlow's object detection API (detection_boxes, detection_classes,
+    detection_scores, detection_multiclass_scores) and torchvision's models.detection (boxes, labels, scores). Label 0
+    and the first of C + 1 scores are the background.
+    """
+    # raw: the candidates before TensorFlow's own suppression
+    tables = {name: array for name, array in outputs.items() if "raw" not in name and "num" not in name}
+    boxes = [array for name, array in tables.items() if "box" in name and array.shape[-1] == 4 and array.ndim in (2, 3)]
+    if len(boxes) == 1:
+        if boxes[0].ndim == 3:
+            tables = {name: array[0] for name, array in tables.items() if array.ndim > 1}
+        by_class = [t for name, t in tables.items() if "score" in name and t.shape[1:] in ((classes,), (classes + 1,))]
+        scores = [t for name, t in tables.items() if "score" in name and t.ndim == 1]
+        labels = [t for name, t in tables.items() if ("label" in name or "class" in name) and t.ndim == 1]
+        xyxy = boxes[0].reshape(-1, 4)
+        if len(by_class) == 1:
+            return _ssd_candidates(layout, xyxy, by_class[0][:, -classes:], shape)
+        if not by_class and len(scores) == len(labels) == 1:
+            return _ssd_candidates(layout, xyxy, _spread(scores[0], labels[0], classes), shape)
+    raise DataError(
+        f"a network of the layout {layout.value} with {classes} classes must have outputs named boxes (K, 4), and"
+        f" either scores (K, {classes} or {classes + 1}), or scores (K,) and labels (K,); found {described(outputs)}"
+    )
+
+
+def _ssd_candidates(layout: Layout, boxes: Float32, class_scores: Float32, shape: tuple[int, int]) -> Candidates:
+    check_scores(class_scores)
+    if layout is Layout.ssd_tensorflow:
+        boxes = boxes[:, [1, 0, 3, 2]]
+    if layout is not Layout.ssd_torchvision:
+        boxes = boxes * np.array([shape[1], shape[0]] * 2, np.float32)
+    return Candidates(boxes, class_scores)
+
+
+def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
+    """Scores by class (K, C) from one score and one label (K,), from 1, each.
+
+    What the score leaves to 1 is shared evenly among the other classes, but none of them gets more than the label,
+    which stays the best. Rows of the background, and of score 0 as padding, are all 0.
+    """
+    column = np.rint(labels).astype(np.int64) - 1
+    used = (column != -1) & (scores > 0)
+    if (beyond := column[used & ((column < 0) | (column >= classes))]).size:
+        raise DataError(
+            f"the network's labels must be 1 to {classes}, found {beyond.max() + 1}: choose other detector.labels"
+        )
+    check_scores(scores)
+    own = scores[used]
+    rows = np.zeros((len(scores), classes), np.float32)
+    rows[used] = np.minimum((1 - own) / max(classes - 1, 1), own)[:, None]
+    rows[np.flatnonzero(used), column[used]] = own
+    return rows

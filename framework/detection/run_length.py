@@ -1,0 +1,86 @@
+"""Masks as run lengths, in COCO's format: the lengths of the runs of 0 and 1 in turn, column by column.
+
+In a file they are a list of numbers, or a string that packs them (pycocotools' `rleToString`): groups of five bits, the
+lowest first, each number from the third on as its difference to the one before the last.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+
+from framework.data import Bool
+from framework.errors import DataError
+
+Int64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
+
+FIRST_CHARACTER = 48  # stands for 0; each character carries five bits, and a sixth that says that more follow
+MORE, SIGN, BITS = 0x20, 0x10, 5
+LONGEST = 7  # characters of one number: more bits than any image has pixels
+
+
+def encode(masks: Bool) -> list[bytes]:
+    """The packed run lengths of masks (N, H, W)."""
+    from pycocotools import mask as coco
+
+    columns_first = np.asfortranarray(masks.transpose(1, 2, 0).view(np.uint8))
+    return [run["counts"] for run in coco.encode(columns_first)] if len(masks) else []
+
+
+def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
+    """The masks (N, H, W) of `shape` (height, width). `counts` are trusted: `check` what comes from a user."""
+    from pycocotools import mask as coco
+
+    masks = np.zeros((len(counts), *shape), np.uint8)
+    size = list(shape)
+    for mask, packed in zip(masks, counts, strict=True):
+        # pycocotools answers column by column; OpenCV transposes several times faster than numpy
+        cv2.transpose(coco.decode({"size": size, "counts": packed}).T, dst=mask)
+    return masks.view(np.bool_)
+
+
+def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
+    """Run lengths as the packed string. Raises DataError unless they fill an image of `shape` (height, width)."""
+    from pycocotools import mask as coco
+
+    if not all(isinstance(length, int) and not isinstance(length, bool) for length in lengths):
+        raise DataError("the run lengths must be whole numbers")
+    _check_filled(np.array(lengths, np.float64), shape)
+    packed: bytes = coco.frPyObjects({"size": list(shape), "counts": list(lengths)}, *shape)["counts"]
+    return packed
+
+
+def check(counts: bytes, shape: tuple[int, int]) -> None:
+    """Raises DataError unless packed run lengths fill an image of `shape` (height, width) exactly.
+
+    pycocotools would leave the rest of the mask as it was in memory.
+    """
+    _check_filled(unpack(counts), shape)
+
+
+def unpack(counts: bytes) -> Int64:
+    """The run lengths (R,) of a packed string. Raises DataError when it is not one."""
+    codes = np.frombuffer(counts, np.uint8).astype(np.int64) - FIRST_CHARACTER
+    if not len(codes) or codes.min() < 0 or codes.max() >= 2 * MORE or codes[-1] & MORE:
+        raise DataError("the run lengths are damaged: not a packed string of COCO's")
+    ends = np.flatnonzero((codes & MORE) == 0)
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    place = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
+    if place.max() >= LONGEST:
+        raise DataError("the run lengths are damaged: a number is longer than any image")
+    numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * place), starts)
+    numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (place[ends] + 1)), 0)
+    lengths = numbers.copy()
+    for first in (1, 2):
+        lengths[first::2] = np.cumsum(numbers[first::2])
+    return np.asarray(lengths, np.int64)
+
+
+def _check_filled(lengths: np.ndarray[tuple[int, ...], np.dtype[np.generic]], shape: tuple[int, int]) -> None:
+    height, width = shape
+    negative = bool(lengths.size) and float(lengths.min()) < 0
+    if negative or int(lengths.sum()) != height * width:
+        found = "a negative length" if negative else f"{int(lengths.sum())} px"
+        raise DataError(f"the run lengths must fill {width}x{height} = {height * width} px, found {found}")

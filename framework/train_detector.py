@@ -1,0 +1,27 @@
+"""`python -m framework.train_detector`: trains Mask R-CNN on rendered rooms."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from framework.command_line import CONF, one_line_errors
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="train_detector")
+def job(config: DictConfig) -> None:
+    from framework.training.run import train  # here, so that a misspelt key is answered before the heavy libraries load
+
+    train(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+def main() -> None:
+    with one_line_errors():
+        job()
+
+
+if __name__ == "__main__":
+    main()

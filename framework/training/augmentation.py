@@ -1,0 +1,59 @@
+"""Random changes to pictures that leave the objects what they are: what a detector must not be fooled by."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from framework.data import UInt8
+from framework.training.room_pictures import Example
+
+ZOOM = (0.55, 1.0)  # share of the picture's sides that is cut out and enlarged
+ZOOMED = 0.5  # share of the pictures
+LEAST_LEFT = 0.25  # share of an object that must be left after a cut for it to stay an object
+SMALLEST = 40  # px, of an object to be learned
+GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the largest factors
+BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # shares of the pictures
+
+
+def augmented(example: Example, rng: np.random.Generator) -> Example:
+    """The picture mirrored, cut out and enlarged, in other light, blurred, noisy: each with some probability."""
+    color, masks = example.color, example.masks
+    if rng.uniform() < 0.5:
+        color, masks = color[:, ::-1], masks[:, :, ::-1]
+    areas = masks.sum(axis=(1, 2))
+    if rng.uniform() < ZOOMED:
+        color, masks, scale = _zoomed(color, masks, rng)
+        areas = areas * scale
+    left = masks.sum(axis=(1, 2))
+    kept = (left >= SMALLEST) & (left >= LEAST_LEFT * areas)
+    names = tuple(name for name, keep in zip(example.class_names, kept.tolist(), strict=True) if keep)
+    return Example(_in_other_light(np.ascontiguousarray(color), rng), np.ascontiguousarray(masks[kept]), names)
+
+
+def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[UInt8, np.ndarray, float]:
+    """A part of the picture at the whole one's size, and by how much areas grow."""
+    height, width = color.shape[:2]
+    share = rng.uniform(*ZOOM)
+    h, w = round(share * height), round(share * width)
+    v, u = int(rng.integers(height - h + 1)), int(rng.integers(width - w + 1))
+    cut = cv2.resize(color[v : v + h, u : u + w], (width, height), interpolation=cv2.INTER_LINEAR)
+    rows = v + ((np.arange(height) + 0.5) * h / height).astype(np.int64)
+    columns = u + ((np.arange(width) + 0.5) * w / width).astype(np.int64)
+    return np.asarray(cut, np.uint8), masks[:, rows[:, None], columns], (height * width) / (h * w)
+
+
+def _in_other_light(color: UInt8, rng: np.random.Generator) -> UInt8:
+    levels = np.arange(256, dtype=np.float32) / 255
+    gains = np.exp(rng.uniform(-GAIN, GAIN) + rng.uniform(-CHANNEL_GAIN, CHANNEL_GAIN, 3))
+    gamma = np.exp(rng.uniform(-GAMMA, GAMMA))
+    table = np.clip(255 * gains[:, None] * levels[None] ** gamma, 0, 255).astype(np.uint8)
+    color = np.stack([cv2.LUT(np.ascontiguousarray(color[..., c]), table[c]) for c in range(3)], axis=-1)
+    if rng.uniform() < GRAY:
+        color = np.repeat(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)[..., None], 3, axis=-1)
+    if rng.uniform() < BLURRED:
+        color = np.asarray(cv2.GaussianBlur(color, (0, 0), rng.uniform(0.3, 1.2)), np.uint8)
+    if rng.uniform() < NOISY:
+        grain = rng.standard_normal(color.shape, np.float32) * np.float32(rng.uniform(1, 8))
+        color = np.asarray(np.clip(color + grain, 0, 255), np.uint8)
+    return color

@@ -1,0 +1,162 @@
+"""Pictures of many furnished rooms, with the mask of every object: what a detector is trained on.
+
+Each room is a random stream of its own and is looked at from random places, at random heights and angles, towards its
+objects. Domain randomization (Tobin et al. 2017): for each picture the colours of all surfaces are drawn anew around
+those that the room has, so that a network has to learn shapes.
+
+On disk a room is a folder, written whole or not at all: 000000.jpg, 000000.png (16-bit instance ids) and classes.json.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from framework.data import Bool, Camera, Float64, UInt8
+from framework.datasets.image_files import read_color, read_uint16
+from framework.errors import DataError
+from framework.synthetic.camera_path import look
+from framework.synthetic.layout import CELL
+from framework.synthetic.renderer import Renderer
+from framework.synthetic.room import Room, RoomKind, furnish
+from framework.synthetic.sensor import noisy_color
+
+STREAM = 0x7261_696E  # apart from the streams of all datasets, whatever their seed
+WIDTH, HEIGHT = 320, 240  # px
+FOCAL = (0.7, 1.0)  # image widths
+EYE_HEIGHT = (0.9, 1.75)  # m
+CLEAR = 0.35  # m, of the camera from furniture and walls
+TINT = 0.5  # how far a surface's colours may be multiplied or divided, as a logarithm
+TINTED = 0.7  # share of the pictures whose colours are drawn anew
+QUALITY = 93  # of the JPEG files
+LEAST = 100  # px of objects that make a picture worth keeping
+TRIES = 20  # views from which one worth keeping is sought
+
+
+@dataclass(frozen=True)
+class Example:
+    """One picture and its N objects of known class."""
+
+    color: UInt8  # (H, W, 3) RGB
+    masks: Bool  # (N, H, W)
+    class_names: tuple[str, ...]  # (N,)
+
+
+def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: int) -> None:
+    """Renders the rooms number `first` and following into `folder`; those that are there already are kept."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
+    if not missing:
+        return
+    # not forked: threads of numba and OpenCV do not survive that
+    workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    with workers, tqdm(total=len(missing), desc="rendering rooms", unit="room", disable=None) as bar:
+        for _ in workers.map(partial(render_room, folder, views), missing):
+            bar.update()
+
+
+def room_folder(folder: Path, number: int) -> Path:
+    return folder / f"room_{number:06d}"
+
+
+def render_room(folder: Path, views: int, number: int) -> None:
+    """Writes `views` pictures of room `number`."""
+    with tempfile.TemporaryDirectory(dir=folder, prefix=".room_") as unfinished:
+        target = Path(unfinished) / "room"
+        target.mkdir()
+        for k, (color, ids, names) in enumerate(pictures(number, views)):
+            if k == 0:
+                (target / "classes.json").write_text(json.dumps({str(i): name for i, name in names.items()}))
+            bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+            cv2.imwrite(str(target / f"{k:06d}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+            cv2.imwrite(str(target / f"{k:06d}.png"), ids)
+        shutil.move(target, room_folder(folder, number))
+
+
+def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:
+    """(color (H, W, 3), instance ids (H, W) uint16, their COCO classes) of random views of room `number`."""
+    rng = np.random.default_rng([STREAM, number])
+    kinds = list(RoomKind)
+    room = furnish(kinds[int(rng.integers(len(kinds)))], rng)
+    names = {i: name for i, name in room.surfaces.class_names.items() if name is not None}
+    renderer = Renderer(room.surfaces, list(room.lamps))
+    centers = _centers(room, list(names))
+    for _ in range(views):
+        for _ in range(TRIES):
+            focal = rng.uniform(*FOCAL) * WIDTH
+            camera = Camera(WIDTH, HEIGHT, focal, focal, (WIDTH - 1) / 2, (HEIGHT - 1) / 2)
+            T_world_camera = _view(room, centers, rng)
+            _, ids = renderer.depth_and_ids(camera, T_world_camera)
+            if np.isin(ids, list(names)).sum() >= LEAST:
+                break
+        renderer.surfaces = replace(room.surfaces, material_table=_tinted(room.surfaces.material_table, rng))
+        picture = renderer.render(camera, T_world_camera)
+        yield noisy_color(picture.color, rng.uniform(0, 2), rng), picture.instance_ids.astype(np.uint16), names
+
+
+def _centers(room: Room, ids: Sequence[int]) -> Float64:
+    """(N, 3) m: the middle of each object's box."""
+    surfaces = room.surfaces
+    corners = [surfaces.vertices[surfaces.triangles[surfaces.instance_ids == i]].reshape(-1, 3) for i in ids]
+    return np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners], np.float64)
+
+
+def _view(room: Room, centers: Float64, rng: np.random.Generator) -> Float64:
+    """T_world_camera (4, 4) from a free place, more or less towards some object."""
+    layout = room.layout
+    rows, columns = np.nonzero(layout.free >= CLEAR)
+    at = int(rng.integers(len(rows)))
+    x, y = (columns[at] + 0.5) * CELL - layout.width / 2, (rows[at] + 0.5) * CELL - layout.depth / 2
+    eye = np.array([x, y, rng.uniform(*EYE_HEIGHT)])
+    aim = centers[int(rng.integers(len(centers)))] - eye
+    yaw = np.arctan2(aim[1], aim[0]) + rng.normal(0, 0.3)
+    pitch = np.clip(np.arctan2(aim[2], np.hypot(aim[0], aim[1])) + rng.normal(0, 0.15), -0.9, 0.3)
+    return look(eye, float(yaw), float(pitch), float(rng.normal(0, 0.05)))
+
+
+def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The material table with the colours of each material multiplied by random factors."""
+    if rng.uniform() > TINTED:
+        return table
+    gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))
+    tinted = table.copy()
+    tinted[:, 1:4] = np.clip(tinted[:, 1:4] * gains, 0, 1)
+    tinted[:, 4:7] = np.clip(tinted[:, 4:7] * gains, 0, 1)
+    return tinted
+
+
+class RoomPictures:
+    """The pictures of rendered rooms, read when they are asked for."""
+
+    def __init__(self, folder: Path, first: int, rooms: int) -> None:
+        self.files: list[Path] = []
+        self._names: dict[Path, dict[int, str]] = {}
+        for number in range(first, first + rooms):
+            room = room_folder(folder, number)
+            if not room.is_dir():
+                raise DataError(f"{room} is missing: render the rooms first")
+            self.files += sorted(room.glob("*.jpg"))
+            classes = json.loads((room / "classes.json").read_text())
+            self._names[room] = {int(i): str(name) for i, name in classes.items()}
+
+    def __len__(self) -> int:
+        return len(self.files)
+
+    def __getitem__(self, k: int) -> Example:
+        file = self.files[k]
+        names = self._names[file.parent]
+        ids = read_uint16(file.with_suffix(".png"))
+        seen = [i for i in np.unique(ids).tolist() if i in names]
+        masks = ids == np.array(seen, np.uint16).reshape(-1, 1, 1)
+        return Example(read_color(file), masks, tuple(names[i] for i in seen))

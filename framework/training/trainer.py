@@ -1,0 +1,188 @@
+"""The training loop: batches, steps, checkpoints, the loss curve.
+
+What a step sees depends on the seed and the step's number only, so that a run that was stopped goes on as if it had not
+been.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from framework.atomic_files import written_whole
+from framework.detection.mask_rcnn import MaskRCNN
+from framework.detection.masks import tight_boxes
+from framework.errors import DataError
+from framework.parameters import require
+from framework.training.augmentation import augmented
+from framework.training.losses import Budget, Objects, losses
+from framework.training.room_pictures import Example, RoomPictures
+
+CHECKPOINT, CURVE, HISTORY = "checkpoint.pt", "losses.png", "losses.csv"
+LARGEST_GRADIENT = 10.0  # norm
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long and how fast to learn."""
+
+    steps: int = 6000  # >= 1
+    batch: int = 4  # pictures a step, >= 1
+    learning_rate: float = 1e-3  # > 0, at its height (AdamW)
+    weight_decay: float = 1e-2  # >= 0
+    warmup: int = 200  # steps, >= 0, in which the learning rate rises; then it falls as a cosine to a hundredth
+    averaging: float = 0.998  # in [0, 1): of the weights, over steps; what is saved is the average
+    checkpoint_every: int = 250  # steps, >= 1
+    seed: int = 0
+    budget: Budget = field(default_factory=Budget)
+
+    def __post_init__(self) -> None:
+        require(self.steps >= 1, "steps", self.steps, "at least 1")
+        require(self.batch >= 1, "batch", self.batch, "at least 1")
+        require(self.learning_rate > 0, "learning_rate", self.learning_rate, "positive")
+        require(self.weight_decay >= 0, "weight_decay", self.weight_decay, "0 or positive")
+        require(self.warmup >= 0, "warmup", self.warmup, "0 or positive")
+        require(0 <= self.averaging < 1, "averaging", self.averaging, "in [0, 1)")
+        require(self.checkpoint_every >= 1, "checkpoint_every", self.checkpoint_every, "at least 1")
+
+    def rate(self, step: int) -> float:
+        """The learning rate of a step."""
+        if step < self.warmup:
+            return self.learning_rate * (step + 1) / self.warmup
+        done = (step - self.warmup) / max(1, self.steps - self.warmup)
+        return self.learning_rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done)))
+
+
+class Trainer:
+    """Trains a network on pictures, from the last checkpoint in `folder` where there is one."""
+
+    def __init__(
+        self, network: MaskRCNN, pictures: RoomPictures, schedule: Schedule, folder: Path, device: str
+    ) -> None:
+        self.device = torch.device(device)
+        self.network = network.to(self.device).train()
+        self.pictures = pictures
+        self.schedule = schedule
+        self.folder = folder
+        self.step = 0
+        self.history: list[dict[str, float]] = []  # a step
+        self.averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
+        decayed = [p for p in network.parameters() if p.ndim > 1]
+        rest = [p for p in network.parameters() if p.ndim <= 1]  # biases and norms are not drawn towards 0
+        self._optimizer = torch.optim.AdamW(
+            [{"params": decayed, "weight_decay": schedule.weight_decay}, {"params": rest, "weight_decay": 0.0}],
+            lr=schedule.learning_rate,
+        )
+        folder.mkdir(parents=True, exist_ok=True)
+        if (folder / CHECKPOINT).is_file():
+            self._resume()
+
+    def run(self) -> None:
+        """All steps that are left. Ctrl-C loses what came after the last checkpoint."""
+        bar = tqdm(total=self.schedule.steps, initial=self.step, desc="training", unit="step", disable=None)
+        with bar:
+            while self.step < self.schedule.steps:
+                terms = self._learn()
+                self.history.append(terms)
+                self.step += 1
+                bar.update()
+                bar.set_postfix(loss=f"{sum(terms.values()):.3f}")
+                if self.step % self.schedule.checkpoint_every == 0 or self.step == self.schedule.steps:
+                    self._save()
+
+    def trained(self) -> MaskRCNN:
+        """The network with its averaged weights, on the CPU, for evaluation."""
+        network = MaskRCNN(self.network.architecture)
+        network.load_state_dict({name: value.cpu() for name, value in self.averaged.items()})
+        return network.eval()
+
+    def _learn(self) -> dict[str, float]:
+        """One step; returns the terms of the loss."""
+        rng = np.random.default_rng([self.schedule.seed, self.step])
+        chosen = rng.integers(len(self.pictures), size=self.schedule.batch)
+        examples = [augmented(self.pictures[int(k)], rng) for k in chosen]
+        images = torch.from_numpy(np.stack([e.color for e in examples])).permute(0, 3, 1, 2).to(self.device)
+        objects = [self._objects(example).to(self.device) for example in examples]
+        generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
+        terms = losses(self.network, images, objects, self.schedule.budget, generator)
+        loss = torch.stack(list(terms.values())).sum()
+        if not torch.isfinite(loss):
+            raise DataError(
+                f"training has diverged at step {self.step}: the loss is {loss.item()}; lower learning_rate"
+            )
+        for group in self._optimizer.param_groups:
+            group["lr"] = self.schedule.rate(self.step)
+        self._optimizer.zero_grad(set_to_none=True)
+        torch.autograd.backward(loss)
+        torch.nn.utils.clip_grad_norm_(self.network.parameters(), LARGEST_GRADIENT)
+        self._optimizer.step()
+        self._average()
+        return {name: float(value.detach()) for name, value in terms.items()}
+
+    def _objects(self, example: Example) -> Objects:
+        index = {name: k for k, name in enumerate(self.network.architecture.classes, start=1)}
+        unknown = sorted(set(example.class_names) - set(index))
+        if unknown:
+            raise DataError(f"the pictures show classes that the network does not have: {', '.join(unknown)}")
+        boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # borders, of pixels inside
+        return Objects(
+            boxes=torch.from_numpy(boxes),
+            labels=torch.tensor([index[name] for name in example.class_names], dtype=torch.int64),
+            masks=torch.from_numpy(example.masks),
+        )
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))  # the first weights are worth nothing
+        for name, value in self.network.state_dict().items():
+            if value.is_floating_point():
+                self.averaged[name].lerp_(value, 1 - keep)
+            else:
+                self.averaged[name].copy_(value)
+
+    def _save(self) -> None:
+        state = {
+            "step": self.step,
+            "network": self.network.state_dict(),
+            "averaged": self.averaged,
+            "optimizer": self._optimizer.state_dict(),
+            "history": self.history,
+        }
+        with written_whole(self.folder / CHECKPOINT) as path:
+            torch.save(state, path)
+        with written_whole(self.folder / HISTORY) as path, path.open("w", newline="") as file:
+            writer = csv.DictWriter(file, ["step", *self.history[0]])
+            writer.writeheader()
+            writer.writerows({"step": k, **terms} for k, terms in enumerate(self.history))
+        with written_whole(self.folder / CURVE) as path:
+            draw_losses(self.history, path)
+
+    def _resume(self) -> None:
+        state = torch.load(self.folder / CHECKPOINT, map_location=self.device, weights_only=True)
+        self.network.load_state_dict(state["network"])
+        self.averaged = state["averaged"]
+        self._optimizer.load_state_dict(state["optimizer"])
+        self.step, self.history = state["step"], state["history"]
+
+
+def draw_losses(history: Sequence[dict[str, float]], path: Path) -> None:
+    """The terms of the loss over the steps, as running means, on a logarithmic scale."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axes = figure.subplots()
+    width = max(1, len(history) // 60)
+    for name in history[0]:
+        values = np.array([terms[name] for terms in history])
+        means = np.convolve(values, np.ones(width) / width, mode="valid")
+        axes.plot(np.arange(len(means)) + width, np.maximum(means, 1e-6), label=name)
+    axes.set(xlabel="step", ylabel=f"loss, mean of {width} steps", yscale="log")
+    axes.grid(alpha=0.3)
+    axes.legend()
+    figure.savefig(path, dpi=110)

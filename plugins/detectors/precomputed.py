@@ -1,0 +1,143 @@
+"""The detections of any other program, from files."""
+
+from __future__ import annotations
+
+import hashlib
+import logging
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Bool, Detections, Float32, Frame
+from framework.detection.coco_results import CategoryIds, read_results
+from framework.detection.mask_folder import read_mask_folder
+from framework.detection.masks import tight_boxes
+from framework.detection.stored_detection import StoredDetection
+from framework.errors import ConfigError, DataError
+from framework.interfaces import Detector
+from framework.label_spaces import read_labels, to_coco
+from framework.parameters import check_bounds
+
+log = logging.getLogger(__name__)
+
+FRAMES_IN_DOUBT = 30  # frames in a row, from the first, without an entry: time to tell the user
+
+
+@dataclass
+class Precomputed(Detector):
+    """Returns what a COCO result file or a folder of masks has for the frame's number.
+
+    `python -m framework.detect` writes such a file, and so does any program that COCO's evaluation accepts; a folder
+    has NNNNNN.png with 16-bit instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Either may
+    give `class_probabilities`, over its own labels. Labels become COCO's names as `label_spaces.yaml` says, and a
+    detection whose best label means none of them is dropped.
+
+    Where there is only a label and a score s, the label gets the probability 1 - spread * (1 - s), but not less than
+    its even share, and the other classes share the rest evenly. With spread 1 that is s; with 0 the label is certain.
+
+    A frame without an entry has no detections. Raises DataError when the last frame that has one is over and there was
+    none: then the file belongs to another sequence.
+    """
+
+    path: Path  # JSON file or folder
+    labels: str = "coco"  # a label space, or a text file with one name a line: that of the file
+    category_ids: CategoryIds = CategoryIds.COCO_91  # what category_id counts, where there is no category_name
+    score_threshold: float = 0.0  # in [0, 1]: detections below are dropped
+    spread: float = 1.0  # in [0, 1]: how much of what a score lacks to 1 goes to the other classes
+
+    reads = ("index", "camera")
+
+    def __post_init__(self) -> None:
+        check_bounds(self, score_threshold=(0.0, 1.0), spread=(0.0, 1.0))
+        self.path = Path(self.path).expanduser()
+        self._labels = read_labels(self.labels)
+        if len(set(self._labels)) < len(self._labels):
+            raise ConfigError(f"detector.labels: {self.labels} has a name twice")
+        if self.path.is_dir():
+            stored = read_mask_folder(self.path, self._labels)
+        else:
+            stored = read_results(self.path, self._labels, self.category_ids)
+        if not stored:
+            raise DataError(f"{self.path} holds no detection")
+        probabilities, known = self._distributions(stored)
+        if not known.any():
+            raise DataError(f"{self.path}: none of the {len(stored)} detections is of a class of COCO's")
+        if not known.all():
+            lost = sorted({one.label for one, is_known in zip(stored, known, strict=True) if not is_known})
+            log.info("%s: %d of %d detections are of no class of COCO's and are dropped: %s",
+                     self.path, int((~known).sum()), len(stored), ", ".join(lost))  # fmt: skip
+        self._frames = {one.frame for one in stored}
+        self._of_frame: dict[int, list[tuple[StoredDetection, Float32]]] = defaultdict(list)
+        for one, row, is_known in zip(stored, probabilities, known, strict=True):
+            if is_known and one.score >= self.score_threshold:
+                self._of_frame[one.frame].append((one, row))
+        for of_frame in self._of_frame.values():
+            of_frame.sort(key=lambda pair: -pair[0].score)  # stable: equal ones stay in the file's order
+        self._matched = False
+        self._asked: set[int] = set()
+
+    def fingerprint(self) -> str:
+        """Also the labels, which may come from a file."""
+        return hashlib.sha256(repr((super().fingerprint(), self._labels)).encode()).hexdigest()
+
+    def detect(self, frame: Frame) -> Detections:
+        self._expect_a_match(frame.index)
+        stored = self._of_frame.get(frame.index)
+        if not stored:
+            return Detections.none(frame.camera.shape, self.classes)
+        masks = np.stack([_mask(one, frame) for one, _ in stored])
+        tight = tight_boxes(masks)
+        return Detections(
+            masks=masks,
+            boxes=np.stack([own if one.box is None else one.box for (one, _), own in zip(stored, tight, strict=True)]),
+            scores=np.array([one.score for one, _ in stored], np.float32),
+            class_probabilities=np.stack([row for _, row in stored]),
+            classes=self.classes,
+            exact=all(one.exact for one, _ in stored),
+        )
+
+    def _distributions(self, stored: Sequence[StoredDetection]) -> tuple[Float32, Bool]:
+        """(N, C) over COCO's names, and (N,) whether the best label means one; sets `classes`."""
+        index = {name: k for k, name in enumerate(self._labels)}
+        one_hot = np.eye(len(index), dtype=np.float32)
+        given = np.stack([one_hot[index[one.label]] if one.probabilities is None else one.probabilities
+                          for one in stored])  # fmt: skip
+        only_label = np.array([one.probabilities is None for one in stored])
+        mapping = to_coco(self._labels)
+        self.classes = mapping.classes
+        rows, known = mapping.apply(given)
+        if self.classes == self._labels:
+            rows = given  # to the bit: normalising could change the last digit
+        scores = np.array([one.score for one in stored])
+        rows[only_label] = self._spread(rows[only_label], scores[only_label])
+        return rows, known
+
+    def _spread(self, one_hot: Float32, scores: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Float32:
+        """Rows (N, C) of 0 and 1 with what the scores (N,) lack to 1 taken from the label and given to the others."""
+        c = one_hot.shape[1]
+        if c == 1:
+            return one_hot
+        own = np.maximum(1 - self.spread * (1 - scores), 1 / c)[:, None]
+        return np.asarray(np.where(one_hot > 0, own, (1 - own) / (c - 1)), np.float32)
+
+    def _expect_a_match(self, index: int) -> None:
+        if self._matched or index in self._frames:
+            self._matched = True
+            return
+        self._asked.add(index)
+        first, last = min(self._frames), max(self._frames)
+        has = f"{self.path} has detections for frames {first} to {last}"
+        if index > last:
+            raise DataError(f"{has}, and for none of those asked for so far, up to {index}: is it this sequence's?")
+        if len(self._asked) == FRAMES_IN_DOUBT:
+            log.warning("%s, but for none of the first %d frames: is it this sequence's?", has, FRAMES_IN_DOUBT)
+
+
+def _mask(stored: StoredDetection, frame: Frame) -> Bool:
+    try:
+        return stored.segmentation.mask(frame.camera.shape)
+    except DataError as error:
+        raise type(error)(f"{stored.where}: frame {frame.index}: {error}") from error

@@ -1,0 +1,382 @@
+"""Networks of Hugging Face transformers that predict one mask and one class for each of a set of queries."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from framework.data import Detections, Float32, Frame, UInt8
+from framework.detection.masks import suppress_duplicates, tight_boxes
+from framework.errors import ConfigError, DataError
+from framework.interfaces import Detector
+from framework.label_spaces import to_coco
+from framework.parameters import require
+
+PREPROCESSING_FILE = "preprocessor_config.json"
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what the files leave out by default
+RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers, as the files have them
+PLACEHOLDER = re.compile(r"LABEL_\d+")  # how transformers names a class that nobody named
+
+
+@dataclass(frozen=True)
+class Family:
+    """What the architectures of one kind have in common."""
+
+    auto_class: str  # of transformers, that loads them
+    logits: str  # the output with the classes' logits, (1, Q, C or C + 1)
+    masks: str  # the output with the masks' logits, (1, Q, h, w)
+    any_size: bool  # they take images of any size
+    mask_quality: bool  # their published score counts how sure a mask is of its own pixels
+
+
+_MASK_FORMER = Family(
+    "AutoModelForUniversalSegmentation",
+    "class_queries_logits",
+    "masks_queries_logits",
+    any_size=True,
+    mask_quality=True,
+)
+_EOMT = Family(
+    "AutoModelForUniversalSegmentation",
+    "class_queries_logits",
+    "masks_queries_logits",
+    any_size=False,
+    mask_quality=True,
+)
+FAMILIES = {
+    "mask2former": _MASK_FORMER,
+    "maskformer": _MASK_FORMER,
+    "eomt": _EOMT,
+    "eomt_dinov3": _EOMT,
+    "detr": Family("AutoModelForUniversalSegmentation", "logits", "pred_masks", any_size=True, mask_quality=False),
+    "rf_detr": Family("AutoModelForInstanceSegmentation", "logits", "pred_masks", any_size=False, mask_quality=False),
+}
+"""By the `model_type` in a model's config.json."""
+
+
+@dataclass
+class TransformersSegmentation(Detector):
+    """Mask2Former, MaskFormer, EoMT, RF-DETR-Seg or DETR by model id or local folder; needs the extra `transformers`.
+
+    Choose a checkpoint for instance or panoptic segmentation: one for semantic segmentation has one mask for all chairs
+    of an image. The classes are those COCO names that the model's labels mean (framework/label_spaces.yaml); what it
+    takes for a wall or another label without such a name is no detection.
+
+    A detection's class probabilities are the softmax over the labels' logits without the no-object one. For a head of
+    softmaxes that is its distribution given that there is an object; for a head of independent sigmoids p_c it is their
+    distribution given that exactly one of the labels is true: P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c), and
+    that is exp(logit_c). Its score is the probability of its best label, for softmaxes with the no-object share
+    counted; the MaskFormers and EoMT multiply it by the mean probability of the mask's pixels, as published.
+    """
+
+    model: str = "facebook/mask2former-swin-tiny-coco-instance"  # id on huggingface.co, or a folder
+    revision: str = "main"  # branch, tag or commit of a model id
+    local_files_only: bool = True  # False = a model id that is not in the local cache is downloaded into it
+    score_threshold: float = 0.1  # in [0, 1): low, for weak detections may still update instances that exist
+    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
+    max_detections: int = 100  # >= 1, an image: the queries with the best class
+    short_side: int = 0  # px, to which images are resized; 0 = as published
+    long_side: int = 0  # px >= short_side, bound on the other side; 0 where short_side is
+    mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
+    half: bool = True  # half precision on CUDA
+    device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
+    reads = ("color",)
+
+    def __post_init__(self) -> None:
+        require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
+        require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
+        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
+        require(
+            self.short_side == 0 or self.short_side >= 32,
+            "detector.short_side",
+            self.short_side,
+            "0 (as published) or at least 32 px",
+        )
+        require(
+            self.long_side >= self.short_side if self.short_side else self.long_side == 0,
+            "detector.long_side",
+            self.long_side,
+            f"at least {self.short_side} px" if self.short_side else "0 where short_side is 0",
+        )
+        require(self.device in ("auto", "cpu", "cuda"), "detector.device", self.device, "auto, cpu or cuda")
+        require(
+            self.device != "cuda" or torch.cuda.is_available(),
+            "detector.device",
+            self.device,
+            "cpu or auto without a GPU",
+        )
+        checkpoint = Checkpoint(self.model, self.revision, self.local_files_only)
+        self._family = checkpoint.family
+        self._preprocessing = checkpoint.read_preprocessing()
+        if self.short_side:
+            require(
+                self._family.any_size, "detector.short_side", self.short_side, "0, for this model takes one size only"
+            )
+            self._preprocessing = self._preprocessing.at(self.short_side, self.long_side)
+        self._mapping = to_coco(checkpoint.labels)
+        self.classes = self._mapping.classes
+        self._device = torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
+        self._network = checkpoint.read_network().to(self._device)
+        self._commit = checkpoint.commit
+
+    def fingerprint(self) -> str:
+        return f"{super().fingerprint()} {self._commit}"
+
+    @torch.inference_mode()
+    def detect(self, frame: Frame) -> Detections:
+        shape = frame.camera.shape
+        pixels, covered = self._preprocessing(frame.color, self._device)
+        logits, grids = self._predict(pixels)
+        distributions, best = class_distributions(logits, len(self._mapping.meaning))
+        class_probabilities, known = self._mapping.apply(distributions)
+        candidates = np.argsort(-best, kind="stable")
+        candidates = candidates[(known & (best > self.score_threshold))[candidates]][: self.max_detections]
+
+        mask_logits = resample_masks(grids[torch.from_numpy(candidates).to(self._device)], covered, shape)
+        inside = mask_logits > math.log(self.mask_threshold / (1 - self.mask_threshold))
+        scores = best[candidates]
+        if self._family.mask_quality:
+            scores = scores * mean_probability(mask_logits, inside)
+        order = np.argsort(-scores, kind="stable")
+        order = order[scores[order] > self.score_threshold]
+        masks, scores, candidates = inside.cpu().numpy()[order], scores[order], candidates[order]
+        kept = suppress_duplicates(masks, self.agnostic_nms)
+        return Detections(
+            masks=masks[kept],
+            boxes=tight_boxes(masks[kept]),
+            scores=scores[kept],
+            class_probabilities=class_probabilities[candidates[kept]],
+            classes=self.classes,
+        )
+
+    def _predict(self, pixels: Tensor) -> tuple[Float32, Tensor]:
+        """The queries' class logits (Q, C or C + 1), and their mask logits (Q, h, w) float32 on the device."""
+        half = self.half and self._device.type == "cuda"
+        with torch.autocast(self._device.type, torch.float16, enabled=half):
+            output = self._network(pixel_values=pixels)
+        logits, grids = output[self._family.logits][0].float(), output[self._family.masks][0].float()
+        if not (torch.isfinite(logits).all() and torch.isfinite(grids).all()):
+            advice = "; try detector.half=false" if half else ""
+            raise DataError(f"detector.model: the output of {self.model} is not finite{advice}")
+        return np.asarray(logits.cpu().numpy(), np.float32), grids
+
+
+def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]:
+    """Distributions over the labels (Q, C), and the probability (Q,) of the best label.
+
+    logits (Q, K). K = C + 1: softmaxes, the last for no object. K = C: independent sigmoids. See the detector.
+    """
+    if logits.shape[1] not in (labels, labels + 1):
+        raise DataError(f"detector.model: {logits.shape[1]} class logits do not fit the config's {labels} labels")
+    objects = logits[:, :labels]
+    highest = objects.max(axis=1, keepdims=True)
+    weights = np.exp(objects - highest, dtype=np.float64)
+    total = weights.sum(axis=1, keepdims=True)
+    if logits.shape[1] == labels:
+        log_best = -np.logaddexp(0, -highest, dtype=np.float64)
+    else:
+        log_best = -np.logaddexp(np.log(total), logits[:, labels:] - highest)
+    return (weights / total).astype(np.float32), np.exp(log_best[:, 0]).astype(np.float32)
+
+
+def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int, int]) -> Tensor:
+    """Mask logits (N, h, w) over the network's input, bilinearly at the pixels of an image of `shape`: (N, H, W).
+
+    `covered`: the share of the input's height and width that the image takes, from the upper left; the rest is padding.
+    """
+    axes = [
+        (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * share / size) - 1
+        for size, share in zip(shape, covered, strict=True)
+    ]
+    v, u = torch.meshgrid(*axes, indexing="ij")
+    places = torch.stack([u, v], dim=-1)[None]
+    return functional.grid_sample(grids[None], places, padding_mode="border", align_corners=False)[0]
+
+
+def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
+    """How sure each mask (N, H, W) is of the pixels inside it, (N,); 0 for an empty one."""
+    total = (torch.sigmoid(mask_logits) * inside).sum(dim=(1, 2))
+    return np.asarray((total / inside.sum(dim=(1, 2)).clamp(min=1)).cpu().numpy(), np.float32)
+
+
+@dataclass(frozen=True)
+class Preprocessing:
+    """From an image to a network's input, by the numbers of the model's preprocessor_config.json.
+
+    Done here and not by transformers' image processors, because those need torchvision, which is often broken.
+    """
+
+    size: Mapping[str, int] | None  # as in the file; None = images are not resized
+    divisor: int  # sides are rounded up to a multiple
+    pad_to: tuple[int, int] | None  # (height, width), with black on the right and below
+    mode: str  # of resampling
+    factor: float  # multiplies 0..255
+    mean: tuple[float, ...]  # RGB, after multiplication
+    std: tuple[float, ...]
+
+    @classmethod
+    def parse(cls, content: Mapping[str, Any], where: str) -> Preprocessing:
+        """Raises DataError, naming the file `where`, for what is missing or not supported."""
+        if content.get("do_split_image"):
+            raise DataError(f"{where} cuts images in pieces, as for semantic segmentation: choose an instance model")
+        if content.get("pad_size"):
+            raise DataError(f"{where}: pad_size is not supported, found {content['pad_size']}")
+        if content.get("resample", 2) not in RESAMPLING:
+            raise DataError(f"{where}: resample must be one of {[*RESAMPLING]}, found {content['resample']}")
+        size = content.get("size") if content.get("do_resize", True) else None
+        if isinstance(size, int):  # as files were before 2023
+            size = {"shortest_edge": size, "longest_edge": content.get("max_size", size)}
+        keys = {key for key, value in (size or {}).items() if value}
+        known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
+        if content.get("do_resize", True) and keys not in known:
+            raise DataError(
+                f"{where}: size must have height and width, or shortest_edge and longest_edge, found {size}"
+            )
+        normalizes = content.get("do_normalize", True)
+        pads = content.get("do_pad") and str(content.get("image_processor_type", "")).startswith("Eomt")
+        return cls(
+            size={key: int(size[key]) for key in keys} if size else None,
+            divisor=int(content.get("size_divisor") or content.get("size_divisibility") or 1),
+            # the other processors pad only to the largest image of a batch
+            pad_to=(size["shortest_edge"], size["longest_edge"]) if pads and size else None,
+            mode=RESAMPLING[content.get("resample", 2)],
+            factor=content.get("rescale_factor", 1 / 255) if content.get("do_rescale", True) else 1.0,
+            mean=tuple(content.get("image_mean", IMAGENET_MEAN)) if normalizes else (0.0, 0.0, 0.0),
+            std=tuple(content.get("image_std", IMAGENET_STD)) if normalizes else (1.0, 1.0, 1.0),
+        )
+
+    def at(self, short_side: int, long_side: int) -> Preprocessing:
+        """The same for images resized to another size."""
+        fields = dict(vars(self), size={"shortest_edge": short_side, "longest_edge": long_side})
+        return Preprocessing(**fields)
+
+    def resized(self, shape: tuple[int, int]) -> tuple[int, int]:
+        """The shape (height, width) of an image of `shape` after resizing."""
+        if self.size is None:
+            return shape
+        height, width = shape
+        if "height" in self.size:
+            height, width = self.size["height"], self.size["width"]
+        elif "max_height" in self.size:
+            scale = min(self.size["max_height"] / height, self.size["max_width"] / width)
+            height, width = int(height * scale), int(width * scale)
+        else:
+            height, width = _with_short_side(shape, self.size["shortest_edge"], self.size["longest_edge"])
+        return -(-height // self.divisor) * self.divisor, -(-width // self.divisor) * self.divisor
+
+    def __call__(self, color: UInt8, device: torch.device) -> tuple[Tensor, tuple[float, float]]:
+        """The input (1, 3, H, W) of an image (h, w, 3), and the share of H and W that the image covers."""
+        pixels = torch.from_numpy(color).to(device).permute(2, 0, 1)[None].float()
+        height, width = self.resized((color.shape[0], color.shape[1]))
+        if (height, width) != color.shape[:2]:
+            # antialiased, as Pillow does it
+            pixels = functional.interpolate(pixels, (height, width), mode=self.mode, antialias=True).clamp_(0, 255)
+        covered = 1.0, 1.0
+        if self.pad_to is not None:
+            pad_height, pad_width = (max(0, to - side) for to, side in zip(self.pad_to, (height, width), strict=True))
+            pixels = functional.pad(pixels, (0, pad_width, 0, pad_height))
+            covered = height / (height + pad_height), width / (width + pad_width)
+        mean, std = (torch.tensor(values, device=device)[:, None, None] for values in (self.mean, self.std))
+        return (pixels * self.factor - mean) / std, covered
+
+
+def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int, int]:
+    """The aspect kept, rounded as DETR's transforms round, for the networks were trained with it."""
+    smaller, larger = min(shape), max(shape)
+    exact: float = short
+    if larger / smaller * short > long:
+        exact = long * smaller / larger
+    side = round(exact)
+    other = larger if smaller == side else int(exact * larger / smaller)
+    return (side, other) if shape[0] <= shape[1] else (other, side)
+
+
+class Checkpoint:
+    """A model in the local cache, on huggingface.co or in a folder. Its faults are one line that says what to do.
+
+    Code that comes with a model is never run.
+    """
+
+    def __init__(self, model: str, revision: str, local_files_only: bool) -> None:
+        try:
+            import transformers
+        except ImportError as error:
+            raise ConfigError(
+                "the package transformers is not installed: pip install instancemap[transformers]"
+            ) from error
+        self._transformers = transformers
+        folder = Path(model).expanduser()
+        self.model = str(folder) if folder.is_dir() else model
+        self.options = {"revision": revision, "local_files_only": local_files_only}
+        self.config = self._read("its config.json", transformers.AutoConfig.from_pretrained, self.model, **self.options)
+        kind = self.config.model_type
+        require(kind in FAMILIES, "detector.model", f"{model}, which is {kind}", f"one of {', '.join(FAMILIES)}")
+        self.family = FAMILIES[kind]
+
+    @property
+    def labels(self) -> Sequence[str]:
+        """The names of the model's classes; those that the model leaves without a name are not an object class."""
+        names = [self.config.id2label[k] for k in range(len(self.config.id2label))]
+        unnamed = [PLACEHOLDER.fullmatch(name) is not None for name in names]
+        if all(unnamed):
+            raise DataError(f"detector.model: {self.model} does not name its classes: fill id2label in its config.json")
+        return ["n/a" if no_name else name for name, no_name in zip(names, unnamed, strict=True)]
+
+    @property
+    def commit(self) -> str:
+        """Of a model id, what `revision` names at present; empty for a folder."""
+        return str(getattr(self.config, "_commit_hash", None) or "")
+
+    def read_preprocessing(self) -> Preprocessing:
+        """How the model wants its images."""
+        read = self._transformers.utils.cached_file
+        path = self._read(f"its {PREPROCESSING_FILE}", read, self.model, PREPROCESSING_FILE, **self.options)
+        try:
+            content = json.loads(Path(path).read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise DataError(f"detector.model: {path} could not be read: {error}") from error
+        return Preprocessing.parse(content, str(path))
+
+    def read_network(self) -> torch.nn.Module:
+        """The network in float32 on the CPU, for inference. Raises DataError unless the weights fit and fill it."""
+        auto_class = getattr(self._transformers, self.family.auto_class)
+        network, loading = self._read(
+            "its weights", auto_class.from_pretrained, self.model, output_loading_info=True, **self.options
+        )
+        # transformers warns only, and leaves them random
+        missing = sorted(set(loading["missing_keys"]) & {name for name, _ in network.named_parameters()})
+        if missing:
+            raise DataError(
+                f"detector.model: {self.model} has no weights for {len(missing)} of the network's tensors,"
+                f" {', '.join(missing[:3])}, ...: it is not a checkpoint for segmentation"
+            )
+        module: torch.nn.Module = network.float().eval()
+        return module
+
+    def _read(self, what: str, read: Any, *arguments: Any, **options: Any) -> Any:
+        try:
+            return read(*arguments, **options)
+        except Exception as error:  # whatever transformers, the hub's client and safetensors raise on foreign files
+            reason = " ".join(str(error).split())
+            if Path(self.model).is_dir():
+                raise DataError(f"detector.model: {what} could not be read from {self.model}: {reason}") from error
+            advice = (
+                "download it once with detector.local_files_only=false, or give a local folder"
+                if self.options["local_files_only"]
+                else "check the name and the network, or give a local folder"
+            )
+            raise DataError(
+                f"detector.model: {self.model} is no folder, and not in the local cache ({what}): {advice};"
+                f" transformers says: {reason}"
+            ) from error

@@ -1,0 +1,73 @@
+"""What the detection cache costs and saves at 640x480: `python -m pytest tests/benchmarks -k detection_cache`."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from framework.data import Camera, Detections, Frame, FrameTruth
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.detection.cache import CachedDetector, frame_hash, pack, unpack
+from framework.detection.masks import tight_boxes
+from framework.interfaces import Detector
+from framework.label_spaces import COCO
+from plugins.detectors.maskrcnn2go import MaskRCNN2Go
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+FRAMES = 12
+OBJECTS = 20
+
+
+def noise() -> Frame:
+    random = np.random.default_rng(0)
+    color = random.integers(0, 256, (480, 640, 3), np.uint8)
+    truth = FrameTruth(random.integers(0, 9, (480, 640), np.int32), dict.fromkeys(range(1, 9), "chair"))
+    return Frame(0, 0.0, color, random.random((480, 640), np.float32), CAMERA, truth=truth)
+
+
+def ellipses() -> Detections:
+    """Objects of 60 to 260 px."""
+    random = np.random.default_rng(0)
+    v, u = np.ogrid[:480, :640]
+    half, center = random.uniform(30, 130, (OBJECTS, 2)), random.uniform(0, (640, 480), (OBJECTS, 2))
+    masks = np.stack([np.hypot((u - x) / a, (v - y) / b) < 1 for (a, b), (x, y) in zip(half, center, strict=True)])
+    rows = random.dirichlet(np.ones(80), OBJECTS).astype(np.float32)
+    return Detections(masks, tight_boxes(masks), np.linspace(1, 0, OBJECTS, dtype=np.float32), rows, COCO)
+
+
+@pytest.mark.parametrize("reads", [("color",), Detector.reads], ids=["color", "everything"])
+def test_hashing_a_frame(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
+    benchmark(frame_hash, noise(), reads)
+
+
+def test_packing_detections(benchmark: BenchmarkFixture) -> None:
+    benchmark.extra_info["bytes"] = len(benchmark(pack, ellipses()))
+
+
+def test_unpacking_detections(benchmark: BenchmarkFixture) -> None:
+    benchmark(unpack, pack(ellipses()), COCO)
+
+
+def test_the_second_run(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
+    """A network on a real video, then the same video again, from the cache."""
+    data, weights = shared / "data" / "redkitchen", shared / "weights" / "maskrcnn2go_int8"
+    if not (data.is_dir() and weights.is_dir()):
+        pytest.skip(f"{data} or {weights} is not there")
+    frames = list(RgbdFolder(data, stop=FRAMES))
+    detector = MaskRCNN2Go(weights=weights, device="cpu")
+    detector.detect(frames[0])  # warm
+    first = CachedDetector(detector, tmp_path)
+    started = time.perf_counter()
+    for frame in frames:
+        first.detect(frame)
+    took = time.perf_counter() - started
+    second = CachedDetector(detector, tmp_path)
+    benchmark.pedantic(lambda: [second.detect(frame) for frame in frames], rounds=5, warmup_rounds=1)
+    assert second.misses == 0
+    share = benchmark.stats.stats.median / took
+    benchmark.extra_info.update(first_run_ms_a_frame=round(1e3 * took / FRAMES, 1), second_run_share=round(share, 4))
+    print(f"\nfirst run {1e3 * took / FRAMES:.1f} ms a frame, the second {100 * share:.1f} % of it")

@@ -1,0 +1,350 @@
+"""The detection cache: the same to the bit, asked once, and never in the way."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from framework.command_line import CONF
+from framework.data import Detections, Frame, FrameTruth
+from framework.detection import cache
+from framework.detection.cache import CachedDetector, CacheMode, cache_metrics, frame_hash, pack, unpack, with_cache
+from framework.errors import ConfigError, DataError, FrameError
+from framework.interfaces import Detector
+from framework.label_spaces import COCO
+from framework.run import run
+from plugins.detectors.simulated import SimulatedDetector
+from tests import detector_files, registered
+from tests.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+FIELDS = ("masks", "boxes", "scores", "class_probabilities")
+
+
+@dataclass
+class Noise(Detector):
+    """Random detections of the colours and the parameter; counts how often it is asked."""
+
+    strength: float = 1.0
+    broken_at: int = -1
+
+    reads = ("color",)
+
+    def __post_init__(self) -> None:
+        self.classes = COCO
+        self.asked = 0
+
+    def detect(self, frame: Frame) -> Detections:
+        if frame.index == self.broken_at:
+            raise FrameError(f"frame {frame.index} is broken")
+        self.asked += 1
+        return random_detections(int(frame.color.sum()) + int(1000 * self.strength), frame.camera.shape)
+
+
+def random_detections(seed: int, shape: tuple[int, int], n: int = 7) -> Detections:
+    random = np.random.default_rng(seed)
+    masks = np.zeros((n, *shape), np.bool_)
+    for mask in masks[1:]:  # the first one is empty
+        (y1, y2), (x1, x2) = (np.sort(random.integers(0, side + 1, 2)) for side in shape)
+        mask[y1:y2, x1:x2] = random.random((y2 - y1, x2 - x1)) < random.random()
+    masks[-1, 0, 0] = masks[-1, -1, -1] = True
+    rows = random.random((n, len(COCO))).astype(np.float32)
+    return Detections(
+        masks=masks,
+        boxes=random.normal(0, 100, (n, 4)).astype(np.float32),
+        scores=np.sort(random.random(n).astype(np.float32))[::-1].copy(),
+        class_probabilities=rows / rows.sum(axis=1, keepdims=True),
+        classes=COCO,
+        exact=bool(seed % 2),
+    )
+
+
+def assert_same(a: Detections, b: Detections) -> None:
+    """To the bit, and arrays that can be used in the same way."""
+    assert (a.classes, a.exact) == (b.classes, b.exact)
+    for name in FIELDS:
+        x, y = getattr(a, name), getattr(b, name)
+        assert (x.dtype, x.shape) == (y.dtype, y.shape)
+        assert x.tobytes() == y.tobytes(), name
+        assert x.flags.writeable == y.flags.writeable
+        assert y.flags.c_contiguous
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_an_entry_comes_back_to_the_bit(seed: int) -> None:
+    before = random_detections(seed, (37, 53))
+    assert_same(before, unpack(pack(before), COCO))
+
+
+def test_an_entry_without_detections_comes_back() -> None:
+    before = Detections.none((37, 53), COCO)
+    assert_same(before, unpack(pack(before), COCO))
+
+
+def test_the_second_time_the_detector_is_not_asked(room: CornerRoom, tmp_path: Path) -> None:
+    first = CachedDetector(Noise(), tmp_path)
+    plain = [Noise().detect(frame) for frame in room]
+    for frame, expected in zip(room, plain, strict=True):
+        assert_same(expected, first.detect(frame))
+    assert first.metrics() == {"detection_cache.hits": 0, "detection_cache.misses": 6}
+    second = CachedDetector(Noise(), tmp_path)
+    for k in reversed(range(6)):
+        assert_same(plain[k], second.detect(room[k]))
+    assert isinstance(second.detector, Noise)
+    assert second.detector.asked == 0
+    assert second.metrics() == {"detection_cache.hits": 6, "detection_cache.misses": 0}
+    assert not list(tmp_path.rglob(".*")), "no temporary files are left"
+
+
+@pytest.mark.parametrize("changed", [Noise(strength=2.0), SphereDetector()], ids=["parameter", "class"])
+def test_another_detector_misses(room: CornerRoom, tmp_path: Path, changed: Detector) -> None:
+    CachedDetector(Noise(), tmp_path).detect(room[0])
+    other = CachedDetector(changed, tmp_path)
+    other.detect(room[0])
+    assert (other.hits, other.misses) == (0, 1)
+
+
+def test_other_weights_miss(room: CornerRoom, tmp_path: Path) -> None:
+    weights = tmp_path / "weights"
+    counts = []
+    for content in (b"1", b"1", b"2"):
+        weights.write_bytes(content)
+        detector = CachedDetector(Weighted(weights=weights), tmp_path / "cache")
+        detector.detect(room[0])
+        counts.append(detector.hits)
+    assert counts == [0, 1, 0]
+
+
+@dataclass
+class Weighted(Noise):
+    """With a file."""
+
+    weights: Path = Path()
+
+
+def test_what_a_detector_reads_of_a_frame_counts(room: CornerRoom) -> None:
+    frame = room[0]
+    assert frame.truth is not None
+    color, depth = frame.color.copy(), frame.depth.copy()
+    color[3, 4, 1] ^= 1
+    depth[3, 4] += 1e-6
+    ids = frame.truth.instance_ids.copy()
+    ids[0, 0] += 1
+    changed = {
+        "index": replace(frame, index=1),
+        "timestamp": replace(frame, timestamp=1e-9),
+        "color": replace(frame, color=color),
+        "depth": replace(frame, depth=depth),
+        "camera": replace(frame, camera=replace(CAMERA, fx=90.0001)),
+        "T_world_camera": replace(frame, T_world_camera=None),
+        "truth": replace(frame, truth=FrameTruth(ids, frame.truth.class_names)),
+        "truth names": replace(frame, truth=FrameTruth(frame.truth.instance_ids, {1: None, 2: "couch"})),
+        "no truth": replace(frame, truth=None),
+    }
+    everything = Detector.reads
+    assert len({frame_hash(other, everything) for other in (frame, *changed.values())}) == len(changed) + 1
+    for name, other in changed.items():
+        assert (frame_hash(other, ("color",)) == frame_hash(frame, ("color",))) == (name != "color")
+
+
+def test_reading_a_field_that_there_is_not_is_told(tmp_path: Path) -> None:
+    detector = Noise()
+    detector.reads = ("colour",)
+    with pytest.raises(ConfigError, match=r"Noise\.reads.*colour"):
+        CachedDetector(detector, tmp_path)
+
+
+@pytest.mark.parametrize("name", registered.names("detector"))
+def test_detectors_read_no_more_than_they_say(name: str, room: CornerRoom, tmp_path: Path) -> None:
+    """Else the cache would give one frame's detections to another."""
+    try:
+        detector = registered.built("detector", name, *detector_files.overrides(name, tmp_path))
+    except (DataError, ConfigError) as absent:
+        pytest.skip(str(absent))
+    frame = room[1]
+    others = {
+        "index": 7,
+        "timestamp": 9.0,
+        "color": np.zeros_like(frame.color),
+        "depth": np.full_like(frame.depth, 2.0),
+        "camera": replace(CAMERA, fx=50.0),
+        "T_world_camera": np.eye(4),
+        "truth": None,
+    }
+    unread = replace(frame, **{key: value for key, value in others.items() if key not in detector.reads})
+    assert_same(detector.detect(frame), detector.detect(unread))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped"])
+def test_a_damaged_entry_is_a_miss_and_is_mended(
+    room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
+) -> None:
+    expected = CachedDetector(Noise(), tmp_path).detect(room[0])
+    [entry] = tmp_path.rglob("*.detections")
+    data = bytearray(entry.read_bytes())
+    data[len(data) // 2] ^= 1
+    entry.write_bytes({"truncated": bytes(data[:-9]), "empty": b"", "flipped": bytes(data)}[damage])
+    detector = CachedDetector(Noise(), tmp_path)
+    assert_same(expected, detector.detect(room[0]))
+    assert (detector.hits, detector.misses) == (0, 1)
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert str(entry) in caplog.text
+    assert_same(expected, detector.detect(room[0]))
+    assert detector.hits == 1
+
+
+def test_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> None:
+    absent = tmp_path / "absent"
+    detector = CachedDetector(Noise(), absent, CacheMode.READ_ONLY)
+    detector.detect(room[0])
+    assert (detector.misses, absent.exists()) == (1, False)
+    CachedDetector(Noise(), tmp_path).detect(room[0])
+    before = sorted(tmp_path.rglob("*"))
+    detector = CachedDetector(Noise(), tmp_path, CacheMode.READ_ONLY)
+    for frame in room:
+        detector.detect(frame)
+    assert (detector.hits, detector.misses) == (1, 5)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_full_disk_ends_storing_and_not_the_run(
+    room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(path: Path) -> Any:
+        raise DataError(f"{path} could not be written: No space left on device")
+
+    monkeypatch.setattr(cache, "written_whole", full)
+    detector = CachedDetector(Noise(), tmp_path)
+    for frame in room:
+        detector.detect(frame)
+    assert detector.misses == 6
+    assert len(caplog.records) == 1
+    assert "No space left on device; nothing more is stored in this run" in caplog.text
+
+
+def test_a_folder_that_cannot_be_made_is_told_at_once(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match=r"detection_cache_dir: .*choose another folder"):
+        CachedDetector(Noise(), tmp_path / "file")
+
+
+def test_what_the_detector_refuses_is_not_stored(room: CornerRoom, tmp_path: Path) -> None:
+    detector = CachedDetector(Noise(broken_at=0), tmp_path)
+    for _ in range(2):
+        with pytest.raises(FrameError, match="frame 0 is broken"):
+            detector.detect(room[0])
+    assert detector.metrics() == {"detection_cache.hits": 0, "detection_cache.misses": 0}
+
+
+FILL = """
+import sys, time
+from pathlib import Path
+from framework.detection.cache import CachedDetector
+from tests.corner_room import CornerRoom, SphereDetector
+
+folder = Path(sys.argv[1])
+(folder / sys.argv[2]).touch()
+while len(list(folder.glob("ready*"))) < 2:
+    time.sleep(0.001)
+for _ in range(8):  # an entry is removed now and then, so that both write again
+    detector = CachedDetector(SphereDetector(), folder / "cache")
+    for frame in CornerRoom():
+        detector.detect(frame)
+        if frame.index % 2:
+            for entry in list(detector.entries.glob("*.detections"))[:1]:
+                entry.unlink(missing_ok=True)
+"""
+
+
+def test_two_processes_may_share_a_folder(tmp_path: Path) -> None:
+    line = [sys.executable, "-c", FILL, str(tmp_path)]
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
+    both = [
+        subprocess.Popen([*line, name], env=environment, stderr=subprocess.PIPE, text=True)
+        for name in ("ready1", "ready2")
+    ]
+    for process in both:
+        _, said = process.communicate(timeout=120)
+        assert process.returncode == 0, said
+        assert "damaged" not in said
+    detector = CachedDetector(SphereDetector(), tmp_path / "cache")
+    for frame in CornerRoom():
+        assert_same(SphereDetector().detect(frame), detector.detect(frame))
+    assert detector.hits > 0
+    assert not list(tmp_path.rglob(".*"))
+
+
+# Chosen by the config
+
+
+def config(*overrides: str) -> DictConfig:
+    stages = ("dataset", "detector", "tracker", "refiner", "fuser")
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        composed = compose("config", overrides=list(overrides))
+    for stage in stages:
+        node = (CHECKOUT / "tests" / "fake_conf" / stage / "fake.yaml").read_text()
+        composed[stage] = DictConfig({"_target_": node.split()[1]})
+    return composed
+
+
+@pytest.mark.parametrize("off", ["off", "false", '"off"'])
+def test_off_is_the_detector_itself(off: str) -> None:
+    detector = Noise()
+    assert with_cache(detector, config(f"detection_cache={off}")) is detector
+    assert with_cache(detector, config()) is detector
+    assert cache_metrics(detector) == {}
+
+
+def test_a_misspelt_mode_is_told() -> None:
+    with pytest.raises(ConfigError, match="detection_cache must be one of off, read_write, read_only, found 'on'"):
+        with_cache(Noise(), config("detection_cache=on"))
+
+
+def test_the_folder_is_the_users_by_default(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    detector = with_cache(Noise(), config("detection_cache=read_write"))
+    assert isinstance(detector, CachedDetector)
+    assert detector.directory == tmp_path / "instancemap" / "detections"
+
+
+def test_a_run_with_the_cache_is_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The whole record, but for times: without, while it fills, and from it."""
+    asked: list[int] = []
+    detect = SphereDetector.detect
+    monkeypatch.setattr(SphereDetector, "detect", lambda self, frame: asked.append(frame.index) or detect(self, frame))
+    monkeypatch.setattr("framework.reports.run_record.write_overview", lambda path, *_: path.write_bytes(b""))
+    counted, records = [], []
+    for k, mode in enumerate(("off", "read_write", "read_write", "read_only")):
+        asked.clear()
+        directory = tmp_path / str(k)
+        run(config(f"detection_cache={mode}", f"detection_cache_dir={tmp_path / 'cache'}"), directory, {})
+        metrics = json.loads((directory / "metrics.json").read_text())
+        counted.append((len(asked), metrics.get("detection_cache.hits"), metrics.get("detection_cache.misses")))
+        varying = ("fps", "stage_ms", "peak", "detection_cache")
+        figures = {key: value for key, value in metrics.items() if not key.startswith(varying)}
+        files = [(directory / name).read_bytes() for name in ("mesh.ply", "instances.json", "trajectory.txt")]
+        records.append((figures, files))
+    assert counted == [(6, None, None), (6, 0, 6), (0, 6, 0), (0, 6, 0)]
+    assert records[1:] == records[:1] * 3
+    assert records[0][0]["config_hash"]
+
+
+def test_a_seeded_detector_is_cached_frame_by_frame(room: CornerRoom, tmp_path: Path) -> None:
+    """The simulated one draws by the frame's number: the same picture at another number is another entry."""
+    detector = CachedDetector(SimulatedDetector(min_pixels=1), tmp_path)
+    frame = room[0]
+    for index in (0, 1, 0):
+        same_picture = replace(frame, index=index)
+        assert_same(SimulatedDetector(min_pixels=1).detect(same_picture), detector.detect(same_picture))
+    assert (detector.hits, detector.misses) == (1, 2)
+    assert detector.classes == COCO != CLASSES

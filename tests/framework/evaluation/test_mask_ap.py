@@ -1,0 +1,78 @@
+"""Cases whose average precision follows by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from framework.data import Detections
+from framework.detection.masks import tight_boxes
+from framework.evaluation.mask_ap import mask_ap
+
+CLASSES = ("chair", "bed")
+SHAPE = (40, 60)
+
+
+def block(u: int, v: int, width: int = 10, height: int = 10) -> np.ndarray:
+    mask = np.zeros(SHAPE, np.bool_)
+    mask[v : v + height, u : u + width] = True
+    return mask
+
+
+def detections(masks: Sequence[np.ndarray], labels: Sequence[int], scores: Sequence[float]) -> Detections:
+    stack = np.array(masks, np.bool_).reshape(-1, *SHAPE)
+    probabilities = np.full((len(masks), 2), 0.1, np.float32)
+    probabilities[np.arange(len(masks)), list(labels)] = 0.9
+    return Detections(stack, tight_boxes(stack), np.array(scores, np.float32), probabilities, CLASSES)
+
+
+def test_what_is_found_exactly_has_an_ap_of_one() -> None:
+    masks = np.array([block(0, 0), block(30, 20)])
+    result = mask_ap([(masks, ("chair", "bed"), detections(list(masks), (0, 1), (0.9, 0.4)))], CLASSES)
+    assert result.ap == pytest.approx(1)
+    assert result.ap50 == pytest.approx(1)
+    assert result.objects == 2
+
+
+def test_a_false_alarm_of_a_better_score_halves_the_precision() -> None:
+    masks = np.array([block(0, 0)])
+    found = detections([block(30, 20), block(0, 0)], (0, 0), (0.9, 0.4))
+    result = mask_ap([(masks, ("chair",), found)], CLASSES)
+    assert result.ap50 == pytest.approx(0.5)
+    assert np.isnan(result.ap50_by_class["bed"])
+
+
+def test_one_of_two_chairs_is_half_the_recall() -> None:
+    masks = np.array([block(0, 0), block(30, 20)])
+    result = mask_ap([(masks, ("chair", "chair"), detections([block(0, 0)], (0,), (0.9,)))], CLASSES)
+    assert result.ap50 == pytest.approx(51 / 101)  # recall is sampled at 0, 0.01, ..., 1
+
+
+def test_a_wrong_class_is_not_found() -> None:
+    masks = np.array([block(0, 0)])
+    result = mask_ap([(masks, ("chair",), detections([block(0, 0)], (1,), (0.9,)))], CLASSES)
+    assert result.ap50 == 0
+
+
+def test_an_overlap_of_sixty_percent_counts_at_the_lower_thresholds_only() -> None:
+    result = mask_ap([(np.array([block(0, 0)]), ("chair",), detections([block(0, 0, 6, 10)], (0,), (0.9,)))], CLASSES)
+    assert result.ap50 == pytest.approx(1)
+    assert result.ap == pytest.approx(3 / 10)  # 0.5, 0.55, 0.6
+
+
+def test_objects_too_small_to_count_and_of_other_classes_are_ignored() -> None:
+    masks = np.array([block(0, 0), block(30, 20, 3, 3), block(45, 25)])
+    found = detections([block(0, 0), block(30, 20, 3, 3)], (0, 0), (0.5, 0.9))
+    result = mask_ap([(masks, ("chair", "chair", "tv"), found)], CLASSES, min_pixels=50)
+    assert result.ap50 == pytest.approx(1)
+    assert result.objects == 1
+
+
+@pytest.mark.parametrize("names", [(), ("chair",)])
+def test_nothing_found(names: tuple[str, ...]) -> None:
+    masks = np.array([block(0, 0)] * len(names), np.bool_).reshape(-1, *SHAPE)
+    result = mask_ap([(masks, names, Detections.none(SHAPE, CLASSES))], CLASSES)
+    assert result.objects == len(names)
+    assert (result.ap50 == 0) if names else np.isnan(result.ap50)

@@ -1,0 +1,115 @@
+"""A tiny network on tiny pictures: it learns, and a run that was stopped goes on as if it had not been."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from framework.detection.mask_rcnn import Architecture, MaskRCNN
+from framework.detection.resnet import ResNetShape
+from framework.errors import ConfigError, DataError
+from framework.training.losses import Budget
+from framework.training.room_pictures import RoomPictures, room_folder
+from framework.training.trainer import CHECKPOINT, CURVE, HISTORY, Schedule, Trainer
+
+TINY = Architecture(
+    classes=("chair", "bed"),
+    backbone=ResNetShape("resnet18", 8),
+    fpn_channels=8,
+    head_features=16,
+    anchor_sides=(16, 24, 32, 48, 64),
+)
+SHORT = Schedule(steps=6, batch=2, warmup=2, checkpoint_every=3, budget=Budget(50, 30, 16))
+
+
+@pytest.fixture(scope="module")
+def pictures(tmp_path_factory: pytest.TempPathFactory) -> RoomPictures:
+    """Red chairs and blue beds on gray, 64x48 px."""
+    folder = tmp_path_factory.mktemp("rooms")
+    room = room_folder(folder, 0)
+    room.mkdir()
+    rng = np.random.default_rng(0)
+    for k in range(6):
+        color, ids = np.full((48, 64, 3), 128, np.uint8), np.zeros((48, 64), np.uint16)
+        for i, bgr in ((1, (0, 0, 255)), (2, (255, 0, 0))):
+            u, v = 32 * (i - 1) + int(rng.integers(2, 10)), int(rng.integers(2, 20))
+            color[v : v + 24, u : u + 18], ids[v : v + 24, u : u + 18] = bgr, i
+        cv2.imwrite(str(room / f"{k:06d}.jpg"), color)
+        cv2.imwrite(str(room / f"{k:06d}.png"), ids)
+    (room / "classes.json").write_text(json.dumps({"1": "chair", "2": "bed"}))
+    return RoomPictures(folder, 0, 1)
+
+
+def network() -> MaskRCNN:
+    torch.manual_seed(0)
+    return MaskRCNN(TINY)
+
+
+def test_it_learns(pictures: RoomPictures, tmp_path: Path) -> None:
+    schedule = Schedule(steps=40, batch=2, learning_rate=3e-3, warmup=5, checkpoint_every=40, budget=Budget(50, 30, 16))
+    trainer = Trainer(network(), pictures, schedule, tmp_path, "cpu")
+    trainer.run()
+    losses = [sum(terms.values()) for terms in trainer.history]
+    assert np.mean(losses[-5:]) < 0.7 * np.mean(losses[:5])
+    assert {file.name for file in tmp_path.iterdir()} == {CHECKPOINT, CURVE, HISTORY}
+    assert len((tmp_path / HISTORY).read_text().splitlines()) == 41
+    assert cv2.imread(str(tmp_path / CURVE)) is not None
+    assert not trainer.trained().training
+
+
+def test_a_stopped_run_goes_on_as_if_it_had_not_been(
+    pictures: RoomPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = Trainer(network(), pictures, SHORT, tmp_path / "whole", "cpu")
+    whole.run()
+    stopped = Trainer(network(), pictures, SHORT, tmp_path / "stopped", "cpu")
+    learn = Trainer._learn
+
+    def interrupted(self: Trainer) -> dict[str, float]:
+        if self.step == 4:
+            raise KeyboardInterrupt
+        return learn(self)
+
+    monkeypatch.setattr(Trainer, "_learn", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        stopped.run()
+    monkeypatch.setattr(Trainer, "_learn", learn)
+    resumed = Trainer(network(), pictures, SHORT, tmp_path / "stopped", "cpu")
+    assert resumed.step == 3
+    resumed.run()
+    assert resumed.history == whole.history
+    assert all(torch.equal(resumed.averaged[name], whole.averaged[name]) for name in whole.averaged)
+
+
+def test_another_seed_learns_otherwise(pictures: RoomPictures, tmp_path: Path) -> None:
+    histories = []
+    for seed in (0, 1):
+        schedule = Schedule(steps=1, batch=2, seed=seed, budget=SHORT.budget)
+        trainer = Trainer(network(), pictures, schedule, tmp_path / str(seed), "cpu")
+        trainer.run()
+        histories.append(trainer.history)
+    assert histories[0] != histories[1]
+
+
+def test_pictures_of_classes_that_the_network_does_not_have(pictures: RoomPictures, tmp_path: Path) -> None:
+    only_chairs = MaskRCNN(Architecture(**{**vars(TINY), "classes": ("chair",)}))
+    with pytest.raises(DataError, match="does not have: bed"):
+        Trainer(only_chairs, pictures, SHORT, tmp_path, "cpu").run()
+
+
+def test_rooms_that_were_not_rendered(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="room_000003 is missing"):
+        RoomPictures(tmp_path, 3, 1)
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"steps": 0}, {"batch": 0}, {"learning_rate": 0.0}, {"averaging": 1.0}, {"checkpoint_every": 0}]
+)
+def test_senseless_schedules_are_refused(wrong: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        Schedule(**wrong)  # type: ignore[arg-type]

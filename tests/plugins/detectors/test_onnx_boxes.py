@@ -1,0 +1,215 @@
+"""Box detectors from ONNX files: known networks on known rooms, and YOLOX-nano on real pictures."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.data import Camera, Frame
+from framework.detection.candidates import Layout
+from framework.detection.letterbox import Placement
+from framework.detection.masks import tight_boxes
+from framework.detection.onnx_network import Runtime
+from framework.errors import ConfigError, DataError
+from framework.label_spaces import COCO
+from plugins.detectors.onnx_boxes import OnnxBoxes
+from tests import registered
+from tests.tiny_networks import constant_network
+
+WEIGHTS = Path("weights") / "yolox_nano" / "yolox_nano.onnx"
+RUNTIMES = [Runtime.onnxruntime, Runtime.opencv]
+
+# A cup before a wall; the network's input is half the image, and the box of the cup in it is known.
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+CUP = np.zeros((120, 160), np.bool_)
+CUP[30:70, 40:60] = True
+BOX = np.array([19.0, 14.0, 31.0, 36.0])  # x1 y1 x2 y2 in the input: two pixels of the image around the cup
+SHAPE = (60, 80)
+LABELS = ("chair", "cup", "wall")  # nyu40 has the wall, which means no object
+
+
+def frame(index=0):
+    depth = np.where(CUP, np.float32(1.0), np.float32(2.0))
+    return Frame(index, 0.0, np.full((120, 160, 3), 90, np.uint8), depth, CAMERA)
+
+
+def center_size(box):
+    return np.concatenate([(box[:2] + box[2:]) / 2, box[2:] - box[:2]])
+
+
+def outputs_of(layout):
+    """One real candidate, the cup: 0.6 cup, 0.2 chair; one that is a wall; one that is too weak."""
+    boxes = np.array([BOX, BOX + 20, BOX - 10])
+    scores = np.array([[0.2, 0.6, 0.0], [0.1, 0.1, 0.9], [0.01, 0.02, 0.0]])
+    rows = np.array([center_size(box) for box in boxes])
+    if layout is Layout.yolo:
+        return {"output0": np.concatenate([rows, scores], axis=1).T[None]}
+    if layout is Layout.yolo_objectness:
+        return {"output": np.concatenate([rows, np.full((3, 1), 0.5), 2 * scores.clip(0, 0.5)], axis=1)[None]}
+    if layout is Layout.yolox:
+        table = np.zeros((1, 7 * 10 + 3 * 5 + 1 * 2, 8))
+        table[0, 14] = [*(rows[0, :2] / 8 - (4, 1)), *np.log(rows[0, 2:] / 8), 0.8, 0.25, 0.75, 0.0]  # cell (4, 1)
+        return {"output": table}
+    unit = boxes / [80, 60, 80, 60]
+    if layout is Layout.ssd_unit:
+        return {"boxes": unit[None], "scores": np.c_[[0.2, 0, 0.9], scores][None]}
+    if layout is Layout.ssd_tensorflow:
+        return {
+            "detection_boxes": unit[None][..., [1, 0, 3, 2]],
+            "detection_scores": np.array([[0.6, 0.9, 0.02]]),
+            "detection_classes": np.array([[2, 3, 2]]),
+        }
+    return {"boxes": boxes, "labels": np.array([2, 3, 2]), "scores": np.array([0.6, 0.9, 0.02])}
+
+
+EXPECTED = {  # score, and distribution over chair and cup
+    Layout.yolo: (0.6, [0.25, 0.75]),
+    Layout.yolo_objectness: (0.5, [2 / 7, 5 / 7]),
+    Layout.yolox: (0.6, [0.25, 0.75]),
+    Layout.ssd_unit: (0.6, [0.25, 0.75]),
+    Layout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # 0.2 0.6 0.2, without the wall
+    Layout.ssd_torchvision: (0.6, [0.25, 0.75]),
+}
+
+
+def tiny(folder, layout, **parameters):
+    labels = folder / "labels.txt"
+    labels.write_text("\n".join(LABELS))
+    weights = constant_network(folder / "tiny.onnx", (1, 3, *SHAPE), outputs_of(layout))
+    return OnnxBoxes(weights=weights, labels=str(labels), layout=layout, device="cpu", **parameters)
+
+
+@pytest.mark.parametrize("runtime", RUNTIMES)
+@pytest.mark.parametrize("layout", Layout)
+def test_a_known_network_finds_the_cup(tmp_path, layout, runtime):
+    detector = tiny(tmp_path, layout, runtime=runtime)
+    assert detector.classes == ("cup", "chair")  # COCO's order
+    found = detector.detect(frame())
+    score, (chair, cup) = EXPECTED[layout]
+    np.testing.assert_array_equal(found.masks, CUP[None])
+    np.testing.assert_array_equal(found.boxes, tight_boxes(CUP[None]))
+    np.testing.assert_allclose(found.scores, [score], rtol=1e-5)
+    np.testing.assert_allclose(found.class_probabilities, [[cup, chair]], rtol=1e-5)
+
+
+@pytest.mark.parametrize("placement", Placement)
+def test_where_the_image_lies_in_the_input_is_undone(tmp_path, placement):
+    """The input is taller than the image: the box is the cup's own in each placement."""
+    top, scale = {Placement.top_left: (0, 0.5), Placement.center: (20, 0.5), Placement.stretch: (0, 5 / 6)}[placement]
+    box = np.array([BOX[0], BOX[1] / 0.5 * scale + top, BOX[2], BOX[3] / 0.5 * scale + top])
+    weights = constant_network(
+        tmp_path / "n.onnx", (1, 3, 100, 80), {"y": np.r_[center_size(box), 0.5, 0.1][None, None]}
+    )
+    labels = tmp_path / "labels.txt"
+    labels.write_text("cup\nchair")
+    detector = OnnxBoxes(
+        weights=weights, labels=str(labels), layout=Layout.yolo, placement=placement, device="cpu", min_readings=1.0
+    )
+    # at this significance everything in the box is foreground: the mask is the box
+    flat = replace(frame(), depth=np.ones((120, 160), np.float32))
+    (mask,) = detector.detect(flat).masks
+    expected = np.zeros_like(mask)
+    expected[28:72, 38:62] = True
+    np.testing.assert_array_equal(mask, expected)
+
+
+def test_a_box_without_depth_is_dropped_counted_and_said_once(tmp_path, caplog):
+    detector = tiny(tmp_path, Layout.yolo)
+    blind = replace(frame(7), depth=np.zeros((120, 160), np.float32))
+    for dropped in (1, 2):
+        assert len(detector.detect(blind)) == 0
+        assert detector.boxes_without_depth == dropped
+    assert len(detector.detect(frame())) == 1
+    assert caplog.messages == ["frame 7: 1 of 1 boxes have too little depth for a mask and are dropped, 1 so far"]
+
+
+def test_two_boxes_of_one_thing_come_back_as_the_better(tmp_path):
+    boxes = np.stack([center_size(BOX), center_size(BOX) + 0.5])
+    rows = np.concatenate([boxes, [[0.2, 0.6, 0.0], [0.5, 0.4, 0.0]]], axis=1)
+    labels = tmp_path / "labels.txt"
+    labels.write_text("\n".join(LABELS))
+    weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": rows[None]})
+    parameters = {"weights": weights, "labels": str(labels), "layout": Layout.yolo, "device": "cpu"}
+    np.testing.assert_allclose(OnnxBoxes(**parameters).detect(frame()).scores, [0.6])
+    np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms=1.0).detect(frame()).scores, [0.6, 0.5])
+
+
+def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_path):
+    weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": np.zeros((1, 6, 9))})
+    with pytest.raises(DataError, match="84 columns"):
+        OnnxBoxes(weights=weights, layout=Layout.yolo, device="cpu")
+    (tmp_path / "labels.txt").write_text("chair\nflibbertigibbet")
+    with pytest.raises(ConfigError, match="flibbertigibbet"):
+        OnnxBoxes(weights=weights, labels=str(tmp_path / "labels.txt"), layout=Layout.yolo, device="cpu")
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"score_threshold": 0.0},
+        {"score_threshold": float("nan")},
+        {"nms": 0.0},
+        {"agnostic_nms": 1.5},
+        {"max_detections": 0},
+        {"significance": 1.1},
+        {"max_slant": 90.0},
+        {"min_readings": -0.1},
+        {"padding": 256},
+        {"white": 0.0},
+        {"input_size": -1},
+        {"sha256": "abc"},
+        {"device": "tpu"},
+    ],
+)
+def test_a_wrong_parameter_is_named(parameters):
+    (name,) = parameters
+    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+        OnnxBoxes(**parameters)
+
+
+# YOLOX-nano
+
+
+def shared_frame(shared, scene, index):
+    folder = shared / "data" / scene
+    color = cv2.imread(str(folder / "color" / f"{index:06d}.jpg"))
+    if color is None:
+        pytest.skip(f"{folder} has no frame {index}")
+    depth = cv2.imread(str(folder / "depth" / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED)
+    metres = np.where(depth == 65535, 0, depth / 1000).astype(np.float32)
+    return Frame(index, 0.0, color[..., ::-1].copy(), metres, Camera(640, 480, 585.0, 585.0, 319.5, 239.5))
+
+
+@pytest.fixture(scope="module")
+def nano(shared):
+    if not (shared / WEIGHTS).is_file():
+        pytest.skip(f"{shared / WEIGHTS} is absent")
+    return {runtime: OnnxBoxes(weights=shared / WEIGHTS, runtime=runtime, device="cpu") for runtime in RUNTIMES}
+
+
+@pytest.mark.parametrize(
+    ("scene", "index", "expected"),
+    [
+        ("redkitchen", 0, {"dining table": 0.75, "chair": 0.65, "cup": 0.6}),
+        ("redkitchen", 290, {"cup": 0.75, "chair": 0.65, "dining table": 0.65, "tv": 0.6}),
+        ("mit76", 3, {"couch": 0.75, "chair": 0.45}),
+    ],
+)
+def test_yolox_nano_finds_what_is_there_with_either_runtime(shared, nano, scene, index, expected):
+    picture = shared_frame(shared, scene, index)
+    a, b = (detector.detect(picture) for detector in nano.values())
+    np.testing.assert_allclose(a.scores, b.scores, atol=1e-4)
+    np.testing.assert_allclose(a.class_probabilities, b.class_probabilities, atol=1e-3)
+    assert (a.masks != b.masks).mean() < 1e-3
+    best = {}
+    for score, row in zip(a.scores, a.class_probabilities, strict=True):
+        best.setdefault(a.classes[row.argmax()], float(score))
+    assert all(best.get(name, 0) > score for name, score in expected.items()), best
+
+
+def test_the_shared_network_is_the_config_s(shared, nano):
+    detector = registered.built("detector", "onnx_boxes", "device=cpu")
+    assert detector.classes == COCO
+    assert detector.sha256 == nano[Runtime.onnxruntime]._network._network.sha256

@@ -1,0 +1,103 @@
+"""YOLO-style segmentation on networks whose boxes, scores and masks are known."""
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Frame
+from framework.detection.masks import tight_boxes
+from framework.detection.onnx_network import Runtime
+from framework.errors import ConfigError, DataError
+from plugins.detectors.onnx_segmentation import OnnxSegmentation
+from tests.test_contracts import (  # noqa: F401  the contract of every detector, on the `detector` below
+    test_detector_gives_the_same_for_the_same_frame_in_any_order,
+    test_detector_needs_no_truth_or_says_so,
+    test_detector_returns_distributions_and_masks_in_the_image,
+    test_detector_takes_a_blank_image,
+)
+from tests.tiny_networks import constant_network
+
+CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
+V, U = np.indices((120, 160))
+LABELS = ("chair", "cup", "wall")
+SIZE = 80  # of the input: the image is halved, and lies 10 px down
+CELL = 2  # px of the input
+
+
+def frame():
+    return Frame(0, 0.0, np.full((120, 160, 3), 90, np.uint8), np.ones((120, 160), np.float32), CAMERA)
+
+
+def outputs(objectness=False, transposed=False):
+    """A cup in the left and a chair in the lower half of their boxes; prototypes: column - 10.4, and row - 25.4."""
+    cells = SIZE // CELL
+    prototypes = np.stack(
+        [np.tile(np.arange(cells) - 10.4, (cells, 1)), np.tile(np.arange(cells) - 25.4, (cells, 1)).T]
+    )
+    boxes = [[20, 30, 30, 20], [60, 50, 20, 20], [40, 40, 9, 9], [60, 50, 19, 20]]  # centre and size
+    scores = [[0.1, 0.6, 0.1], [0.4, 0.05, 0.05], [0.0, 0.2, 0.9], [0.3, 0.0, 0.0]]
+    coefficients = [[-1, 0], [0, 1], [1, 1], [0, 1]]
+    certain = np.ones((4, 1 if objectness else 0))
+    rows = np.concatenate([boxes, certain, scores, coefficients], axis=1)
+    return {"output0": rows[None] if transposed else rows.T[None], "output1": prototypes[None]}
+
+
+def tiny(folder, runtime=Runtime.auto, objectness=False, transposed=False, **parameters):
+    labels = folder / "labels.txt"
+    labels.write_text("\n".join(LABELS))
+    weights = constant_network(folder / "tiny.onnx", (1, 3, SIZE, SIZE), outputs(objectness, transposed))
+    return OnnxSegmentation(
+        weights=weights, labels=str(labels), objectness=objectness, runtime=runtime, device="cpu", **parameters
+    )
+
+
+@pytest.fixture
+def detector(tmp_path):
+    return tiny(tmp_path)
+
+
+@pytest.mark.parametrize("runtime", [Runtime.onnxruntime, Runtime.opencv])
+@pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
+def test_boxes_scores_and_masks(tmp_path, runtime, objectness, transposed):
+    found = tiny(tmp_path, runtime, objectness, transposed).detect(frame())
+    # A pixel u of the image has its centre at (u + 0.5) / 2 in the input and at a half of that, less 0.5, in cells.
+    cup = ((U + 0.5) / 4 - 0.5 < 10.4) & (U >= 10) & (U < 70) & (V >= 20) & (V < 60)
+    chair = (((V + 0.5) / 2 + 10) / 2 - 0.5 > 25.4) & (U >= 100) & (U < 140) & (V >= 60) & (V < 100)
+    np.testing.assert_array_equal(found.masks, [cup, chair])
+    np.testing.assert_array_equal(found.boxes, tight_boxes(np.stack([cup, chair])))
+    np.testing.assert_allclose(found.scores, [0.6, 0.4], rtol=1e-5)
+    assert found.classes == ("cup", "chair")
+    np.testing.assert_allclose(found.class_probabilities, [[6 / 7, 1 / 7], [1 / 9, 8 / 9]], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"output1": np.zeros((1, 3, 40, 40))}, "must have 10 columns"),
+        ({"output1": np.zeros((1, 40, 40))}, r"outputs \(1, 4 \+ classes \+ M, K\) and \(1, M, h, w\), found output0"),
+        ({"more": np.zeros((1, 2))}, r"found output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
+    ],
+)
+def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_path, changed, message):
+    (tmp_path / "labels.txt").write_text("\n".join(LABELS))
+    weights = constant_network(tmp_path / "n.onnx", (1, 3, SIZE, SIZE), {**outputs(), **changed})
+    with pytest.raises(DataError, match=message):
+        OnnxSegmentation(weights=weights, labels=str(tmp_path / "labels.txt"), device="cpu")
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        {"score_threshold": 0.0},
+        {"nms": 1.1},
+        {"agnostic_nms": 0.0},
+        {"max_detections": 0},
+        {"mask_threshold": 1.0},
+        {"padding": -1},
+        {"white": float("inf")},
+        {"device": "tpu"},
+    ],
+)
+def test_a_wrong_parameter_is_named(tmp_path, parameters):
+    (name,) = parameters
+    with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
+        OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})

@@ -1,0 +1,319 @@
+"""Anybody's detections: every form of a COCO result, folders of masks, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from pycocotools import mask as coco
+
+from framework.data import Camera, Detections, Frame
+from framework.detect import write_detections, write_labels
+from framework.detection.coco_results import CategoryIds
+from framework.errors import ConfigError, DataError, FrameError
+from framework.label_spaces import COCO
+from plugins.detectors.ground_truth import GroundTruthDetector
+from plugins.detectors.precomputed import Precomputed
+from plugins.detectors.simulated import SimulatedDetector
+from tests.corner_room import CornerRoom, SphereDetector
+
+CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
+MASK = np.zeros(CAMERA.shape, np.bool_)
+MASK[1:4, 2:7] = True  # rows 1 to 3, columns 2 to 6
+RUN_LENGTHS = [13, 3, 3, 3, 3, 3, 3, 3, 3, 3, 8]  # column by column
+PACKED = coco.encode(np.asfortranarray(MASK.view(np.uint8)))["counts"].decode()
+CHAIR = COCO.index("chair")
+
+
+def frame(index: int = 0, camera: Camera = CAMERA) -> Frame:
+    shape = camera.shape
+    return Frame(index, 0.0, np.zeros((*shape, 3), np.uint8), np.ones(shape, np.float32), camera)
+
+
+def entry(**changes: Any) -> dict[str, Any]:
+    """One result; a change to None leaves the key out."""
+    segmentation = {"size": [6, 8], "counts": PACKED}
+    result = {"image_id": 0, "category_name": "chair", "segmentation": segmentation, "score": 0.6} | changes
+    return {key: value for key, value in result.items() if value is not None}
+
+
+def write(folder: Path, *entries: Any) -> Path:
+    path = folder / "results.json"
+    path.write_text(json.dumps(list(entries)))
+    return path
+
+
+def detected(folder: Path, *entries: Any, **parameters: Any) -> Detections:
+    return Precomputed(write(folder, *entries), **parameters).detect(frame())
+
+
+@pytest.mark.parametrize(
+    "segmentation",
+    [
+        {"size": [6, 8], "counts": PACKED},
+        {"size": [6, 8], "counts": RUN_LENGTHS},
+        [[2, 1, 7, 1, 7, 4, 2, 4]],  # borders of the pixels, from the image's corner
+        [[2, 1, 7, 1, 7, 3, 2, 3], [2, 3, 7, 3, 7, 4, 2, 4]],  # two parts
+    ],
+    ids=["packed", "list", "polygon", "polygons"],
+)
+def test_every_form_of_a_mask(tmp_path: Path, segmentation: Any) -> None:
+    found = detected(tmp_path, entry(segmentation=segmentation))
+    np.testing.assert_array_equal(found.masks, MASK[None])
+    np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3]])  # no bbox: the mask's
+
+
+@pytest.mark.parametrize("image_id", [12, "000012", "12", "color/000012.png", "frame/000012.color.png"[6:12]])
+def test_every_form_of_an_image_id(tmp_path: Path, image_id: Any) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id=image_id)))
+    assert [len(detector.detect(frame(k))) for k in (12, 0, 11)] == [1, 0, 0]
+
+
+def test_a_label_and_a_score_become_a_distribution(tmp_path: Path) -> None:
+    [row] = detected(tmp_path, entry(score=0.6)).class_probabilities
+    expected = np.full(80, 0.4 / 79)
+    expected[CHAIR] = 0.6
+    np.testing.assert_allclose(row, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("spread", "score", "own"), [(0.0, 0.6, 1.0), (0.5, 0.6, 0.8), (1.0, 1.0, 1.0), (1.0, 0, 1 / 80)]
+)
+def test_spread_says_how_much_the_others_get(tmp_path: Path, spread: float, score: float, own: float) -> None:
+    """Never so much that the label is no longer the best."""
+    [row] = detected(tmp_path, entry(score=score), spread=spread).class_probabilities
+    assert row[CHAIR] == pytest.approx(own)
+    np.testing.assert_allclose(np.delete(row, CHAIR), (1 - own) / 79, rtol=1e-5, atol=1e-9)
+
+
+def test_whole_distributions_are_kept_to_the_bit(tmp_path: Path) -> None:
+    row = np.random.default_rng(0).random(80).astype(np.float32)
+    row /= row.sum()
+    as_list = [float(p) for p in row]
+    as_names = {name: p for name, p in zip(COCO, as_list, strict=True) if name != "person"} | {"person": as_list[0]}
+    found = detected(tmp_path, entry(class_probabilities=as_list), entry(class_probabilities=as_names))
+    np.testing.assert_array_equal(found.class_probabilities, [row, row])
+
+
+def test_names_that_are_left_out_have_no_probability_and_rounded_rows_are_normalised(tmp_path: Path) -> None:
+    found = detected(tmp_path, entry(class_probabilities={"chair": 0.66, "couch": 0.32}))
+    expected = np.zeros(80)
+    expected[CHAIR], expected[COCO.index("couch")] = 0.66 / 0.98, 0.32 / 0.98
+    np.testing.assert_allclose(found.class_probabilities[0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("ids", "labels", "category_id", "name"),
+    [
+        (CategoryIds.COCO_91, "coco", 1, "person"),
+        (CategoryIds.COCO_91, "coco", 62, "chair"),  # as in instances_val2017.json
+        (CategoryIds.COCO_91, "coco", 90, "toothbrush"),
+        (CategoryIds.FROM_ONE, "coco", 57, "chair"),
+        (CategoryIds.FROM_ZERO, "coco", 56, "chair"),
+        (CategoryIds.FROM_ONE, "nyu40", 5, "chair"),
+    ],
+)
+def test_category_ids(tmp_path: Path, ids: CategoryIds, labels: str, category_id: int, name: str) -> None:
+    numbered = entry(category_name=None, category_id=category_id)
+    found = detected(tmp_path, numbered, category_ids=ids, labels=labels)
+    assert found.classes[int(found.class_probabilities[0].argmax())] == name
+
+
+def test_other_labels_become_cocos(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A wall is no object: dropped, and told."""
+    entries = [entry(category_name="sofa", score=0.9), entry(category_name="wall", score=0.8)]
+    with caplog.at_level(logging.INFO):
+        found = detected(tmp_path, *entries, labels="nyu40")
+    assert [found.classes[k] for k in found.class_probabilities.argmax(axis=1)] == ["couch"]
+    assert found.class_probabilities.max() == pytest.approx(0.9)
+    assert "1 of 2 detections are of no class of COCO's and are dropped: wall" in caplog.text
+
+
+def test_the_best_come_first_and_the_weak_are_dropped(tmp_path: Path) -> None:
+    entries = [entry(score=s, bbox=[k, 0, 1, 1]) for k, s in enumerate((0.2, 0.9, 0.05, 0.9))]
+    found = detected(tmp_path, *entries, score_threshold=0.1)
+    np.testing.assert_array_equal(found.scores, np.array([0.9, 0.9, 0.2], np.float32))
+    np.testing.assert_array_equal(found.boxes[:, 0], [1, 3, 0])
+    np.testing.assert_array_equal(found.boxes[:, 2] - found.boxes[:, 0], 1)
+
+
+# What framework.detect writes
+
+
+@pytest.mark.parametrize(
+    "detector",
+    [SimulatedDetector(min_pixels=1, false_positives=3.0), GroundTruthDetector(min_pixels=1), SphereDetector()],
+    ids=lambda detector: type(detector).__name__,
+)
+def test_written_detections_come_back_to_the_bit(tmp_path: Path, detector: Any) -> None:
+    path, room = tmp_path / "results.json", CornerRoom()
+    expected = [detector.detect(one) for one in room]
+    assert write_detections(path, detector, room) == sum(map(len, expected)) > 6
+    labels = "coco" if detector.classes == COCO else str(write_labels(path, detector.classes))
+    again = Precomputed(path, labels=labels)
+    assert again.classes == detector.classes
+    for one, before in zip(room, expected, strict=True):
+        after = again.detect(one)
+        for name in ("masks", "boxes", "scores", "class_probabilities"):
+            x, y = getattr(before, name), getattr(after, name)
+            assert (x.dtype, x.shape, x.tobytes()) == (y.dtype, y.shape, y.tobytes()), name
+        assert before.exact == after.exact or not len(before)
+
+
+# Folders of masks
+
+
+def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None, name: str = "000003") -> Path:
+    """Instance 7 is a chair over MASK, 300 a tv in the corner, 9 is not listed."""
+    image = np.where(MASK, 7, 0).astype(np.uint16)
+    image[0, 0], image[5, 7] = 300, 9
+    cv2.imwrite(str(folder / f"{name}.png"), image if ids is None else ids)
+    detections = [{"id": 300, "class": "tv", "score": 0.5}, {"id": 7, "class": "chair", "score": 0.75}]
+    (folder / f"{name}.json").write_text(json.dumps(detections if listed is None else listed))
+    return folder
+
+
+def test_a_folder_of_masks(tmp_path: Path) -> None:
+    found = Precomputed(write_folder(tmp_path)).detect(frame(3))
+    corner = np.zeros_like(MASK)
+    corner[0, 0] = True
+    np.testing.assert_array_equal(found.masks, [MASK, corner])
+    np.testing.assert_array_equal(found.boxes, [[2, 1, 6, 3], [0, 0, 0, 0]])
+    np.testing.assert_array_equal(found.scores, np.array([0.75, 0.5], np.float32))
+    assert [COCO[k] for k in found.class_probabilities.argmax(axis=1)] == ["chair", "tv"]
+
+
+@pytest.mark.parametrize(
+    ("listed", "said"),
+    [
+        ([{"id": 0, "class": "tv", "score": 0.5}], "id must be a whole number from 1 to 65535, found 0"),
+        ([{"id": 7, "class": "television", "score": 0.5}], "'television' is not one of the 80 labels"),
+        ([{"id": 7, "class": "tv"}], "score must be a number"),
+        ({"id": 7}, "must hold a list"),
+    ],
+)
+def test_a_folder_that_is_wrong_is_told(tmp_path: Path, listed: Any, said: str) -> None:
+    with pytest.raises(DataError, match=said) as raised:
+        Precomputed(write_folder(tmp_path, listed=listed))
+    assert "000003.json" in str(raised.value)
+
+
+def test_a_folder_with_half_of_a_frame_is_told(tmp_path: Path) -> None:
+    (write_folder(tmp_path) / "000003.json").rename(tmp_path / "000004.json")
+    with pytest.raises(DataError, match=r"000003\.json could not be read"):
+        Precomputed(tmp_path)
+    (tmp_path / "000003.png").rename(tmp_path / "000005.png")
+    (tmp_path / "000005.json").write_text("[]")
+    with pytest.raises(DataError, match=r"000004\.json has no image 000004\.png"):
+        Precomputed(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("ids", "error"), [(np.zeros((6, 9), np.uint16), DataError), (np.zeros((6, 8), np.uint8), FrameError)]
+)
+def test_an_image_of_another_form_is_told(tmp_path: Path, ids: np.ndarray, error: type[DataError]) -> None:
+    with pytest.raises(error, match=r"000003\.(png|json).*(9x6 px, but the frame 8x6 px|uint8)"):
+        Precomputed(write_folder(tmp_path, ids)).detect(frame(3))
+
+
+# What is refused
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"image_id": "left.png"}, "image_id must be the frame's number"),
+        ({"image_id": -1}, "image_id"),
+        ({"image_id": True}, "image_id"),
+        ({"category_name": "chiar"}, "'chiar' is not one of the 80 labels"),
+        ({"category_name": None, "category_id": 12}, "category_id 12 is not the id of a label"),
+        ({"category_name": None}, "category_id None"),
+        ({"score": 1.5}, "score must be a number in [0, 1], found 1.5"),
+        ({"score": None}, "score"),
+        ({"segmentation": None}, "segmentation must be run lengths"),
+        ({"segmentation": {"size": [6, 8], "counts": "\u00e9"}}, "packed string"),
+        ({"segmentation": {"size": [6, 8], "counts": PACKED[:-1]}}, "must fill 8x6 = 48 px, found 40 px"),
+        ({"segmentation": {"size": [6, 9], "counts": PACKED}}, "must fill 9x6 = 54 px, found 48 px"),
+        ({"segmentation": {"size": [6], "counts": PACKED}}, "size"),
+        ({"segmentation": {"size": [6, 8], "counts": [3, 4]}}, "must fill"),
+        ({"segmentation": [[1, 2, 3, 4]]}, "three points"),
+        ({"segmentation": []}, "no polygon"),
+        ({"bbox": [1, 2, 3]}, "bbox must be"),
+        ({"class_probabilities": [0.5, 0.5]}, "must have 80 values, one for each label, found 2"),
+        ({"class_probabilities": {"chair": 0.5}}, "must sum to 1, found 0.5"),
+        ({"class_probabilities": {"chair": 1.5, "couch": -0.5}}, "0 or more"),
+        ({"class_probabilities": {"sofa": 1.0}}, "'sofa'"),
+    ],
+)
+def test_an_entry_that_is_wrong_is_told_in_one_line(tmp_path: Path, changes: dict[str, Any], said: str) -> None:
+    with pytest.raises(DataError) as raised:
+        Precomputed(write(tmp_path, entry(), entry(**changes)))
+    assert said in str(raised.value)
+    assert f"{tmp_path}/results.json, entry 1: " in str(raised.value)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("[{]", "is not JSON"), ('{"annotations": []}', "must hold a list"), ("[]", "no detection"), ("[3]", "entry 0")],
+)
+def test_a_file_that_is_none_is_told(tmp_path: Path, content: str, said: str) -> None:
+    (tmp_path / "results.json").write_text(content)
+    with pytest.raises(DataError, match=said):
+        Precomputed(tmp_path / "results.json")
+    with pytest.raises(DataError, match=r"absent\.json could not be read"):
+        Precomputed(tmp_path / "absent.json")
+
+
+def test_masks_of_another_size_than_the_frame_are_told(tmp_path: Path) -> None:
+    detector = Precomputed(write(tmp_path, entry()))
+    with pytest.raises(DataError, match=r"entry 0: frame 0: the mask is 8x6 px, but the frame 16x12 px"):
+        detector.detect(frame(camera=CAMERA.scaled(2)))
+    detector = Precomputed(write(tmp_path, entry(segmentation=[[0, 0, 12, 0, 12, 6]])))
+    with pytest.raises(DataError, match=r"entry 0: frame 0: a polygon reaches 4 px out of the image of 8x6 px"):
+        detector.detect(frame())
+
+
+def test_a_file_of_another_sequence_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path, entry(image_id=2), entry(image_id=5))
+    strange = Precomputed(path)
+    for index in (0, 1, 3, 4):
+        assert len(strange.detect(frame(index))) == 0
+    with pytest.raises(DataError, match=r"frames 2 to 5, and for none of those asked for so far, up to 6"):
+        strange.detect(frame(6))
+    fitting = Precomputed(path)
+    assert [len(fitting.detect(frame(k))) for k in (2, 6, 900)] == [1, 0, 0]
+
+
+def test_a_file_that_may_be_of_another_sequence_is_doubted_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    detector = Precomputed(write(tmp_path, entry(image_id=5000)))
+    for index in range(100):
+        detector.detect(frame(index))
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "for none of the first 30 frames" in caplog.text
+
+
+def test_ids_of_coco_need_cocos_labels(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="FROM_ONE or FROM_ZERO"):
+        Precomputed(write(tmp_path, entry(category_name=None, category_id=1)), labels="nyu40")
+
+
+def test_parameters_are_checked(tmp_path: Path) -> None:
+    for wrong in ({"spread": 1.5}, {"score_threshold": -0.1}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            Precomputed(write(tmp_path, entry()), **wrong)
+
+
+def test_a_file_of_no_class_that_counts_is_told(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="none of the 1 detections is of a class"):
+        Precomputed(write(tmp_path, entry(category_name="wall")), labels="nyu40")
+    (tmp_path / "labels.txt").write_text("chair\nchair\n")
+    with pytest.raises(ConfigError, match="has a name twice"):
+        Precomputed(write(tmp_path, entry()), labels=str(tmp_path / "labels.txt"))

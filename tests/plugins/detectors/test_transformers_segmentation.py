@@ -1,0 +1,482 @@
+"""The transformers detector: on tiny random networks of each family, beside slow decodings and the models' own."""
+
+import builtins
+import json
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from framework.data import Camera, Frame
+from framework.errors import ConfigError, DataError
+from plugins.detectors.transformers_segmentation import (
+    FAMILIES,
+    Preprocessing,
+    TransformersSegmentation,
+    class_distributions,
+    resample_masks,
+)
+
+# a detector that any config registers keeps these; here they run on the networks below
+from tests.test_contracts import (  # noqa: F401
+    test_detector_gives_the_same_for_the_same_frame_in_any_order,
+    test_detector_needs_no_truth_or_says_so,
+    test_detector_returns_distributions_and_masks_in_the_image,
+    test_detector_takes_a_blank_image,
+)
+
+transformers = pytest.importorskip("transformers")
+
+LABELS = ("chair", "wall", "sofa", "armchair", "tv", "LABEL_5")
+CLASSES = ("chair", "couch", "tv")
+MEANING = {0: 0, 2: 1, 3: 0, 4: 2}  # label -> index in CLASSES
+STAGES = ["stage1", "stage2", "stage3", "stage4"]
+SWIN = {
+    "model_type": "swin",
+    "image_size": 32,
+    "embed_dim": 8,
+    "depths": [1] * 4,
+    "num_heads": [1, 1, 2, 2],
+    "window_size": 4,
+    "out_features": STAGES,
+}
+RESNET = {
+    "model_type": "resnet",
+    "embedding_size": 8,
+    "hidden_sizes": [8, 8, 16, 16],
+    "depths": [1] * 4,
+    "out_features": STAGES,
+}
+DINO = {
+    "model_type": "rf_detr_dinov2",
+    "hidden_size": 16,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "image_size": 64,
+    "patch_size": 16,
+    "num_windows": 2,
+    "out_features": STAGES[:2],
+}
+DETR = {
+    "encoder_layers": 1,
+    "decoder_layers": 1,
+    "encoder_attention_heads": 8,
+    "decoder_attention_heads": 8,
+    "encoder_ffn_dim": 32,
+    "decoder_ffn_dim": 32,
+    "d_model": 32,
+    "num_queries": 12,
+    "backbone_config": RESNET,
+}
+EOMT = {
+    "hidden_size": 16,
+    "num_hidden_layers": 2,
+    "num_attention_heads": 2,
+    "image_size": 64,
+    "patch_size": 16,
+    "num_blocks": 1,
+    "num_queries": 12,
+    "num_register_tokens": 1,
+}
+MODELS = {
+    "mask2former": (
+        "Mask2FormerForUniversalSegmentation",
+        {
+            "backbone_config": SWIN,
+            "feature_size": 32,
+            "mask_feature_size": 32,
+            "hidden_dim": 32,
+            "encoder_feedforward_dim": 32,
+            "dim_feedforward": 32,
+            "encoder_layers": 1,
+            "decoder_layers": 2,
+            "num_attention_heads": 2,
+            "num_queries": 12,
+        },
+    ),
+    "maskformer": (
+        "MaskFormerForInstanceSegmentation",
+        {
+            "backbone_config": SWIN,
+            "decoder_config": {"model_type": "detr", **DETR},
+            "fpn_feature_size": 32,
+            "mask_feature_size": 32,
+        },
+    ),
+    "eomt": ("EomtForUniversalSegmentation", EOMT),
+    "eomt_dinov3": ("EomtDinov3ForUniversalSegmentation", {**EOMT, "intermediate_size": 32}),
+    "detr": ("DetrForSegmentation", DETR),
+    "rf_detr": (
+        "RfDetrForInstanceSegmentation",
+        {
+            "backbone_config": DINO,
+            "d_model": 16,
+            "decoder_layers": 1,
+            "decoder_self_attention_heads": 2,
+            "decoder_cross_attention_heads": 2,
+            "decoder_ffn_dim": 32,
+            "num_queries": 12,
+            "group_detr": 1,
+            "decoder_n_points": 2,
+            "intermediate_size": 32,
+        },
+    ),
+}
+FIXED = {"height": 64, "width": 64}
+PREPROCESSING = {
+    "mask2former": {"size": {"shortest_edge": 48, "longest_edge": 80}, "size_divisor": 32},
+    "maskformer": {"size": 48, "max_size": 100, "size_divisibility": 32},
+    "eomt": {"size": {"shortest_edge": 64, "longest_edge": 64}, "do_pad": True},
+    "eomt_dinov3": {"size": {"shortest_edge": 64, "longest_edge": 64}, "do_pad": True},
+    "detr": {"size": {"shortest_edge": 64, "longest_edge": 90}},
+    "rf_detr": {"size": FIXED},
+}
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+
+
+@pytest.fixture(scope="session")
+def folders(tmp_path_factory):
+    """A random network of each family, spread so that classes and masks differ from query to query."""
+    found = {}
+    for kind, (name, parameters) in MODELS.items():
+        torch.manual_seed(3)
+        model_class = getattr(transformers, name)
+        config = model_class.config_class(**parameters, id2label=dict(enumerate(LABELS)), num_labels=len(LABELS))
+        model = model_class(config)
+        with torch.no_grad():
+            for key, weights in model.named_parameters():
+                spread = 3.0 if "quer" in key else 0.7
+                if (
+                    any(part in key for part in ("class", "quer", "mask", "bbox_attention", "decoder.layers"))
+                    and "norm" not in key
+                ):
+                    weights.copy_(torch.randn_like(weights) * spread)
+        found[kind] = tmp_path_factory.mktemp(kind)
+        model.save_pretrained(found[kind])
+        kind_of_processor = {"eomt": "EomtImageProcessor", "eomt_dinov3": "EomtImageProcessorFast"}
+        content = {**PREPROCESSING[kind], "image_processor_type": kind_of_processor.get(kind, "Other")}
+        (found[kind] / "preprocessor_config.json").write_text(json.dumps(content))
+    return found
+
+
+def built(folder, **parameters):
+    return TransformersSegmentation(**{"model": str(folder), "device": "cpu", **parameters})
+
+
+@pytest.fixture(params=MODELS)
+def detector(request, folders):
+    return built(folders[request.param], score_threshold=0.02, agnostic_nms=0.9)
+
+
+def frame(seed=0, camera=CAMERA):
+    color = np.random.default_rng(seed).integers(0, 256, (6, 8, 3), np.uint8)
+    color = np.kron(color, np.ones((camera.height // 6, camera.width // 8, 1), np.uint8))
+    return Frame(seed, 0.0, color, np.ones(camera.shape, np.float32), camera)
+
+
+def test_every_family_is_tried():
+    assert set(MODELS) == set(FAMILIES)
+
+
+def test_networks_see_something(detector):
+    found = [detector.detect(frame(seed)) for seed in range(3)]
+    assert sum(map(len, found)) >= 3, "or the other tests say nothing"
+    assert detector.classes == CLASSES
+    assert not np.array_equal(found[0].masks, found[1].masks)
+
+
+def slow_decoding(detector, kind, image, threshold):
+    """Query by query: (score, mask, class distribution), best first, before masks are compared with each other."""
+    pixels, (down, right) = detector._preprocessing(image.color, torch.device("cpu"))
+    output = detector._network(pixel_values=pixels)
+    instance = "masks_queries_logits" not in output
+    logits = output["logits" if instance else "class_queries_logits"][0].double()
+    grids = output["pred_masks" if instance else "masks_queries_logits"]
+    height, width = pixels.shape[2:]
+    whole = functional.interpolate(grids, (height, width), mode="bilinear")[..., : round(down * height), :]
+    whole = functional.interpolate(whole[..., : round(right * width)], image.camera.shape, mode="bilinear")[0]
+    rows = []
+    for row, mask in zip(logits, whole, strict=True):
+        if kind == "rf_detr":
+            labels = torch.sigmoid(row)
+            only = [labels[k] * math.prod(1 - p for j, p in enumerate(labels) if j != k) for k in range(len(LABELS))]
+            only = torch.tensor(only)
+        else:
+            labels = only = torch.softmax(row, dim=0)[:-1]
+        sums = [float(sum(only[k] for k, c in MEANING.items() if c == wanted)) for wanted in range(len(CLASSES))]
+        score = float(labels.max())
+        inside = mask > 0
+        if kind not in ("detr", "rf_detr"):
+            score *= float(torch.sigmoid(mask)[inside].mean()) if inside.any() else 0.0
+        if int(labels.argmax()) in MEANING and score > threshold and inside.any():
+            rows.append((score, inside.numpy(), np.array(sums) / sum(sums)))
+    return sorted(rows, key=lambda row: -row[0])
+
+
+@pytest.mark.parametrize("kind", ["mask2former", "maskformer", "detr", "rf_detr"])
+def test_decoding_agrees_with_a_slow_one(folders, kind):
+    if kind == "rf_detr" or kind == "detr":
+        camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    else:
+        camera = Camera(96, 96, 60.0, 60.0, 47.5, 47.5)
+    image = frame(1, camera)
+    sides = {} if kind == "rf_detr" else {"short_side": min(camera.shape), "long_side": max(camera.shape)}
+    detector = built(folders[kind], score_threshold=0.05, agnostic_nms=1.0, **sides)
+    with torch.inference_mode():
+        expected = slow_decoding(detector, kind, image, 0.05)
+    found = detector.detect(image)
+    assert len(expected) > 1
+    np.testing.assert_allclose(found.scores, [score for score, _, _ in expected], rtol=1e-4)
+    np.testing.assert_allclose(found.class_probabilities, [row for _, _, row in expected], atol=1e-5)
+    if kind != "rf_detr":  # the slow one goes by the network's size, and only there it is that of the image
+        assert np.mean(found.masks == np.array([mask for _, mask, _ in expected])) > 0.999
+
+
+def test_agrees_with_mask2formers_own_decoding(folders):
+    """Each of its (query, label) pairs that is a query's best is ours, with its mask and its score."""
+    from transformers import Mask2FormerImageProcessorPil
+
+    camera = Camera(384, 384, 300.0, 300.0, 191.5, 191.5)  # the size at which it always decodes
+    image = frame(2, camera)
+    folder = folders["mask2former"]
+    detector = built(folder, score_threshold=0.05, agnostic_nms=1.0, short_side=384, long_side=384)
+    processor = Mask2FormerImageProcessorPil(size={"height": 384, "width": 384})
+    with torch.inference_mode():
+        inputs = processor(images=image.color, return_tensors="pt")
+        output = detector._network(pixel_values=inputs["pixel_values"])
+        [own] = processor.post_process_instance_segmentation(
+            output, threshold=0.05, target_sizes=[(384, 384)], return_binary_maps=True
+        )
+    theirs = {
+        round(segment["score"], 3): (segment["label_id"], mask.numpy() > 0)
+        for segment, mask in zip(own["segments_info"], own["segmentation"], strict=True)
+    }
+    found = detector.detect(image)
+    assert len(found) > 1
+    for k, score in enumerate(found.scores):
+        near = min(theirs, key=lambda value: abs(value - float(score)))
+        label, mask = theirs[near]
+        assert near == pytest.approx(float(score), abs=2e-3)
+        assert MEANING[label] in found.class_probabilities[k].argsort()[-2:]
+        assert np.mean(mask == found.masks[k]) > 0.99
+
+
+def test_agrees_with_eomts_own_decoding(folders):
+    from transformers import EomtImageProcessorPil
+
+    image = frame(3, CAMERA)  # 48 rows on 64: padded below
+    detector = built(folders["eomt"], score_threshold=0.03, agnostic_nms=1.0)
+    processor = EomtImageProcessorPil(size={"shortest_edge": 64, "longest_edge": 64}, do_pad=True)
+    with torch.inference_mode():
+        inputs = processor(images=image.color, return_tensors="pt")
+        pixels, covered = detector._preprocessing(image.color, torch.device("cpu"))
+        np.testing.assert_allclose(pixels.numpy(), inputs["pixel_values"].numpy(), atol=1e-5)
+        assert covered == (0.75, 1.0)
+        output = detector._network(pixel_values=pixels)
+        [own] = processor.post_process_instance_segmentation(output, target_sizes=[CAMERA.shape], threshold=0.03)
+    theirs = sorted(s["score"] for s in own["segments_info"] if s["label_id"] in MEANING)
+    found = detector.detect(image)
+    assert len(theirs) > 1
+    np.testing.assert_allclose(found.scores[::-1], theirs, atol=1e-4)
+
+
+@pytest.mark.parametrize("shape", [(480, 640), (640, 480), (100, 100), (120, 500), (97, 131)])
+@pytest.mark.parametrize(
+    ("name", "numbers"),
+    [
+        ("Mask2FormerImageProcessorPil", {"size": {"shortest_edge": 80, "longest_edge": 133}, "size_divisor": 32}),
+        ("MaskFormerImageProcessorPil", {"size": {"shortest_edge": 51, "longest_edge": 200}, "size_divisor": 0}),
+        ("DetrImageProcessorPil", {"size": {"shortest_edge": 80, "longest_edge": 133}}),
+        ("DetrImageProcessorPil", {"size": {"max_height": 90, "max_width": 90}, "resample": 3}),
+        (
+            "DetrImageProcessorPil",
+            {"size": {"height": 72, "width": 60}, "image_mean": [0.5] * 3, "image_std": [0.2] * 3},
+        ),
+        ("EomtImageProcessorPil", {"size": {"shortest_edge": 64, "longest_edge": 64}, "do_pad": True}),
+    ],
+)
+def test_preprocessing_is_that_of_transformers(name, numbers, shape):
+    color = np.random.default_rng(0).integers(64, 192, (*shape, 3), np.uint8)  # bicubic never leaves 0..255
+    processor = getattr(transformers, name)(**numbers)
+    expected = processor(images=color, return_tensors="pt")["pixel_values"][0].numpy()
+    content = {"image_processor_type": name, **numbers}
+    pixels, _ = Preprocessing.parse(content, "here")(color, torch.device("cpu"))
+    assert pixels.shape[1:] == expected.shape
+    # theirs goes through 8 bits after resizing
+    np.testing.assert_allclose(pixels[0].numpy(), expected, atol=2 / 255 / 0.2)
+    assert np.abs(pixels[0].numpy() - expected).mean() < 0.6 / 255 / 0.2
+
+
+def test_softmax_head():
+    logits = np.log(np.array([[0.2, 0.1, 0.7], [0.6, 0.3, 0.1]], np.float32))
+    rows, best = class_distributions(logits, 2)
+    np.testing.assert_allclose(rows, [[2 / 3, 1 / 3], [2 / 3, 1 / 3]], rtol=1e-6)
+    np.testing.assert_allclose(best, [0.2, 0.6], rtol=1e-6)
+
+
+def test_sigmoid_head_is_the_distribution_given_exactly_one():
+    p = np.array([0.9, 0.5, 0.01])
+    one = [0.9 * 0.5 * 0.99, 0.1 * 0.5 * 0.99, 0.1 * 0.5 * 0.01]
+    rows, best = class_distributions(np.log(p / (1 - p))[None].astype(np.float32), 3)
+    np.testing.assert_allclose(rows[0], np.array(one) / sum(one), rtol=1e-5)
+    np.testing.assert_allclose(best, [0.9], rtol=1e-6)
+
+
+def test_extreme_logits_stay_finite():
+    logits = np.array([[1e4, -1e4, 0.0], [-1e4, -1e4, 1e4]], np.float32)
+    for labels in (2, 3):
+        rows, best = class_distributions(logits, labels)
+        np.testing.assert_allclose(rows.sum(axis=1), 1, rtol=1e-6)
+        assert ((best >= 0) & (best <= 1)).all()
+
+
+def test_a_head_that_does_not_fit_its_labels():
+    with pytest.raises(DataError, match="7 class logits do not fit the config's 5 labels"):
+        class_distributions(np.zeros((1, 7), np.float32), 5)
+
+
+@pytest.mark.parametrize("shape", [(24, 40), (7, 5), (6, 10)])
+def test_resampling_without_padding_is_bilinear_interpolation(shape):
+    grids = torch.randn(3, 6, 10, generator=torch.Generator().manual_seed(0))
+    expected = functional.interpolate(grids[None], shape, mode="bilinear", align_corners=False)[0]
+    np.testing.assert_allclose(resample_masks(grids, (1.0, 1.0), shape), expected, atol=1e-5)
+
+
+def test_resampling_leaves_the_padding_out():
+    grids = torch.zeros(1, 8, 8)
+    grids[:, 4:] = 1  # below the image
+    assert resample_masks(grids, (0.5, 1.0), (16, 32))[0, :14].abs().max() < 1e-6
+    assert resample_masks(grids, (1.0, 1.0), (16, 32))[0, 10:].min() == 1
+
+
+def test_duplicates_and_weak_ones_fall(folders):
+    image = frame(1)
+    everything = built(folders["mask2former"], score_threshold=0.0, agnostic_nms=1.0).detect(image)
+    fewer = built(folders["mask2former"], score_threshold=0.0, agnostic_nms=0.2).detect(image)
+    assert 0 < len(fewer) < len(everything)
+    least = float(np.median(everything.scores))
+    strong = built(folders["mask2former"], score_threshold=least, agnostic_nms=1.0).detect(image)
+    np.testing.assert_array_equal(strong.scores, everything.scores[everything.scores > np.float32(least)])
+    assert len(built(folders["mask2former"], score_threshold=0.0, max_detections=2).detect(image)) <= 2
+
+
+def test_an_output_that_is_not_finite_is_an_error(folders):
+    detector = built(folders["mask2former"])
+    broken = {"class_queries_logits": torch.full((1, 2, 7), math.nan), "masks_queries_logits": torch.zeros(1, 2, 4, 4)}
+    detector._network = lambda pixel_values: broken
+    with pytest.raises(DataError, match="not finite"):
+        detector.detect(frame())
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"score_threshold": 1.0}, "score_threshold"),
+        ({"agnostic_nms": 0.0}, "agnostic_nms"),
+        ({"max_detections": 0}, "max_detections"),
+        ({"mask_threshold": 1.0}, "mask_threshold"),
+        ({"short_side": 31}, "short_side"),
+        ({"short_side": 64}, "long_side must be at least 64 px"),
+        ({"long_side": 64}, "long_side must be 0"),
+        ({"device": "tpu"}, "device"),
+    ],
+)
+def test_parameters_are_checked(parameters, message):
+    with pytest.raises(ConfigError, match=message):
+        built("nowhere", **parameters)
+
+
+def one_line(caught):
+    return "\n" not in str(caught.value)
+
+
+def test_a_model_that_is_not_here_says_what_to_do():
+    with pytest.raises(DataError, match=r"nobody/nothing.*detector\.local_files_only=false") as caught:
+        built("nobody/nothing")
+    assert one_line(caught)
+
+
+def test_a_fixed_size_is_not_changed(folders):
+    with pytest.raises(ConfigError, match="takes one size only"):
+        built(folders["eomt"], short_side=64, long_side=64)
+
+
+def test_a_missing_package_names_the_extra(monkeypatch):
+    original = builtins.__import__
+
+    def without(name, *arguments, **options):
+        if name == "transformers":
+            raise ImportError(name)
+        return original(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+    with pytest.raises(ConfigError, match=r"pip install instancemap\[transformers\]"):
+        built("nowhere")
+
+
+@pytest.fixture
+def copy(folders, tmp_path):
+    """A copy of the mask2former folder, and a way to change its JSON files."""
+    for file in folders["mask2former"].iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+
+    def change(name, **values):
+        path = tmp_path / name
+        path.write_text(json.dumps(json.loads(path.read_text()) | values))
+
+    return SimpleNamespace(folder=tmp_path, change=change)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "message"),
+    [
+        ("config.json", {"id2label": {str(k): f"LABEL_{k}" for k in range(6)}}, "does not name its classes"),
+        ("config.json", {"id2label": {str(k): f"thing {k}" for k in range(6)}}, "'thing 0', 'thing 1'"),
+        ("config.json", {"id2label": {"0": "chair", "1": "bed"}}, "its weights could not be read"),
+        ("config.json", {"num_queries": 13}, "its weights could not be read"),
+        ("config.json", {"model_type": "never heard of"}, "never heard of"),
+        ("preprocessor_config.json", {"size": {"height": 3}}, "size must have height and width"),
+        ("preprocessor_config.json", {"size": None}, "size must have height and width"),
+        ("preprocessor_config.json", {"pad_size": FIXED}, "pad_size"),
+        ("preprocessor_config.json", {"resample": 1}, "resample"),
+        ("preprocessor_config.json", {"do_split_image": True}, "semantic"),
+    ],
+)
+def test_a_folder_that_cannot_be_used_says_why(copy, name, values, message):
+    copy.change(name, **values)
+    with pytest.raises((ConfigError, DataError), match=message) as caught:
+        built(copy.folder)
+    assert one_line(caught)
+
+
+def test_an_architecture_that_it_does_not_know(tmp_path):
+    transformers.SegformerConfig().save_pretrained(tmp_path)
+    with pytest.raises(ConfigError, match=r"one of mask2former, .*, found .*, which is segformer"):
+        built(tmp_path)
+
+
+def test_weights_that_leave_a_layer_random_are_refused(copy):
+    from safetensors.torch import load_file, save_file
+
+    path = copy.folder / "model.safetensors"
+    tensors = load_file(path)
+    del tensors["class_predictor.weight"]
+    save_file(tensors, path, {"format": "pt"})
+    with pytest.raises(DataError, match=r"no weights for 1 of .* class_predictor\.weight"):
+        built(copy.folder)
+
+
+@pytest.mark.parametrize("name", ["config.json", "preprocessor_config.json", "model.safetensors"])
+def test_missing_and_damaged_files(copy, name):
+    whole = (copy.folder / name).read_bytes()
+    (copy.folder / name).write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(DataError, match=r"detector\.model") as damaged:
+        built(copy.folder)
+    (copy.folder / name).unlink()
+    with pytest.raises(DataError, match=r"detector\.model") as missing:
+        built(copy.folder)
+    assert one_line(damaged)
+    assert one_line(missing)
