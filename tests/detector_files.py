@@ -6,10 +6,13 @@ from pathlib import Path
 
 from framework.detect import write_detections, write_labels
 from tests.corner_room import CornerRoom, SphereDetector
+from tests.tiny_mask_rcnn import tiny_network_file
 
 
 def overrides(name: str, folder: Path) -> list[str]:
     """What to set so that detector=`name` works on the corner room; files are made in `folder`."""
+    if name == "mask_rcnn":
+        return [f"detector.weights={tiny_network_file(folder)}"]
     if name != "precomputed":
         return []
     path = folder / "detections.json"

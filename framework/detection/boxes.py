@@ -15,9 +15,13 @@ LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))  # a box grows by at most this 
 """Detectron's bound (Girshick et al., github.com/facebookresearch/Detectron)."""
 
 
-def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float) -> Float32:
-    """The (A, 4) anchors of cell (0, 0) repeated over a feature map: (rows * columns * A, 4), the anchor fastest."""
-    x, y = np.meshgrid(np.arange(columns) * stride, np.arange(rows) * stride)
+def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple[float, float]) -> Float32:
+    """The (A, 4) anchors of cell (0, 0) repeated over a feature map: (rows * columns * A, 4), the anchor fastest.
+
+    `stride`: px per cell, one for both axes or y and x.
+    """
+    stride_y, stride_x = stride if isinstance(stride, tuple) else (stride, stride)
+    x, y = np.meshgrid(np.arange(columns) * stride_x, np.arange(rows) * stride_y)
     shifts = np.stack([x, y, x, y], axis=-1).reshape(-1, 1, 4)
     return np.asarray(shifts + anchors, np.float32).reshape(-1, 4)
 
@@ -42,11 +46,13 @@ def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32
     return np.clip(boxes, np.float32(0), largest)
 
 
-def to_original_image(boxes: Float32, resized: tuple[int, int], original: tuple[int, int]) -> Float32:
-    """Boxes (N, 4) of the old convention in a resized image, as borders in the image before: shapes (height, width).
+def to_original_image(
+    boxes: Float32, resized: tuple[int, int], original: tuple[int, int], extent: float = 1.0
+) -> Float32:
+    """Boxes (N, 4) in a resized image, as borders in the image before: shapes (height, width).
 
     Pixel centres are at integers, so the returned borders of a box of one pixel (u, v) are u - 0.5 and u + 0.5.
     """
     scale = np.array(original[::-1], np.float32) / np.array(resized[::-1], np.float32)
-    borders = boxes + np.array([0, 0, 1, 1], np.float32)
+    borders = boxes + np.array([0, 0, extent, extent], np.float32)
     return np.asarray(borders * np.tile(scale, 2) - np.float32(0.5), np.float32)

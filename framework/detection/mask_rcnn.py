@@ -42,6 +42,7 @@ class Architecture:
     anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, a level
     anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height over width
     rounded_anchors: bool = True  # torchvision rounds them to pixels
+    truncated_strides: bool = False  # torchvision spaces P6's by the input's size over P6's, rounded down: 61 at 800 px
     sampling_ratio: int = 2  # of RoIAlign; 0 = one sample a cell
     half_pixel: bool = False  # RoIAlign's convention: True is "aligned"
     pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
@@ -87,9 +88,12 @@ class MaskRCNN(nn.Module):
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
         """The (A, 4) anchors of each level."""
+        shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
+        height, width = (STRIDES[0] * cells for cells in shapes[0])
+        truncated = self.architecture.truncated_strides
         return [
-            anchor_grid(anchors, level.shape[2], level.shape[3], stride)
-            for anchors, level, stride in zip(self._anchors, pyramid, STRIDES, strict=True)
+            anchor_grid(anchors, rows, columns, (height // rows, width // columns) if truncated else stride)
+            for anchors, (rows, columns), stride in zip(self._anchors, shapes, STRIDES, strict=True)
         ]
 
     def propose(
@@ -124,7 +128,7 @@ class MaskRCNN(nn.Module):
         """(logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image, whose pyramid is (1, C, H, W)."""
         x = self.roi_heads.box_head(self.pool(pyramid, boxes, BOX_BINS))
         logits, deltas = self.roi_heads.box_predictor(x)
-        return logits, deltas.view(len(x), -1, 4)
+        return logits, deltas.view(*logits.shape, 4)  # also without boxes, where a -1 would be ambiguous
 
     def segment(self, pyramid: Sequence[Tensor], boxes: Tensor) -> Tensor:
         """The logits (P, 1 + C, 28, 28) of being inside the object of each class, over each box of one image."""

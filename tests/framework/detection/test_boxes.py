@@ -51,3 +51,11 @@ def test_anchor_grid_runs_over_rows_then_columns_then_anchors():
 def test_a_box_of_one_resized_pixel_covers_its_pixels_of_the_original_image():
     borders = to_original_image(np.array([[3, 5, 3, 5]], np.float32), resized=(240, 320), original=(480, 640))
     np.testing.assert_allclose(borders, [[5.5, 9.5, 7.5, 11.5]])  # columns 6 and 7, rows 10 and 11
+    same = np.array([[3, 5, 4, 6]], np.float32)  # in the newer convention
+    np.testing.assert_allclose(to_original_image(same, (240, 320), (480, 640), extent=0.0), borders)
+
+
+def test_anchors_may_be_spaced_otherwise_along_y():
+    anchors = np.array([[-8, -8, 8, 8]], np.float32)
+    grid = anchor_grid(anchors, rows=2, columns=2, stride=(61, 64))
+    np.testing.assert_array_equal(grid[3], anchors[0] + [64, 61, 64, 61])

@@ -1,0 +1,209 @@
+"""detector=mask_rcnn on a tiny network of random weights, and on one that is built to find a known object."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from framework.data import Camera, Frame
+from framework.detection import mask_rcnn as steps
+from framework.detection.masks import mask_overlaps, tight_boxes
+from framework.detection.network_file import save_network
+from framework.errors import ConfigError, DataError
+from plugins.detectors.mask_rcnn import MaskRCNNDetector
+from tests.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
+
+
+def picture(color):
+    height, width = color.shape[:2]
+    camera = Camera(width, height, 500.0, 500.0, width / 2, height / 2)
+    return Frame(0, 0.0, color, np.ones((height, width), np.float32), camera)
+
+
+def noise(seed, shape=(120, 160)):
+    return picture(np.random.default_rng(seed).integers(0, 256, (*shape, 3)).astype(np.uint8))
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory):
+    return tiny_network_file(tmp_path_factory.mktemp("network"))
+
+
+@pytest.fixture(scope="module")
+def detector(path):
+    return MaskRCNNDetector(weights=path, device="cpu")
+
+
+def test_the_score_is_the_classes_share_of_all_and_the_row_its_share_of_objects(path):
+    """Without suppression across classes, each detection is a label of a proposal with that proposal's softmax."""
+    detector, frame = MaskRCNNDetector(weights=path, device="cpu", agnostic_nms=1.0), noise(0)
+    seen = []
+    classify = detector._network.classify
+    detector._network.classify = lambda *a: seen.append(classify(*a)) or seen[-1]
+    found = detector.detect(frame)
+    everything = torch.softmax(seen[0][0].double(), dim=1).numpy()
+    assert len(found) > 5
+    assert everything[:, 0].min() > 0.01, "a background that counts"
+    for score, row in zip(found.scores, found.class_probabilities, strict=True):
+        of_objects = everything[:, 1:] / everything[:, 1:].sum(axis=1, keepdims=True)
+        nearest = np.abs(of_objects - row).max(axis=1).argmin()
+        np.testing.assert_allclose(row, of_objects[nearest], atol=1e-5)
+        assert np.abs(everything[nearest, 1:] - score).min() < 1e-5
+        assert score < row.max()
+    assert (found.scores > detector.score_threshold).all()
+
+
+def test_detections_keep_the_contract(detector):
+    frame = noise(1)
+    found = detector.detect(frame)
+    assert found.classes == detector.classes == TINY.classes
+    assert len(found) > 0
+    assert (np.diff(found.scores) <= 0).all()
+    np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1, atol=1e-5)
+    np.testing.assert_array_equal(found.boxes, tight_boxes(found.masks))
+    overlaps = mask_overlaps(found.masks)
+    areas = overlaps.diagonal()
+    iou = overlaps / (areas[:, None] + areas - overlaps)
+    np.fill_diagonal(iou, 0)
+    assert iou.max() <= detector.agnostic_nms
+
+
+def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
+    frame = noise(2)
+    before = frame.color.copy()
+    first = detector.detect(frame)
+    detector.detect(noise(3, (90, 130)))
+    second = detector.detect(frame)
+    np.testing.assert_array_equal(frame.color, before)
+    for name in ("masks", "boxes", "scores", "class_probabilities"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+
+
+@pytest.mark.parametrize("shape", [(120, 160), (33, 57), (24, 400), (1, 1), (3, 700)])
+def test_blank_images_of_any_size_are_fine(detector, shape):
+    for value in (0, 255):
+        found = detector.detect(picture(np.full((*shape, 3), value, np.uint8)))
+        assert found.masks.shape == (len(found), *shape)
+
+
+def test_numbers_of_proposals_and_detections(path, monkeypatch):
+    given = []
+    propose = steps.MaskRCNN.propose
+    monkeypatch.setattr(steps.MaskRCNN, "propose", lambda self, *a: given.append(propose(self, *a)) or (given[-1]))
+    few = MaskRCNNDetector(
+        weights=path, device="cpu", proposals=7, max_detections=3, agnostic_nms=1.0, score_threshold=0.0
+    )
+    assert len(few.detect(noise(4))) == 3
+    assert len(given[0]) == 7
+    one = MaskRCNNDetector(weights=path, device="cpu", proposals_before_nms=1)
+    one.detect(noise(4))
+    assert len(given[1]) <= 5, "one a level"
+
+
+def test_sides_are_the_networks_own_unless_given(path):
+    frame = noise(5, (120, 160))
+    assert MaskRCNNDetector(weights=path, device="cpu")._resize(frame).shape[2:] == (96, 128)
+    assert MaskRCNNDetector(weights=path, device="cpu", short_side=60)._resize(frame).shape[2:] == (60, 80)
+    assert MaskRCNNDetector(weights=path, device="cpu", short_side=240)._resize(frame).shape[2:] == (240, 320)
+    wide = noise(5, (100, 400))
+    assert MaskRCNNDetector(weights=path, device="cpu")._resize(wide).shape[2:] == (40, 160)
+    assert MaskRCNNDetector(weights=path, device="cpu", long_side=200)._resize(wide).shape[2:] == (50, 200)
+
+
+def known_object(folder, extent, resized):
+    """A detector, at a scale, whose every proposal is a "chair" over the given box x1 y1 x2 y2 of a 160 x 120 image."""
+    network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
+    for parameter in network.roi_heads.parameters():
+        parameter.data.zero_()
+    network.roi_heads.box_predictor.cls_score.bias.data[1] = 6.0
+    network.roi_heads.mask_predictor.mask_fcn_logits.bias.data[1] = 4.0
+    path = folder / f"{resized}.safetensors"
+    save_network(network, path, {})
+    detector = MaskRCNNDetector(weights=path, device="cpu")
+    box = np.array([extent], np.float32) * np.float32(resized / 120)
+    detector._network.propose = lambda *_: box
+    return detector
+
+
+@pytest.mark.parametrize("resized", [60, 96, 120, 300])
+def test_a_box_is_where_it_was_whatever_the_scale(tmp_path, resized):
+    """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image: nothing shifts."""
+    found = known_object(tmp_path, (20, 30, 60, 90), resized).detect(noise(6))
+    assert len(found) == 1
+    expected = np.zeros((120, 160), bool)
+    expected[30:90, 20:60] = True
+    np.testing.assert_array_equal(found.masks[0], expected)
+    np.testing.assert_allclose(found.scores, np.exp(6) / (np.exp(6) + 3), rtol=1e-5)
+    np.testing.assert_allclose(found.class_probabilities[0, 0], np.exp(6) / (np.exp(6) + 2), rtol=1e-5)
+
+
+@pytest.mark.parametrize("short_side", [32, 40, 80])
+def test_resizing_keeps_a_ramp_in_its_place(path, short_side):
+    """A pixel's value is 5 times its place: after resizing, the one at u' is of the place (u' + 0.5) / scale - 0.5."""
+    ramp = np.repeat(np.tile(5 * np.arange(50, dtype=np.uint8), (40, 1))[..., None], 3, axis=2)
+    image = MaskRCNNDetector(weights=path, device="cpu", short_side=short_side, long_side=400)._resize(picture(ramp))
+    places = (np.arange(image.shape[3]) + 0.5) * 40 / short_side - 0.5
+    np.testing.assert_allclose(image[0, 0, 5, 2:-2].numpy(), 5 * places[2:-2], atol=0.51)  # rounded to whole numbers
+
+
+def test_numbers_that_overflow_are_an_error_and_no_empty_answer(tmp_path):
+    network = tiny_network()
+    network.roi_heads.box_head.fc6.weight.data.fill_(3e38)
+    save_network(network, tmp_path / "wild.safetensors", {})
+    detector = MaskRCNNDetector(weights=tmp_path / "wild.safetensors", device="cpu")
+    with pytest.raises(DataError, match=r"^wild\.safetensors computed numbers that are not finite$"):
+        detector.detect(noise(7))
+
+
+def test_no_proposals_are_no_detections(detector, monkeypatch):
+    monkeypatch.setattr(steps.MaskRCNN, "propose", lambda *_: np.zeros((0, 4), np.float32))
+    assert len(detector.detect(noise(8))) == 0
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here: half precision is not compared")
+def test_half_precision_finds_the_same(path):
+    frame = noise(9)
+    half, single = (MaskRCNNDetector(weights=path, device="cuda", half=half).detect(frame) for half in (True, False))
+    assert len(half) == pytest.approx(len(single), rel=0.2)
+    np.testing.assert_allclose(half.scores[:5], single.scores[:5], atol=0.02)
+
+
+# Faults
+
+
+@pytest.mark.parametrize(
+    ("parameters", "fault"),
+    [
+        ({"score_threshold": 1.0}, r"detector\.score_threshold must be in \[0, 1\), found 1.0"),
+        ({"nms": 0.0}, r"detector\.nms must be in \(0, 1\]"),
+        ({"agnostic_nms": 1.1}, r"detector\.agnostic_nms must be in \(0, 1\]"),
+        ({"proposals_before_nms": 0}, r"detector\.proposals_before_nms must be at least 1"),
+        ({"proposals": 0}, r"detector\.proposals must be at least 1"),
+        ({"max_detections": 0}, r"detector\.max_detections must be at least 1"),
+        ({"short_side": 31}, r"detector\.short_side must be at least 32 px, or 0"),
+        ({"long_side": -1}, r"detector\.long_side must be at least 32 px, or 0"),
+        ({"short_side": 200, "long_side": 100}, r"detector\.long_side must be at least 200 px, found 100"),
+        ({"mask_threshold": 1.0}, r"detector\.mask_threshold must be in \(0, 1\)"),
+        ({"device": "tpu"}, r"detector\.device must be auto, cpu or cuda"),
+    ],
+)
+def test_parameters_are_checked(path, parameters, fault):
+    with pytest.raises(ConfigError, match=fault):
+        MaskRCNNDetector(**({"weights": path, "device": "cpu"} | parameters))
+
+
+def test_absent_weights_are_one_line(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError, match=r"^detector\.weights: there is no network .*resnet50_fpn_coco") as caught:
+        MaskRCNNDetector(weights=Path("no/such.pth"), device="cpu")
+    assert "\n" not in str(caught.value)
+    (tmp_path / "bad.safetensors").write_bytes(b"bad")
+    with pytest.raises(DataError, match=r"^detector\.weights: .*bad\.safetensors is damaged"):
+        MaskRCNNDetector(weights=Path("bad.safetensors"), device="cpu")
+
+
+def test_after_building_weights_is_the_file_that_was_read(path, monkeypatch):
+    monkeypatch.chdir(path.parent)
+    assert MaskRCNNDetector(weights=Path(path.name), device="cpu").weights == path.resolve()

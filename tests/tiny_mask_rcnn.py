@@ -1,0 +1,43 @@
+"""A Mask R-CNN of random weights that runs in milliseconds: what it finds is nonsense, how it is found is not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+
+from framework.detection.mask_rcnn import Architecture, MaskRCNN
+from framework.detection.network_file import save_network
+from framework.detection.resnet import ResNetShape
+
+TINY = Architecture(
+    classes=("chair", "couch", "dining table"),
+    backbone=ResNetShape("resnet18", width=4),
+    fpn_channels=8,
+    head_features=16,
+    anchor_sides=(8.0, 16.0, 32.0, 64.0, 128.0),
+    short_side=96,
+    long_side=160,
+)
+
+
+def tiny_network(architecture: Architecture = TINY, seed: int = 0) -> MaskRCNN:
+    """Ready to run; also the normalization's statistics are random, so that nothing in it is a neutral element."""
+    generator = torch.Generator().manual_seed(seed)
+    network = MaskRCNN(architecture).eval()
+    for name, tensor in network.state_dict().items():
+        if name.endswith("running_var") or (name.endswith("weight") and tensor.ndim == 1):
+            tensor.uniform_(0.5, 1.5, generator=generator)
+        elif tensor.ndim == 1:
+            tensor.normal_(0, 0.1, generator=generator)
+        elif tensor.ndim > 1:
+            gain = 0.3 if "predictor" in name else 1.0  # so that no class is certain
+            tensor.normal_(0, gain / tensor[0].numel() ** 0.5, generator=generator)
+    return network
+
+
+def tiny_network_file(folder: Path) -> Path:
+    """The network in a file in `folder`."""
+    path = folder / "tiny_mask_rcnn.safetensors"
+    save_network(tiny_network(), path, {"data": "none: the weights are random"})
+    return path
