@@ -17,13 +17,13 @@ import numpy as np
 import platformdirs
 import torch
 from omegaconf import DictConfig, OmegaConf
-from plugins.detectors.mask_rcnn import MaskRCNNDetector
 from tqdm import tqdm
 
 from framework.atomic_files import written_whole
+from framework.build import build
 from framework.data import Bool, Camera, Detections, Frame
 from framework.detection.mask_rcnn import Architecture, MaskRCNN
-from framework.detection.network_file import load_network, save_network
+from framework.detection.network_file import Fact, load_network, save_network
 from framework.detection.resnet import DEPTHS, ResNetShape
 from framework.evaluation.mask_ap import MaskAp, mask_ap
 from framework.interfaces import Detector
@@ -36,6 +36,7 @@ from framework.training.trainer import Schedule, Trainer
 
 log = logging.getLogger(__name__)
 
+DETECTOR = "plugins.detectors.mask_rcnn.MaskRCNNDetector"
 HELD_OUT = 1_000_000  # the number of the first room that is never learned from
 NETWORK, PRECISION = "network.safetensors", "average_precision.json"
 
@@ -53,21 +54,22 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     network = MaskRCNN(architecture(config.network))
     if config.network.start_from:
         network.load_state_dict(load_network(Path(config.network.start_from)).state_dict(), strict=False)
-    schedule = Schedule(**OmegaConf.to_container(config.schedule), seed=config.seed)  # type: ignore[arg-type]
+    schedule = Schedule(**dict(config.schedule), seed=config.seed)
     device = config.device if config.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
     pictures = RoomPictures(rooms, 0, wanted.rooms)
     trainer = Trainer(network, pictures, schedule, folder, device)
     log.info("%d pictures, step %d of %d, on %s", len(pictures), trainer.step, schedule.steps, device)
     trainer.run()
 
-    card = {
+    card: dict[str, Fact] = {
         "data": f"{len(pictures)} pictures of {wanted.rooms} rendered rooms",
         "steps": trainer.step,
         "batch": schedule.batch,
         "seed": int(config.seed),
     }
     save_network(trainer.trained(), folder / NETWORK, card, half=True)
-    detector = MaskRCNNDetector(weights=str(folder / NETWORK), device=device)
+    node = {"_target_": DETECTOR, "weights": str((folder / NETWORK).absolute()), "device": device}
+    detector = build(Detector, OmegaConf.create(node))
     precision = mask_ap(_detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, SMALLEST)
     card |= {"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap}
     save_network(trainer.trained(), folder / NETWORK, card, half=True)

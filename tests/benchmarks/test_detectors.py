@@ -16,6 +16,7 @@ import pytest
 import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from framework.data import Frame
 from framework.datasets.synthetic import Synthetic
 from framework.errors import ConfigError, DataError
 from tests import registered
@@ -36,11 +37,9 @@ class Measured:
     fault: str = ""  # why it cannot run here
 
 
-def measure(name: str) -> Measured:
-    """Builds detector=`name` and runs it on frames of the synthetic room."""
+def measure(name: str, frames: list[Frame]) -> Measured:
+    """Builds detector=`name` and runs it on frames."""
     torch.set_num_threads(THREADS)
-    room = Synthetic(frames=240, stride=240 // FRAMES)
-    frames = list(room)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     try:
         detector = registered.built("detector", name, f"threads={THREADS}")
@@ -58,6 +57,12 @@ def measure(name: str) -> Measured:
 
 
 @pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    """The synthetic room, where all can run, also those that look at the truth."""
+    return list(Synthetic(frames=240, stride=240 // FRAMES))
+
+
+@pytest.fixture(scope="module")
 def table(tables: list[Table]) -> Table:
     table = Table(
         "Detectors, synthetic room at 640x480",
@@ -69,9 +74,9 @@ def table(tables: list[Table]) -> Table:
 
 
 @pytest.mark.parametrize("name", registered.names("detector"))
-def test_detectors(benchmark: BenchmarkFixture, table: Table, name: str) -> None:
+def test_detectors(benchmark: BenchmarkFixture, table: Table, frames: list[Frame], name: str) -> None:
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as process:
-        measured: Measured = benchmark.pedantic(process.submit(measure, name).result, rounds=1)
+        measured: Measured = benchmark.pedantic(process.submit(measure, name, frames).result, rounds=1)
     if measured.fault:
         pytest.skip(measured.fault)
     median = float(np.median(measured.seconds))
