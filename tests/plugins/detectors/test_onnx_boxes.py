@@ -116,6 +116,7 @@ def test_where_the_image_lies_in_the_input_is_undone(tmp_path, placement):
 
 
 def test_a_box_without_depth_is_dropped_counted_and_said_once(tmp_path, caplog):
+    caplog.set_level("WARNING")
     detector = tiny(tmp_path, Layout.yolo)
     blind = replace(frame(7), depth=np.zeros((120, 160), np.float32))
     for dropped in (1, 2):
