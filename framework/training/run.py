@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import json
 import logging
+import math
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import platformdirs
@@ -71,10 +73,10 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     node = {"_target_": DETECTOR, "weights": str((folder / NETWORK).absolute()), "device": device}
     detector = build(Detector, OmegaConf.create(node))
     precision = mask_ap(_detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, SMALLEST)
-    card |= {"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap}
+    card |= _known({"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
     save_network(trainer.trained(), folder / NETWORK, card, half=True)
     with written_whole(folder / PRECISION) as path:
-        path.write_text(json.dumps(asdict(precision), indent=1))
+        path.write_text(json.dumps(_known(asdict(precision)), indent=1))
     log.info("mask AP50 %.3f, AP %.3f on %d other rooms", precision.ap50, precision.ap, wanted.held_out)
     return precision
 
@@ -93,6 +95,12 @@ def architecture(network: DictConfig) -> Architecture:
         short_side=HEIGHT,
         long_side=WIDTH,
     )
+
+
+def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+    """None for NaN, which JSON does not have."""
+    inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
+    return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
 
 
 def _detected(detector: Detector, pictures: RoomPictures) -> Iterator[tuple[Bool, Sequence[str], Detections]]:

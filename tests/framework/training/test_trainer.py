@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
@@ -14,8 +13,9 @@ from framework.detection.mask_rcnn import Architecture, MaskRCNN
 from framework.detection.resnet import ResNetShape
 from framework.errors import ConfigError, DataError
 from framework.training.losses import Budget
-from framework.training.room_pictures import RoomPictures, room_folder
+from framework.training.room_pictures import RoomPictures
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY, Schedule, Trainer
+from tests.tiny_rooms import write_room
 
 TINY = Architecture(
     classes=("chair", "bed"),
@@ -29,19 +29,8 @@ SHORT = Schedule(steps=6, batch=2, warmup=2, checkpoint_every=3, budget=Budget(5
 
 @pytest.fixture(scope="module")
 def pictures(tmp_path_factory: pytest.TempPathFactory) -> RoomPictures:
-    """Red chairs and blue beds on gray, 64x48 px."""
     folder = tmp_path_factory.mktemp("rooms")
-    room = room_folder(folder, 0)
-    room.mkdir()
-    rng = np.random.default_rng(0)
-    for k in range(6):
-        color, ids = np.full((48, 64, 3), 128, np.uint8), np.zeros((48, 64), np.uint16)
-        for i, bgr in ((1, (0, 0, 255)), (2, (255, 0, 0))):
-            u, v = 32 * (i - 1) + int(rng.integers(2, 10)), int(rng.integers(2, 20))
-            color[v : v + 24, u : u + 18], ids[v : v + 24, u : u + 18] = bgr, i
-        cv2.imwrite(str(room / f"{k:06d}.jpg"), color)
-        cv2.imwrite(str(room / f"{k:06d}.png"), ids)
-    (room / "classes.json").write_text(json.dumps({"1": "chair", "2": "bed"}))
+    write_room(folder, 0)
     return RoomPictures(folder, 0, 1)
 
 

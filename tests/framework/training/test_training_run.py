@@ -1,0 +1,52 @@
+"""`python -m framework.train_detector` from its config to a network that the detector loads."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from framework.command_line import CONF
+from framework.detection.network_file import describe_network
+from framework.errors import ConfigError
+from framework.training.run import HELD_OUT, NETWORK, PRECISION, architecture, train
+from framework.training.trainer import CHECKPOINT, CURVE, HISTORY
+from tests.tiny_rooms import PICTURES, write_room
+
+
+def config(folder: Path, *overrides: str) -> DictConfig:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose(
+            "train_detector",
+            overrides=[
+                "device=cpu", "network.width=8", "network.fpn_channels=8", "network.head_features=16",
+                f"pictures.folder={folder}", "pictures.rooms=1", "pictures.held_out=1", "schedule.batch=2", *overrides,
+            ],
+        )  # fmt: skip
+
+
+def test_it_leaves_a_network_that_goes_on_and_is_told_what_it_is(tmp_path: Path) -> None:
+    for number in (0, HELD_OUT):
+        write_room(tmp_path / "rooms", number)
+    first = train(config(tmp_path / "rooms", "schedule.steps=2"), tmp_path / "run")
+    assert {path.name for path in (tmp_path / "run").iterdir()} == {CHECKPOINT, CURVE, HISTORY, NETWORK, PRECISION}
+    assert 0 <= first.ap50 <= 1
+    assert first.objects == 2 * PICTURES
+    written = json.loads((tmp_path / "run" / PRECISION).read_text(), parse_constant=pytest.fail)
+    assert written["objects"] == 2 * PICTURES
+    assert written["ap50_by_class"]["toilet"] is None, "there is none"
+    train(config(tmp_path / "rooms", "schedule.steps=3"), tmp_path / "run")
+    described = describe_network(tmp_path / "run" / NETWORK)
+    assert described.card["steps"] == 3
+    assert described.architecture == architecture(config(tmp_path).network)
+    assert len(described.architecture.classes) == 9
+    other = f"network.start_from={tmp_path / 'run' / NETWORK}"
+    train(config(tmp_path / "rooms", "schedule.steps=1", other), tmp_path / "tuned")
+
+
+def test_a_backbone_that_there_is_not(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"network\.backbone"):
+        architecture(config(tmp_path, "network.backbone=vgg16").network)
