@@ -10,9 +10,9 @@ from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 
+from framework.detection.places import places
 from framework.errors import ConfigError
 
-PROJECT_ROOT = Path(__file__).resolve().parents[2]  # holds conf/
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Another version may give other last digits."""
 
@@ -75,7 +75,7 @@ def _parameters(detector: object) -> Iterator[str]:
 
 def _is_path(value: str) -> bool:
     """Whether a parameter that may be a name or a path (labels, a model) is a path, and not a word like `auto`."""
-    return value not in ("", ".") and any(_exists(place / value) for place in (Path.cwd(), PROJECT_ROOT))
+    return value not in ("", ".") and any(_exists(place) for place in places(Path(value)))
 
 
 def _exists(path: Path) -> bool:
@@ -95,10 +95,9 @@ def content_hash(path: Path) -> str:
     """SHA-256 of a file, or of the names and the bytes of all files below a folder; "" for a path that is not given."""
     if path == NOT_GIVEN:
         return ""
-    places = [path] if path.is_absolute() else [Path.cwd() / path, PROJECT_ROOT / path]
-    found = next((place for place in places if place.exists()), None)
+    found = next((place for place in places(path) if place.exists()), None)
     if found is None:
-        looked = " and ".join(str(place) for place in places)
+        looked = " and ".join(str(place) for place in places(path))
         raise ConfigError(f"there is no {looked}, by which the detector would be identified: give it a fingerprint()")
     if found.is_file():
         return file_hash(found)

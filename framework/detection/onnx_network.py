@@ -15,9 +15,9 @@ import numpy as np
 
 from framework.data import Float32
 from framework.detection.onnx_file import Signature, TensorType, read_signature
+from framework.detection.places import places
 from framework.errors import ConfigError, DataError
 
-PROJECT_ROOT = Path(__file__).resolve().parents[2]  # holds conf/
 INPUT_DTYPES = ("float32", "float16", "uint8")
 
 log = logging.getLogger(__name__)
@@ -90,11 +90,10 @@ class OnnxNetwork:
 def find_file(path: Path) -> Path:
     """The file `path`. A relative one is tried from the working folder, then from the project's."""
     path = path.expanduser()
-    places = [path] if path.is_absolute() else [Path.cwd() / path, PROJECT_ROOT / path]
-    for place in places:
+    for place in places(path):
         if place.is_file():
             return place
-    looked = " or ".join(str(place.resolve()) for place in dict.fromkeys(places))
+    looked = " or ".join(str(place.resolve()) for place in places(path))
     raise DataError(f"detector.weights: there is no file {looked}; put the network there, or name another")
 
 

@@ -14,9 +14,9 @@ import platformdirs
 from tqdm import tqdm
 
 from framework.atomic_files import written_whole
+from framework.detection.places import places
 from framework.errors import DataError
 
-PROJECT_ROOT = Path(__file__).resolve().parents[2]  # holds conf/
 OFFLINE = "INSTANCEMAP_OFFLINE"
 """An environment variable: set to anything, nothing is downloaded."""
 
@@ -69,11 +69,10 @@ def find_network(weights: Path) -> Path:
             download(published)
         check(published)
         return published.file
-    places = [weights] if weights.is_absolute() else [Path.cwd() / weights, PROJECT_ROOT / weights]
-    for place in places:
+    for place in places(weights):
         if place.is_file():
             return place.resolve()
-    looked = " and no ".join(str(place) for place in dict.fromkeys(places))
+    looked = " and no ".join(str(place) for place in places(weights))
     raise DataError(f"there is no network {looked}; give a file, or one of the published: {', '.join(PUBLISHED)}")
 
 

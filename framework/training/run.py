@@ -24,6 +24,7 @@ from tqdm import tqdm
 from framework.atomic_files import written_whole
 from framework.build import build
 from framework.data import Bool, Camera, Detections, Frame
+from framework.detection.device import torch_device
 from framework.detection.mask_rcnn import Architecture, MaskRCNN
 from framework.detection.network_file import Fact, load_network, save_network
 from framework.detection.resnet import DEPTHS, ResNetShape
@@ -57,7 +58,7 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     if config.network.start_from:
         network.load_state_dict(load_network(Path(config.network.start_from)).state_dict(), strict=False)
     schedule = Schedule(**dict(config.schedule), seed=config.seed)
-    device = config.device if config.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
+    device = str(torch_device(config.device, "device"))
     pictures = RoomPictures(rooms, 0, wanted.rooms)
     trainer = Trainer(network, pictures, schedule, folder, device)
     log.info("%d pictures, step %d of %d, on %s", len(pictures), trainer.step, schedule.steps, device)

@@ -13,6 +13,7 @@ from torch import Tensor
 from framework.data import Detections, Float32, Frame, Int32
 from framework.detection.boxes import to_original_image
 from framework.detection.checkpoint import read_network
+from framework.detection.device import torch_device
 from framework.detection.fusion import fuse_batch_norms
 from framework.detection.mask_rcnn import select
 from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
@@ -61,9 +62,7 @@ class MaskRCNNDetector(Detector):
             side = getattr(self, name)
             require(side == 0 or side >= 32, f"detector.{name}", side, "at least 32 px, or 0")
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
-        require(self.device in ("auto", "cpu", "cuda"), "detector.device", self.device, "auto, cpu or cuda")
-        cuda = torch.cuda.is_available()
-        require(self.device != "cuda" or cuda, "detector.device", self.device, "cpu or auto without a GPU")
+        self._device = torch_device(self.device)
         try:
             self.weights = find_network(self.weights)
             network = read_network(self.weights)
@@ -77,7 +76,6 @@ class MaskRCNNDetector(Detector):
         require(
             self._long_side >= self._short_side, "detector.long_side", self.long_side, f"at least {self._short_side} px"
         )
-        self._device = torch.device("cuda" if self.device != "cpu" and cuda else "cpu")
         fuse_batch_norms(network)  # before halving: variances may be too large for float16
         network = network.requires_grad_(False).to(self._device, memory_format=torch.channels_last)  # type: ignore[call-overload]
         self._network = network.half() if self.half and self._device.type == "cuda" else network

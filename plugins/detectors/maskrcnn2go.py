@@ -18,15 +18,16 @@ from torch.nn import functional
 
 from framework.data import Detections, Float32, Frame, Int32
 from framework.detection.boxes import anchor_grid, clip, decode, to_original_image
+from framework.detection.device import torch_device
 from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
 from framework.detection.nms import suppress_boxes
+from framework.detection.places import places
 from framework.detection.roi_align import roi_align
 from framework.errors import DataError
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
 from framework.parameters import require
 
-PROJECT_ROOT = Path(__file__).resolve().parents[2]  # holds conf/
 SHA256 = {
     "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
@@ -76,15 +77,8 @@ class MaskRCNN2Go(Detector):
             self.long_side >= self.short_side, "detector.long_side", self.long_side, f"at least {self.short_side} px"
         )
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
-        require(self.device in ("auto", "cpu", "cuda"), "detector.device", self.device, "auto, cpu or cuda")
-        require(
-            self.device != "cuda" or torch.cuda.is_available(),
-            "detector.device",
-            self.device,
-            "cpu or auto without a GPU",
-        )
+        self._device = torch_device(self.device)
         self.classes = COCO
-        self._device = torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
         graph, tensors = _read_network(_find_weights(self.weights))
         tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
         self._anchors: Float32 = tensors.pop("anchor").cpu().numpy()
@@ -220,11 +214,10 @@ def _as_torch(operator: Mapping[str, Any], tensors: Tensors) -> Callable[..., Te
 
 def _find_weights(folder: Path) -> Path:
     """The folder of the network. A relative path is tried from the working folder, then from the project's."""
-    places = [folder] if folder.is_absolute() else [Path.cwd() / folder, PROJECT_ROOT / folder]
-    for place in places:
+    for place in places(folder):
         if place.is_dir():
             return place
-    looked = " and ".join(str(place.resolve()) for place in dict.fromkeys(places))
+    looked = " and ".join(str(place.resolve()) for place in places(folder))
     raise DataError(f"detector.weights: there is no folder {looked}; put {' and '.join(SHA256)} there")
 
 

@@ -16,6 +16,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.data import Detections, Float32, Frame, UInt8
+from framework.detection.device import torch_device
 from framework.detection.masks import suppress_duplicates, tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
@@ -109,13 +110,7 @@ class TransformersSegmentation(Detector):
             self.long_side,
             f"at least {self.short_side} px" if self.short_side else "0 where short_side is 0",
         )
-        require(self.device in ("auto", "cpu", "cuda"), "detector.device", self.device, "auto, cpu or cuda")
-        require(
-            self.device != "cuda" or torch.cuda.is_available(),
-            "detector.device",
-            self.device,
-            "cpu or auto without a GPU",
-        )
+        self._device = torch_device(self.device)
         checkpoint = Checkpoint(self.model, self.revision, self.local_files_only)
         self._family = checkpoint.family
         self._preprocessing = checkpoint.read_preprocessing()
@@ -126,7 +121,6 @@ class TransformersSegmentation(Detector):
             self._preprocessing = self._preprocessing.at(self.short_side, self.long_side)
         self._mapping = to_coco(checkpoint.labels)
         self.classes = self._mapping.classes
-        self._device = torch.device("cuda" if self.device != "cpu" and torch.cuda.is_available() else "cpu")
         self._network = checkpoint.read_network().to(self._device)
         self._commit = checkpoint.commit
 

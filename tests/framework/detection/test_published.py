@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from framework.detection import published
+from framework.detection.places import PROJECT_ROOT
 from framework.detection.published import PUBLISHED, PublishedNetwork, find_network, networks_folder
 from framework.errors import DataError
 
@@ -130,8 +131,8 @@ def test_a_path_is_looked_for_in_the_working_then_in_the_project_folder(tmp_path
     monkeypatch.chdir(tmp_path)
     (tmp_path / "own.pth").write_bytes(b"")
     assert find_network(Path("own.pth")) == (tmp_path / "own.pth").resolve()
-    assert find_network(Path("conf/config.yaml")) == published.PROJECT_ROOT / "conf" / "config.yaml"
+    assert find_network(Path("conf/config.yaml")) == PROJECT_ROOT / "conf" / "config.yaml"
     message = fault("no/such.pth")
     assert str(tmp_path / "no/such.pth") in message
-    assert str(published.PROJECT_ROOT / "no/such.pth") in message
+    assert str(PROJECT_ROOT / "no/such.pth") in message
     assert "resnet50_fpn_coco" in message
