@@ -1,12 +1,19 @@
-"""`python -m framework.detect detector=X dataset=D out=FILE`: writes a sequence's detections as a COCO result file."""
+"""`python -m framework.detect detector=X dataset=D out=FILE`: writes a sequence's detections as a COCO result file.
+
+Where the frames come with their true instances, it also says how good the masks are.
+"""
 
 from __future__ import annotations
 
 import logging
+import math
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import hydra
+import numpy as np
 from omegaconf import DictConfig
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
@@ -15,8 +22,14 @@ from framework.command_line import CONF, EXIT_FAILED, Jobs, one_line_errors
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import Detector, RGBDSequence
 
+if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
+    from framework.data import Bool, Detections
+    from framework.detection.coco_results import ResultWriter
+
 log = logging.getLogger(__name__)
 jobs = Jobs()
+
+SMALLEST = 100  # px, of a true object that counts
 
 
 @hydra.main(version_base="1.3", config_path=str(CONF), config_name="detect")
@@ -50,26 +63,43 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     Frames that cannot be used are told and left out. Raises DataError when none can.
     """
     from framework.detection.coco_results import results_file
+    from framework.evaluation.mask_ap import mask_ap
 
-    skipped = 0
-    with (
-        results_file(path, detector.classes) as results,
-        logging_redirect_tqdm(),
-        tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar,
-    ):
+    with results_file(path, detector.classes) as results:
+        precision = mask_ap(_written(results, detector, sequence), detector.classes, SMALLEST)
+    log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)
+    if precision.objects:
+        log.info(
+            "mask AP50 %.2f, AP %.2f: the mean of %d classes, %d true objects of %d px or more",
+            precision.ap50,
+            precision.ap,
+            sum(not math.isnan(ap) for ap in precision.ap50_by_class.values()),
+            precision.objects,
+            SMALLEST,
+        )
+    return results.count
+
+
+def _written(
+    results: ResultWriter, detector: Detector, sequence: RGBDSequence
+) -> Iterator[tuple[Bool, list[str | None], Detections]]:
+    """Detects and writes, frame by frame; yields what `mask_ap` compares where the true instances are known."""
+    with logging_redirect_tqdm(), tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar:
         for k in range(len(sequence)):
             bar.update()
             try:
                 frame = sequence[k]
-                results.write(frame.index, detector.detect(frame))
+                found = detector.detect(frame)
             except FrameError as error:
-                skipped += 1
                 log.warning("frame skipped: %s", error)
-        if skipped == len(sequence):
-            raise DataError(f"{sequence.name}: none of the {skipped} frames can be used")
-    frames = len(sequence) - skipped
-    log.info("%s: %d detections in %d frames of %s", path, results.count, frames, sequence.name)
-    return results.count
+                continue
+            results.write(frame.index, found)
+            if frame.truth is not None:
+                names = frame.truth.class_names
+                ids = np.array([i for i in np.unique(frame.truth.instance_ids).tolist() if i and i in names], np.int32)
+                yield frame.truth.instance_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found
+    if results.frames == 0:
+        raise DataError(f"{sequence.name}: none of the {len(sequence)} frames can be used")
 
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:

@@ -154,6 +154,7 @@ class ResultWriter:
         self._classes = classes
         self._ids = (CategoryIds.COCO_91 if classes == COCO else CategoryIds.FROM_ONE).of(classes)
         self.count = 0  # entries written
+        self.frames = 0
 
     def write(self, frame: int, detections: Detections) -> None:
         """Adds the detections of frame number `frame`."""
@@ -174,6 +175,7 @@ class ResultWriter:
             }
             self._file.write((",\n" if self.count else "") + json.dumps(entry, separators=(",", ":"), allow_nan=False))
             self.count += 1
+        self.frames += 1
 
 
 @contextmanager

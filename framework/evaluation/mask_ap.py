@@ -32,12 +32,12 @@ class MaskAp:
 
 
 def mask_ap(
-    pictures: Iterable[tuple[Bool, Sequence[str], Detections]], classes: Sequence[str], min_pixels: int = 1
+    pictures: Iterable[tuple[Bool, Sequence[str | None], Detections]], classes: Sequence[str], min_pixels: int = 1
 ) -> MaskAp:
-    """The AP of the detections over pictures with true masks (N, H, W) and their class names (N,).
+    """The AP of the detections over pictures with true masks (N, H, W) and their class names (N,), None = not known.
 
-    A detection counts as of its most likely class. Objects of other classes than `classes`, and those smaller than
-    `min_pixels`, count neither for nor against it (COCO's `iscrowd`).
+    A detection counts as of its most likely class. Objects smaller than `min_pixels` count neither for nor against it
+    (COCO's `iscrowd`), nor do objects of unknown class, whatever they are taken for.
     """
     number = {name: k for k, name in enumerate(classes, start=1)}
     images: list[dict[str, int]] = []
@@ -46,13 +46,16 @@ def mask_ap(
     for k, (masks, names, detections) in enumerate(pictures, start=1):
         height, width = detections.masks.shape[1:]
         images.append({"id": k, "height": height, "width": width})
-        for mask, name in zip(masks, names, strict=True):
-            if name in number:
-                area = int(mask.sum())
-                truths.append(
-                    {"id": len(truths) + 1, "image_id": k, "category_id": number[name], "segmentation": encoded(mask),
-                     "area": area, "bbox": [0, 0, width, height], "iscrowd": int(area < min_pixels)}
-                )  # fmt: skip
+        objects = [(mask, number[name], mask.sum() < min_pixels) for mask, name in zip(masks, names, strict=True)
+                   if name in number]  # fmt: skip
+        unknown = masks[[name is None for name in names]].any(axis=0)
+        if unknown.any():
+            objects += [(unknown, label, True) for label in number.values()]
+        for mask, label, ignored in objects:
+            truths.append(
+                {"id": len(truths) + 1, "image_id": k, "category_id": label, "segmentation": encoded(mask),
+                 "area": int(mask.sum()), "bbox": [0, 0, width, height], "iscrowd": int(ignored)}
+            )  # fmt: skip
         best = detections.class_probabilities.argmax(axis=1) if len(detections) else np.empty(0, np.int64)
         for mask, label, score in zip(detections.masks, best.tolist(), detections.scores.tolist(), strict=True):
             name = detections.classes[label]

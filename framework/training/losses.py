@@ -46,7 +46,7 @@ def losses(
     """The five terms, each a mean over the images (N, 3, H, W) RGB 0..255; their sum is what training minimizes."""
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
-    objectness, deltas = network.score_anchors(pyramid)
+    objectness, deltas = (found.float() for found in network.score_anchors(pyramid))
     of_levels = network.anchors(pyramid)
     anchors = torch.from_numpy(np.concatenate(of_levels)).to(images.device)
     terms: dict[str, list[Tensor]] = {name: [] for name in ("objectness", "anchors", "classes", "boxes", "masks")}
@@ -57,8 +57,8 @@ def losses(
         with torch.no_grad():
             proposals = network.propose(
                 of_levels,
-                objectness[i].detach().float().cpu().numpy(),
-                deltas[i].detach().float().cpu().numpy(),
+                objectness[i].detach().cpu().numpy(),
+                deltas[i].detach().cpu().numpy(),
                 shape,
                 budget.before_nms,
                 budget.after_nms,
@@ -99,7 +99,7 @@ def _proposal_losses(
     is_object = own != BACKGROUND
     labels = torch.zeros(len(chosen), dtype=torch.int64, device=boxes.device)
     labels[is_object] = true.labels[own[is_object]]
-    logits, deltas = network.classify(pyramid, boxes)
+    logits, deltas = (found.float() for found in network.classify(pyramid, boxes))
     n = len(positive)  # the first ones
     weights = torch.tensor(DELTA_WEIGHTS, device=boxes.device)
     aims = encode(boxes[:n], true.boxes[own[:n]]) * weights
@@ -107,7 +107,7 @@ def _proposal_losses(
     missed = functional.smooth_l1_loss(moved, aims, beta=BETA, reduction="sum")
     terms = {"classes": functional.cross_entropy(logits, labels), "boxes": missed / max(len(chosen), 1)}
     if n:
-        of_labels = network.segment(pyramid, boxes[:n])
+        of_labels = network.segment(pyramid, boxes[:n]).float()
         own_logits = of_labels[torch.arange(n, device=boxes.device), labels[:n]]
         covered = mask_targets(true.masks, boxes[:n], own[:n], own_logits.shape[-1])
         terms["masks"] = functional.binary_cross_entropy_with_logits(own_logits, covered)

@@ -13,7 +13,7 @@ import json
 import multiprocessing
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -39,6 +39,7 @@ EYE_HEIGHT = (0.9, 1.75)  # m
 CLEAR = 0.35  # m, of the camera from furniture and walls
 TINT = 0.5  # how far a surface's colours may be multiplied or divided, as a logarithm
 TINTED = 0.7  # share of the pictures whose colours are drawn anew
+STUDIOS = 0.5  # share of the rooms that hold all classes: some are found nowhere else
 QUALITY = 93  # of the JPEG files
 LEAST = 100  # px of objects that make a picture worth keeping
 TRIES = 20  # views from which one worth keeping is sought
@@ -88,10 +89,11 @@ def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[
     """(color (H, W, 3), instance ids (H, W) uint16, their COCO classes) of random views of room `number`."""
     rng = np.random.default_rng([STREAM, number])
     kinds = list(RoomKind)
-    room = furnish(kinds[int(rng.integers(len(kinds)))], rng)
+    kind = RoomKind.STUDIO if rng.uniform() < STUDIOS else kinds[int(rng.integers(len(kinds)))]
+    room = furnish(kind, rng)
     names = {i: name for i, name in room.surfaces.class_names.items() if name is not None}
     renderer = Renderer(room.surfaces, list(room.lamps))
-    centers = _centers(room, list(names))
+    centers = {name: _centers(room, [i for i in names if names[i] == name]) for name in sorted(set(names.values()))}
     for _ in range(views):
         for _ in range(TRIES):
             focal = rng.uniform(*FOCAL) * WIDTH
@@ -112,14 +114,15 @@ def _centers(room: Room, ids: Sequence[int]) -> Float64:
     return np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners], np.float64)
 
 
-def _view(room: Room, centers: Float64, rng: np.random.Generator) -> Float64:
-    """T_world_camera (4, 4) from a free place, more or less towards some object."""
+def _view(room: Room, centers: Mapping[str, Float64], rng: np.random.Generator) -> Float64:
+    """T_world_camera (4, 4) from a free place, more or less towards an object of some class, all classes alike."""
     layout = room.layout
     rows, columns = np.nonzero(layout.free >= CLEAR)
     at = int(rng.integers(len(rows)))
     x, y = (columns[at] + 0.5) * CELL - layout.width / 2, (rows[at] + 0.5) * CELL - layout.depth / 2
     eye = np.array([x, y, rng.uniform(*EYE_HEIGHT)])
-    aim = centers[int(rng.integers(len(centers)))] - eye
+    of_class = list(centers.values())[int(rng.integers(len(centers)))]
+    aim = of_class[int(rng.integers(len(of_class)))] - eye
     yaw = np.arctan2(aim[1], aim[0]) + rng.normal(0, 0.3)
     pitch = np.clip(np.arctan2(aim[2], np.hypot(aim[0], aim[1])) + rng.normal(0, 0.15), -0.9, 0.3)
     return look(eye, float(yaw), float(pitch), float(rng.normal(0, 0.05)))

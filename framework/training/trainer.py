@@ -41,6 +41,7 @@ class Schedule:
     warmup: int = 200  # steps, >= 0, in which the learning rate rises; then it falls as a cosine to a hundredth
     averaging: float = 0.998  # in [0, 1): of the weights, over steps; what is saved is the average
     checkpoint_every: int = 250  # steps, >= 1
+    bfloat16: bool = False  # products in 16 bits, sums and weights in 32: faster where the processor has them
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
 
@@ -68,7 +69,7 @@ class Trainer:
         self, network: MaskRCNN, pictures: RoomPictures, schedule: Schedule, folder: Path, device: str
     ) -> None:
         self.device = torch.device(device)
-        self.network = network.to(self.device).train()
+        self.network = network.to(self.device, memory_format=torch.channels_last).train()  # type: ignore[call-overload]
         self.pictures = pictures
         self.schedule = schedule
         self.folder = folder
@@ -112,7 +113,8 @@ class Trainer:
         images = torch.from_numpy(np.stack([e.color for e in examples])).permute(0, 3, 1, 2).to(self.device)
         objects = [self._objects(example).to(self.device) for example in examples]
         generator = torch.Generator().manual_seed(int(rng.integers(2**62)))
-        terms = losses(self.network, images, objects, self.schedule.budget, generator)
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.schedule.bfloat16):
+            terms = losses(self.network, images, objects, self.schedule.budget, generator)
         loss = torch.stack(list(terms.values())).sum()
         if not torch.isfinite(loss):
             raise DataError(

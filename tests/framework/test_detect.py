@@ -32,6 +32,7 @@ def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
+    assert "mask AP50 1.00, AP 1.00: the mean of 2 classes, 10 true objects" in done.stderr
     how = done.stderr.split("read it with: ")[1].split()
     path, labels = (argument.split("=")[1] for argument in how[1:])
     detector = Precomputed(Path(path), labels=labels)

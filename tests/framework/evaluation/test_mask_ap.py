@@ -70,6 +70,15 @@ def test_objects_too_small_to_count_and_of_other_classes_are_ignored() -> None:
     assert result.objects == 1
 
 
+@pytest.mark.parametrize(("name", "ap50"), [(None, 1.0), ("tv", 0.5)])
+def test_what_is_found_on_an_object_of_unknown_class_is_ignored(name: str | None, ap50: float) -> None:
+    masks = np.array([block(0, 0), block(30, 20)])
+    found = detections([block(30, 20), block(0, 0)], (0, 0), (0.9, 0.4))
+    result = mask_ap([(masks, ("chair", name), found)], CLASSES)
+    assert result.ap50 == pytest.approx(ap50)
+    assert result.objects == 1
+
+
 @pytest.mark.parametrize("names", [(), ("chair",)])
 def test_nothing_found(names: tuple[str, ...]) -> None:
     masks = np.array([block(0, 0)] * len(names), np.bool_).reshape(-1, *SHAPE)
