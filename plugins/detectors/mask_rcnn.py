@@ -37,7 +37,7 @@ class MaskRCNNDetector(Detector):
 
     weights: Path = Path(
         "resnet50_fpn_coco"
-    )  # a published network's name or a file; relative: to the working, then project folder
+    )  # a published one's name or a file, relative to the working or project folder
     score_threshold: float = 0.1  # in [0, 1): low, for weak detections may still update instances that exist
     nms: float = 0.5  # IoU in (0, 1] above which a box falls to a better one of its class
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
@@ -51,6 +51,8 @@ class MaskRCNNDetector(Detector):
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
     half: bool = True  # half precision on CUDA; the CPU always computes in single
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
+
+    reads = ("color",)
 
     def __post_init__(self) -> None:
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
