@@ -224,6 +224,8 @@ class Instance:
     class_probabilities: Float32  # (C,) a distribution over the map's classes
     confidence: float  # in [0, 1], ranks instances in the evaluation
     observations: int  # frames in which it was detected
+    first_frame: int  # `Frame.index` of the first and of the last one
+    last_frame: int
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
     aabb: Box
     obb: Box

@@ -193,7 +193,7 @@ class GridMap(SceneMap):
             low, high = points.min(0), points.max(0)
             box = Box((low + high) / 2, high - low, np.eye(3))
             sure = np.array([0.9, 0.1] if key == 1 else [0.2, 0.8], np.float32)
-            found[key] = Instance(key, sure, float(sure.max()), len(self.vertices), vertices, box, box)
+            found[key] = Instance(key, sure, float(sure.max()), len(self.vertices), 0, 0, vertices, box, box)
         return found
 
     def save(self, path: Path) -> None:

@@ -1,60 +1,106 @@
-"""The voxel-wise Bayesian update: class and instance distributions as two independent recursions, eqs. [7] and [8].
+"""Label evidence in the voxels: how likely each instance and each class is there, and how a frame changes that.
+
+The paper's rule is the voxel-wise Bayesian update, two independent recursions, eqs. [7] and [8]:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t)
 
-runs in log space as a sum of log-likelihoods, from a uniform start. Only the ratios between labels matter, so a voxel
+In log space it is a sum of log-likelihoods, from a uniform start. Only the ratios between labels matter, so a voxel
 stores each label's sum relative to the labels that nobody named there, whose sum is 0 by that definition ("the rest").
-A voxel keeps the SLOTS most likely instances and classes and drops the least likely one when another one is named (an
-eviction, counted). What a dropped or unnamed label would have gained over the rest is lost; everything that stays is
-exact.
+Other rules (a count of detections, the latest one, the most confident one) keep other numbers in the same place, and
+differ in how new evidence for a label meets the old one: `Combine`.
+
+Compact storage keeps a voxel's SLOTS likeliest instances and classes and drops the least likely one when another one
+is named (an eviction, counted). What a dropped or unnamed label would have gained over the rest is lost; everything
+that stays is exact. Exact storage has a slot for every class, and as many for instances as no voxel ever fills: the
+oracle that the compact one is compared with.
 
 Rows of 512 voxels exist only for blocks in which something was detected: 8 bytes an instance slot, 6 a class slot, so
-56 bytes a labelled voxel.
+56 bytes a labelled voxel in compact storage.
 """
 
 from __future__ import annotations
 
+from enum import Enum, IntEnum
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Int32
+from framework.data import Bool, Float32, Float64, Int32
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more
 
-SLOTS = 4  # instances and classes that a voxel can tell apart
+Int16 = npt.NDArray[np.int16]
+
+SLOTS = 4  # instances and classes that a voxel can tell apart in compact storage
 NEW_CLASSES = 4  # a detection can bring its best so many classes into a voxel's slots
 
 
-class Evidence(NamedTuple):
-    """Log-likelihoods of labels, relative to every label not named. The best label is always in slot 0."""
+class Combine(IntEnum):
+    """How a label's new evidence meets the old one."""
 
-    instance_ids: Int32  # (R, 512, SLOTS), 0 = free slot
-    instance_log: Float32  # (R, 512, SLOTS)
-    class_ids: npt.NDArray[np.int16]  # (R, 512, SLOTS), -1 = free slot
-    class_log: Float32  # (R, 512, SLOTS)
+    SUM = 0
+    LARGEST = 1
+    LATEST = 2  # which also forgets what the other labels had
+
+
+SUM, LARGEST, LATEST = (int(combine) for combine in Combine)  # for the kernels
+
+
+class Storage(Enum):
+    """How many labels a voxel remembers."""
+
+    COMPACT = "compact"
+    EXACT = "exact"
+
+
+class Evidence(NamedTuple):
+    """How much speaks for each label, relative to every label not named. The best label is always in slot 0."""
+
+    instance_ids: Int32  # (R, 512, S), 0 = free slot
+    instance_value: Float32  # (R, 512, S)
+    class_ids: Int16  # (R, 512, T), -1 = free slot
+    class_value: Float32  # (R, 512, T)
 
 
 class Measurement(NamedTuple):
-    """What one frame's clusters say, P(O_u | I_t): N clusters, C classes."""
+    """What one frame's clusters say: N clusters, C classes."""
 
     first_point: Int32  # (H, W) the first entry of each pixel's list of cluster points, -1 = under no cluster
     next_point: Int32  # (P,) the next entry of the same pixel, -1 = last
     cluster: Int32  # (P,) whose point it is
     instance_id: Int32  # (N,) the instance that each cluster was associated with, 0 = none: it says nothing
-    instance_gain: Float32  # (N,) log P(O = that instance) / P(O = any other)
-    absence_loss: np.float32  # log-likelihood ratio, negative, for an instance matched in this frame but not seen here
+    instance_gain: Float32  # (N,) for that instance, over any other
+    absence: np.float32  # not above 0, for an instance matched in this frame but not seen here
     matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
-    class_gain: Float32  # (N, C) log P(O = c) / P(O = a class not named)
-    named_classes: npt.NDArray[np.int16]  # (N, NEW_CLASSES) each cluster's best classes
+    class_gain: Float32  # (N, C) for each class, over those that the cluster does not name
+    named_classes: Int16  # (N, NEW_CLASSES) each cluster's best classes
+    combine: int  # Combine
+
+
+def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float32, Int16]:
+    """What clusters say of classes, evidence (N, C), as a Measurement has it: (class_gain, named_classes).
+
+    Of log-likelihoods a cluster names its NEW_CLASSES best classes, and the others share the mean of what is left;
+    otherwise it names its best one, and for those that it does not name it says nothing.
+    """
+    c = evidence.shape[1]
+    names = min(c, NEW_CLASSES) if logarithmic else min(c, 1)
+    named = np.argsort(-evidence, axis=1, kind="stable")[:, :names]
+    gains = evidence
+    if logarithmic:
+        rest = np.exp(evidence)
+        np.put_along_axis(rest, named, 0, axis=1)
+        gains = evidence - np.log(np.maximum(rest.sum(axis=1, keepdims=True) / max(c - NEW_CLASSES, 1), 1e-6))
+    again = np.repeat(named[:, :1], NEW_CLASSES - names, axis=1)  # names the first one again, which changes nothing
+    return gains.astype(np.float32), np.concatenate([named, again], axis=1).astype(np.int16)
 
 
 @device
 def best_instance(evidence, row, n):
     """The most likely instance of a voxel, 0 when none is more likely than the rest."""
-    return evidence.instance_ids[row, n, 0] if evidence.instance_log[row, n, 0] > 0 else np.int32(0)
+    return evidence.instance_ids[row, n, 0] if evidence.instance_value[row, n, 0] > 0 else np.int32(0)
 
 
 @device
@@ -63,56 +109,64 @@ def best_counted_instance(evidence, row, n, counts):
     rest.
     """
     best = np.int32(0)
-    best_log = np.float32(0.0)
-    for s in range(SLOTS):
+    best_value = np.float32(0.0)
+    for s in range(evidence.instance_ids.shape[2]):
         label = evidence.instance_ids[row, n, s]
         if label > 0 and counts[label]:
-            log = evidence.instance_log[row, n, s]
-            if log > best_log or (log == best_log and label < best):
+            value = evidence.instance_value[row, n, s]
+            if value > best_value or (value == best_value and label < best):
                 best = label
-                best_log = log
+                best_value = value
     return best
 
 
 @device
 def best_class(evidence, row, n):
     """The most likely class of a voxel, -1 when none was ever named."""
-    return np.int32(evidence.class_ids[row, n, 0])
+    return np.int32(evidence.class_ids[row, n, 0]) if evidence.instance_ids[row, n, 0] > 0 else np.int32(-1)
 
 
 @device
-def add_evidence(labels, logs, free, label, gain):
-    """Adds `gain` to a label's slot, or gives it the free or least likely one. Returns 1 when that evicted another."""
+def add_evidence(labels, values, free, label, gain, combine):
+    """Combines `gain` with a label's slot, or gives it the free or least likely one. Returns 1 when that evicted
+    another.
+    """
+    if combine == LATEST:
+        for s in range(1, len(labels)):
+            labels[s] = free
+        labels[0] = label
+        values[0] = gain
+        return 0
     least = 0
-    for s in range(SLOTS):
+    for s in range(len(labels)):
         if labels[s] == label:
-            logs[s] += gain
+            values[s] = values[s] + gain if combine == SUM else max(values[s], gain)
             return 0
         if labels[s] == free:
             labels[s] = label
-            logs[s] = gain
+            values[s] = gain
             return 0
-        if logs[s] < logs[least]:
+        if values[s] < values[least]:
             least = s
-    if logs[least] >= gain:
+    if values[least] >= gain:
         return 1  # the newcomer is itself the least likely: it is the one that is dropped
     labels[least] = label
-    logs[least] = gain
+    values[least] = gain
     return 1
 
 
 @device
-def _best_first(labels, logs, free):
+def _best_first(labels, values, free):
     """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not
     matter.
     """
     best = 0
-    for s in range(1, SLOTS):
-        if labels[s] != free and (logs[s] > logs[best] or (logs[s] == logs[best] and labels[s] < labels[best])):
+    for s in range(1, len(labels)):
+        if labels[s] != free and (values[s] > values[best] or (values[s] == values[best] and labels[s] < labels[best])):
             best = s
     if best > 0:
         labels[0], labels[best] = labels[best], labels[0]
-        logs[0], logs[best] = logs[best], logs[0]
+        values[0], values[best] = values[best], values[0]
 
 
 @device
@@ -124,12 +178,13 @@ def update_voxel(evidence, row, n, measurement, point):
     ids = evidence.instance_ids[row, n]
     if point < 0 and ids[0] == 0:
         return 0  # nothing is known of the voxel, and nothing is said about it
-    id_logs = evidence.instance_log[row, n]
+    id_values = evidence.instance_value[row, n]
     classes = evidence.class_ids[row, n]
-    class_logs = evidence.class_log[row, n]
+    class_values = evidence.class_value[row, n]
+    combine = measurement.combine
     evicted = 0
     # evidence of absence: an instance that was found in this frame, but not here
-    for s in range(SLOTS):
+    for s in range(len(ids) if measurement.absence < 0 else 0):
         if ids[s] > 0 and measurement.matched[ids[s]]:
             covered = False
             p = point
@@ -137,26 +192,28 @@ def update_voxel(evidence, row, n, measurement, point):
                 covered = covered or measurement.instance_id[measurement.cluster[p]] == ids[s]
                 p = measurement.next_point[p]
             if not covered:
-                id_logs[s] += measurement.absence_loss
+                id_values[s] += measurement.absence
     p = point
     while p >= 0:
         k = measurement.cluster[p]
         p = measurement.next_point[p]
         if measurement.instance_id[k] == 0:
             continue
-        evicted += add_evidence(ids, id_logs, 0, measurement.instance_id[k], measurement.instance_gain[k])
-        for s in range(SLOTS):
+        evicted += add_evidence(ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine)
+        for s in range(len(classes) if combine == SUM else 0):
             if classes[s] >= 0:
-                class_logs[s] += measurement.class_gain[k, classes[s]]
+                class_values[s] += measurement.class_gain[k, classes[s]]
         for m in range(NEW_CLASSES):
             label = measurement.named_classes[k, m]
+            if m > 0 and label == measurement.named_classes[k, 0]:
+                break
             known = False
-            for s in range(SLOTS):
+            for s in range(len(classes) if combine == SUM else 0):
                 known = known or classes[s] == label
             if not known:
-                evicted += add_evidence(classes, class_logs, -1, label, measurement.class_gain[k, label])
-    _best_first(ids, id_logs, 0)
-    _best_first(classes, class_logs, -1)
+                evicted += add_evidence(classes, class_values, -1, label, measurement.class_gain[k, label], combine)
+    _best_first(ids, id_values, 0)
+    _best_first(classes, class_values, -1)
     return evicted
 
 
@@ -195,42 +252,60 @@ def _update(grid, seen, evidence, measurement, first_point, evicted):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _merge(evidence, rows, kept, dropped):
+def _count_free(evidence, rows, least):
+    """The free instance slots of the fullest voxel of each of the first rows, in least (rows,)."""
+    for row in prange(rows):
+        slots = evidence.instance_ids.shape[2]
+        fewest = slots
+        for n in range(BLOCK_VOXELS):
+            free = 0
+            while free < fewest and evidence.instance_ids[row, n, slots - 1 - free] == 0:
+                free += 1
+            fewest = min(fewest, free)
+        least[row] = fewest
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _merge(evidence, rows, kept, dropped, combine):
     for row in prange(rows):
         for n in range(BLOCK_VOXELS):
             ids = evidence.instance_ids[row, n]
-            logs = evidence.instance_log[row, n]
-            for s in range(SLOTS):
+            values = evidence.instance_value[row, n]
+            for s in range(len(ids)):
                 if ids[s] == dropped:
-                    gain = logs[s]
-                    last = SLOTS - 1  # slots stay filled from the front
+                    gain = values[s]
+                    last = len(ids) - 1  # slots stay filled from the front
                     while ids[last] == 0:
                         last -= 1
-                    ids[s], logs[s] = ids[last], logs[last]
-                    ids[last], logs[last] = 0, 0
-                    add_evidence(ids, logs, 0, kept, gain)
-                    _best_first(ids, logs, 0)
+                    ids[s], values[s] = ids[last], values[last]
+                    ids[last], values[last] = 0, 0
+                    add_evidence(ids, values, 0, kept, gain, combine)
+                    _best_first(ids, values, 0)
                     break
 
 
 class EvidenceRows:
     """Owns the label evidence of a grid's blocks and makes it grow. The kernels work on `self.evidence`."""
 
-    def __init__(self, voxels: VoxelGrid) -> None:
+    def __init__(self, voxels: VoxelGrid, combine: Combine = Combine.SUM, storage: Storage = Storage.COMPACT) -> None:
         self.voxels = voxels
+        self.combine = combine
+        self.storage = storage
         self.row_count = 0
         self.evicted = 0  # slots given to another label so far
-        self.evidence = Evidence(
-            instance_ids=np.empty((64, BLOCK_VOXELS, SLOTS), np.int32),
-            instance_log=np.empty((64, BLOCK_VOXELS, SLOTS), np.float32),
-            class_ids=np.empty((64, BLOCK_VOXELS, SLOTS), np.int16),
-            class_log=np.empty((64, BLOCK_VOXELS, SLOTS), np.float32),
-        )
+        self._class_slots = SLOTS
+        self.evidence = self._free_rows(64)
 
     @property
     def byte_count(self) -> int:
         """Of the rows in use."""
         return sum(array[: self.row_count].nbytes for array in self.evidence)
+
+    def begin(self, classes: int) -> None:
+        """Says how many classes there are, before the first update."""
+        if self.storage is Storage.EXACT:
+            self._class_slots = max(classes, 1)
+            self.evidence = self._free_rows(64)
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
         """Updates the voxels near the measured surface of the blocks that a frame has seen."""
@@ -241,15 +316,46 @@ class EvidenceRows:
         evicted = np.empty(len(seen.blocks), np.int32)
         _find_blocks_under_clusters(self.voxels.grid, seen, measurement, first_point, wants_row)
         self._add_rows(seen.blocks[wants_row])
+        if self.storage is Storage.EXACT:
+            self._make_room_for_instances(len(measurement.instance_id))
         _update(self.voxels.grid, seen, self.evidence, measurement, first_point, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
-        """Adds the evidence for instance `dropped` to that for `kept` in every voxel.
+        """Combines the evidence for instance `dropped` with that for `kept` in every voxel.
 
         Rare, and it visits the whole map.
         """
-        _merge(self.evidence, self.row_count, np.int32(kept), np.int32(dropped))
+        _merge(self.evidence, self.row_count, np.int32(kept), np.int32(dropped), int(self.combine))
+
+    def _free_rows(self, rows: int) -> Evidence:
+        return Evidence(
+            instance_ids=np.empty((rows, BLOCK_VOXELS, SLOTS), np.int32),
+            instance_value=np.empty((rows, BLOCK_VOXELS, SLOTS), np.float32),
+            class_ids=np.empty((rows, BLOCK_VOXELS, self._class_slots), np.int16),
+            class_value=np.empty((rows, BLOCK_VOXELS, self._class_slots), np.float32),
+        )
+
+    def _first_classes(self) -> Int16:
+        """What a new voxel's class slots hold: nothing, or in exact storage every class."""
+        named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, -1)
+        return named.astype(np.int16)
+
+    def _make_room_for_instances(self, new: int) -> None:
+        """Doubles the slots until every voxel has `new` free ones."""
+        least = np.empty(self.row_count, np.int64)
+        _count_free(self.evidence, self.row_count, least)
+        slots = self.evidence.instance_ids.shape[2]
+        missing = new - int(least.min(initial=slots))
+        while missing > 0:
+            missing -= slots
+            slots *= 2
+        added = ((0, 0), (0, 0), (0, slots - self.evidence.instance_ids.shape[2]))
+        if added[2][1]:
+            self.evidence = self.evidence._replace(
+                instance_ids=np.pad(self.evidence.instance_ids, added),
+                instance_value=np.pad(self.evidence.instance_value, added),
+            )
 
     def _add_rows(self, blocks: Int32) -> None:
         """Gives each of these blocks a row, in the order given."""
@@ -258,14 +364,14 @@ class EvidenceRows:
             capacity = max(needed, 2 * len(self.evidence.instance_ids))
             self.evidence = Evidence(
                 instance_ids=grown(self.evidence.instance_ids, capacity),
-                instance_log=grown(self.evidence.instance_log, capacity),
+                instance_value=grown(self.evidence.instance_value, capacity),
                 class_ids=grown(self.evidence.class_ids, capacity),
-                class_log=grown(self.evidence.class_log, capacity),
+                class_value=grown(self.evidence.class_value, capacity),
             )
         new = slice(self.row_count, needed)
         self.evidence.instance_ids[new] = 0
-        self.evidence.instance_log[new] = 0
-        self.evidence.class_ids[new] = -1
-        self.evidence.class_log[new] = 0
+        self.evidence.instance_value[new] = 0
+        self.evidence.class_ids[new] = self._first_classes()
+        self.evidence.class_value[new] = 0
         self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
         self.row_count = needed

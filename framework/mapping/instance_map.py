@@ -20,14 +20,14 @@ from framework.atomic_files import written_whole
 from framework.data import Bool, Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
-from framework.mapping.evidence import Evidence, EvidenceRows
+from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.meshing import SurfaceNets, look_up
 from framework.mapping.raycasting import render, render_near
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
-FORMAT = 2  # of the saved file; a change of meaning counts it up
+FORMAT = 3  # of the saved file; a change of meaning counts it up
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)
 ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
@@ -49,6 +49,9 @@ class InstanceMap(SceneMap):
         min_observations: int,
         min_confidence: float,
         min_vertices: int,
+        combine: Combine = Combine.SUM,
+        logarithmic: bool = True,
+        storage: Storage = Storage.COMPACT,
     ) -> None:
         self.classes: tuple[str, ...] = ()
         self.sensor = sensor
@@ -56,8 +59,8 @@ class InstanceMap(SceneMap):
         self.min_confidence = min_confidence
         self.min_vertices = min_vertices
         self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
-        self.labels = EvidenceRows(self.voxels)
-        self.table = InstanceTable()
+        self.labels = EvidenceRows(self.voxels, combine, storage)
+        self.table = InstanceTable(combine, logarithmic)
 
     @property
     def voxel_size(self) -> float:
@@ -76,6 +79,11 @@ class InstanceMap(SceneMap):
     def instance_count(self) -> int:
         """Without the condition on vertices, which takes a mesh."""
         return int(self._counts().sum())
+
+    def begin(self, classes: tuple[str, ...]) -> None:
+        """Takes the first frame's label space for the map's."""
+        self.classes = classes
+        self.labels.begin(len(classes))
 
     def changed(self, blocks: Int32 | None = None) -> None:
         """To be called after the map was written: what was derived from it is out of date.
@@ -133,10 +141,24 @@ class InstanceMap(SceneMap):
         ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
         ends = [*starts[1:], len(order)]
         return {
-            int(k): _instance(self.table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
+            int(k): self._instance(self.table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
             for k, start, end in zip(ids, starts, ends, strict=False)
             if k > 0
         }
+
+    def _instance(self, record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
+        low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+        return Instance(
+            id=record.id,
+            class_probabilities=self.table.class_probabilities(record),
+            confidence=record.confidence,
+            observations=record.observations,
+            first_frame=record.first_frame,
+            last_frame=record.last_frame,
+            vertices=vertices,
+            aabb=Box((low + high) / 2, high - low, np.eye(3)),
+            obb=_oriented_box(points),
+        )
 
     def save(self, path: Path) -> None:
         grid, evidence = self.voxels.grid, self.labels.evidence
@@ -149,11 +171,18 @@ class InstanceMap(SceneMap):
             "min_observations": self.min_observations,
             "min_confidence": self.min_confidence,
             "min_vertices": self.min_vertices,
+            "combine": self.labels.combine.name,
+            "logarithmic": self.table.logarithmic,
+            "storage": self.labels.storage.name,
             "classes": self.classes,
             "last_id": self.table.last_id,
             "evicted": self.labels.evicted,
             "instances": [
-                {**asdict(record), "class_log": record.class_log.tolist(), "observed_in": sorted(record.observed_in)}
+                {
+                    **asdict(record),
+                    "class_evidence": record.class_evidence.tolist(),
+                    "observed_in": sorted(record.observed_in),
+                }
                 for record in self.table.records.values()
             ],
         }
@@ -175,8 +204,11 @@ class InstanceMap(SceneMap):
             header["min_observations"],
             header["min_confidence"],
             header["min_vertices"],
+            Combine[header["combine"]],
+            header["logarithmic"],
+            Storage[header["storage"]],
         )
-        scene.classes = tuple(header["classes"])
+        scene.begin(tuple(header["classes"]))
         scene.voxels.allocate(arrays["block_coords"])
         b = scene.voxels.block_count
         for name in BLOCK_ARRAYS:
@@ -187,8 +219,8 @@ class InstanceMap(SceneMap):
         scene.labels.evicted = header["evicted"]
         scene.table.last_id = header["last_id"]
         for entry in header["instances"]:
-            class_log, observed_in = np.array(entry.pop("class_log")), set(entry.pop("observed_in"))
-            record = InstanceRecord(class_log=class_log, observed_in=observed_in, **entry)
+            evidence, observed_in = np.array(entry.pop("class_evidence")), set(entry.pop("observed_in"))
+            record = InstanceRecord(class_evidence=evidence, observed_in=observed_in, **entry)
             scene.table.records[record.id] = record
         return scene
 
@@ -221,19 +253,6 @@ def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
     except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{path} is not a map that can be read: {error}") from error
     return header, arrays
-
-
-def _instance(record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-    return Instance(
-        id=record.id,
-        class_probabilities=record.class_probabilities,
-        confidence=record.confidence,
-        observations=record.observations,
-        vertices=vertices,
-        aabb=Box((low + high) / 2, high - low, np.eye(3)),
-        obb=_oriented_box(points),
-    )
 
 
 def _oriented_box(points: Float32) -> Box:

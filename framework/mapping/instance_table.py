@@ -7,15 +7,17 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from framework.data import Float32, Float64
+from framework.mapping.evidence import Combine
 
 
 @dataclass
 class InstanceRecord:
-    """One instance's history. `class_log` is the sum of log P(O = c | I_t) over its observations, (C,)."""
+    """One instance's history. `class_evidence` (C,) is what its observations said, combined by the fuser's rule."""
 
     id: int
-    class_log: Float64
+    class_evidence: Float64
     first_frame: int = -1
+    last_frame: int = -1
     observed_in: set[int] = field(default_factory=set)  # frames in which it was detected
     visible: int = 0  # frames in which it was in view
     score_sum: float = 0.0  # over its detections
@@ -27,12 +29,6 @@ class InstanceRecord:
         return len(self.observed_in)
 
     @property
-    def class_probabilities(self) -> Float32:
-        """(C,) the posterior: the product of the observed distributions, normalised."""
-        likelihood = np.exp(self.class_log - self.class_log.max())
-        return np.asarray(likelihood / likelihood.sum(), np.float32)
-
-    @property
     def confidence(self) -> float:
         """Mean score of its detections times the share of frames in view in which it was detected, in [0, 1]."""
         mean_score = self.score_sum / max(self.detections, 1)
@@ -40,23 +36,29 @@ class InstanceRecord:
 
 
 class InstanceTable:
-    """All instances ever created, by id; ids count from 1 and are never used again."""
+    """All instances ever created, by id; ids count from 1 and are never used again.
 
-    def __init__(self) -> None:
+    Class evidence is combined as in the voxels, and `logarithmic` or proportional to what it says of the classes.
+    """
+
+    def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
         self.records: dict[int, InstanceRecord] = {}
         self.last_id = 0
+        self.combine = combine
+        self.logarithmic = logarithmic
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
         """A new instance without observations."""
         self.last_id += 1
-        record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index)
+        record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
         return record
 
-    def observe(self, instance_id: int, log_probabilities: Float64, score: float, frame_index: int) -> None:
-        """Counts one detection with log P(O = c | I_t) (C,)."""
+    def observe(self, instance_id: int, class_evidence: Float64, score: float, frame_index: int) -> None:
+        """Counts one detection with the evidence (C,) for its classes."""
         record = self.records[instance_id]
-        record.class_log += log_probabilities
+        record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
+        record.last_frame = max(record.last_frame, frame_index)
         record.observed_in.add(frame_index)
         record.score_sum += score
         record.detections += 1
@@ -64,9 +66,26 @@ class InstanceTable:
     def merge(self, kept: int, dropped: int) -> None:
         """Adds the history of `dropped` to `kept` and forgets it."""
         a, b = self.records[kept], self.records.pop(dropped)
-        a.class_log += b.class_log
+        earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
+        a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)
         a.observed_in |= b.observed_in
         a.visible = max(a.visible, b.visible)  # the two were in view together, or they would not cover each other
         a.score_sum += b.score_sum
         a.detections += b.detections
         a.first_frame = min(a.first_frame, b.first_frame)
+        a.last_frame = max(a.last_frame, b.last_frame)
+
+    def class_probabilities(self, record: InstanceRecord) -> Float32:
+        """(C,) what an instance is: the normalised product of the observed distributions where evidence is logarithmic,
+        else the share of each class in the evidence.
+        """
+        evidence = record.class_evidence
+        likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
+        total = likelihood.sum()
+        return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
+
+
+def _combined(old: Float64, new: Float64, combine: Combine) -> Float64:
+    if combine is Combine.SUM:
+        return old + new
+    return np.maximum(old, new) if combine is Combine.LARGEST else new.copy()

@@ -141,6 +141,8 @@ def write_instances(
                     zip(classes, np.round(instance.class_probabilities.astype(float), 6).tolist(), strict=True)
                 ),
                 "observations": int(instance.observations),
+                "first_frame": int(instance.first_frame),
+                "last_frame": int(instance.last_frame),
                 "centroid": mesh.vertices[instance.vertices].mean(axis=0).tolist() if len(instance.vertices) else None,
                 "aabb": {
                     "min": (instance.aabb.center - instance.aabb.extent / 2).tolist(),

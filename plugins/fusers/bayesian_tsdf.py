@@ -1,210 +1,37 @@
-"""The paper's fuser: a TSDF whose voxels carry class and instance distributions, updated by Bayes' rule."""
+"""The paper's fuser: voxels carry class and instance distributions, updated by Bayes' rule."""
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
-import numpy.typing as npt
 
-from framework.data import Float64, Frame, Int32, PointClusters, Pose
-from framework.errors import DataError
-from framework.interfaces import MapFuser
-from framework.mapping.association import (
-    Overlaps,
-    PixelLists,
-    count_overlaps,
-    cover_another,
-    list_points_by_pixel,
-    look_up_instances,
-    match_one_to_one,
-)
-from framework.mapping.evidence import NEW_CLASSES, Measurement
-from framework.mapping.instance_map import InstanceMap
-from framework.mapping.integration import Integrator
-from framework.mapping.sensor import Sensor, pinhole
+from framework.data import PointClusters
+from framework.mapping.instance_fuser import FrameEvidence, InstanceFuser
 from framework.parameters import check_bounds
-
-VOTES_ACROSS = 320  # pixels of an image row that vote in association: more cost time and tell the same
 
 
 @dataclass
-class BayesianTsdf(MapFuser):
-    """Voxel hashing with two independent Bayesian recursions a voxel, eqs. [7] and [8] of the paper."""
+class BayesianTsdf(InstanceFuser):
+    """Two independent Bayesian recursions a voxel, eqs. [7] and [8] of the paper, as sums of log-likelihoods.
 
-    voxel_size: float = 0.01  # m, > 0
-    truncation: float = 4.0  # voxels, >= 1: the width of the band at depth 0
-    truncation_slope: float = 0.01  # m more for each m of depth, >= 0: noise grows with depth (VoxelHashing's value)
-    min_depth: float = 0.2  # m, > 0
-    max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
-    max_weight: float = 200.0  # observations, 1 to 255: how slowly an old surface gives way
-    full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
-    max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
-    label_band: float = 2.0  # voxels, >= 1: label evidence goes to voxels within this distance of the measured surface
-    overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap over the smaller of the two
-    create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
-    create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
-    duplicate_overlap: float = 0.6  # in (0, 1]: a cluster that shares this with a better one creates nothing
-    merge_overlap: float = 0.5  # in (0, 1]: two instances under one cluster above this are one object ...
-    merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
+    An instance's class distribution is the product of the distributions of all its detections.
+    """
+
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
     instance_floor: float = 0.05  # in (0, 1): P(O = another instance); the matched one has the detection's score
     absence: float = 0.3  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
-    min_observations: int = 3  # frames, >= 1: before that an instance is tentative
-    min_confidence: float = 0.05  # in [0, 1]: likewise
-    min_vertices: int = 30  # mesh vertices, >= 1: of an instance that counts
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self,
-            voxel_size=(1e-4, 1.0),
-            truncation=(1.0, 100.0),
-            truncation_slope=(0.0, 1.0),
-            min_depth=(1e-3, 100.0),
-            max_depth=(self.min_depth, 1000.0),
-            max_weight=(1.0, 255.0),
-            full_weight_depth=(1e-3, 1000.0),
-            max_blocks=(1, 2**31 // 512),
-            label_band=(1.0, self.truncation),
-            overlap=(0.0, 1.0),
-            create_score=(0.0, 1.0),
-            create_points=(1, 2**31),
-            duplicate_overlap=(0.0, 1.0),
-            merge_overlap=(0.0, 1.0),
-            merge_frames=(1, 2**31),
-            class_floor=(1e-6, 0.999),
-            instance_floor=(1e-6, 0.999),
-            absence=(1e-6, 1.0),
-            min_observations=(1, 2**31),
-            min_confidence=(0.0, 1.0),
-            min_vertices=(1, 2**31),
-        )
-        sensor = Sensor(
-            truncation=np.float32(self.truncation * self.voxel_size),
-            truncation_slope=np.float32(self.truncation_slope),
-            min_depth=np.float32(self.min_depth),
-            max_depth=np.float32(self.max_depth),
-            max_weight=np.float32(self.max_weight),
-            full_weight_depth=np.float32(self.full_weight_depth),
-        )
-        self.scene: InstanceMap = InstanceMap(
-            self.voxel_size,
-            sensor,
-            self.max_blocks,
-            self.min_observations,
-            self.min_confidence,
-            self.min_vertices,
-        )
-        self._integrator = Integrator(self.scene.voxels, sensor)
-        self._together: Counter[tuple[int, int]] = Counter()  # frames that see two instances as one, less those as two
+        super().__post_init__()
+        check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence=(1e-6, 1.0))
 
-    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
-        self._agree_on_classes(clusters.classes)
-        points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = self._look_up(frame, pose, clusters)
-        instance_ids = self._associate(overlaps, clusters, points, frame)
-        band = self.label_band * self.voxel_size
-        seen = self._integrator.integrate(frame, pose.T_world_camera, band)
-        self._observe(overlaps, clusters, instance_ids, frame)
-        self.scene.labels.update(seen, self._measurement(clusters, points, instance_ids))
-        self._merge_instances(overlaps, instance_ids)
-        self.scene.changed(seen.blocks)
-
-    def _agree_on_classes(self, classes: tuple[str, ...]) -> None:
-        """The first frame's label space becomes the map's."""
-        if not self.scene.classes:
-            self.scene.classes = classes
-        elif self.scene.classes != classes:
-            raise DataError(
-                f"the map has {len(self.scene.classes)} classes and this frame's clusters have {len(classes)} "
-                "others; use one detector, or map them to one label space"
-            )
-
-    def _look_up(self, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
-        """How the clusters lie on the instances that the map has at the measured surface."""
-        stride = max(1, frame.camera.width // VOTES_ACROSS)
-        instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
-        view = pinhole(frame.camera, pose.T_world_camera)
-        look_up_instances(self.scene.voxels.grid, self.scene.labels.evidence, frame.depth, view, stride, instance_ids)
-        return count_overlaps(clusters, instance_ids, stride)
-
-    def _associate(self, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame: Frame) -> Int32:
-        """(N,) the instance of each cluster, an old or a new one; 0 = none."""
-        match = match_one_to_one(overlaps.over_smaller(self.create_points), self.overlap)
-        instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
-        may_create = (
-            (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
-        )
-        if may_create.any():
-            may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
-        for k in np.flatnonzero(may_create):
-            instance_ids[k] = self.scene.table.create(len(clusters.classes), frame.index).id
-        return instance_ids
-
-    def _observe(self, overlaps: Overlaps, clusters: PointClusters, instance_ids: Int32, frame: Frame) -> None:
-        """Brings the table of instances up to date with what this frame saw."""
-        log_probabilities = self._log_probabilities(clusters)
-        for k in np.flatnonzero(instance_ids):
-            self.scene.table.observe(int(instance_ids[k]), log_probabilities[k], float(clusters.scores[k]), frame.index)
-        in_view = set(overlaps.instance_ids[overlaps.visible >= self.create_points].tolist())
-        for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
-            self.scene.table.records[instance_id].visible += 1
-
-    def _log_probabilities(self, clusters: PointClusters) -> Float64:
-        """(N, C) log P(O_u = c | I_t), the uniform distribution mixed in so that no zero kills a class for good."""
+    def evidence(self, clusters: PointClusters) -> FrameEvidence:
         p = clusters.class_probabilities.astype(np.float64)
-        return np.asarray(np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)))
-
-    def _measurement(self, clusters: PointClusters, points: PixelLists, instance_ids: Int32) -> Measurement:
-        """P(O_u | I_t) of this frame's clusters, as the recursions take it."""
-        matched = np.zeros(self.scene.table.last_id + 1, np.bool_)
-        matched[instance_ids] = True
         scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
-        class_gain, named_classes = _class_gains(self._log_probabilities(clusters))
-        return Measurement(
-            first_point=points.first,
-            next_point=points.next,
-            cluster=clusters.cluster,
-            instance_id=instance_ids,
-            instance_gain=np.log(scores / self.instance_floor).astype(np.float32),
-            absence_loss=np.float32(np.log(self.absence)),
-            matched=matched,
-            class_gain=class_gain,
-            named_classes=named_classes,
+        return FrameEvidence(
+            instances=np.log(scores / self.instance_floor).astype(np.float32),
+            # no zero may kill a class for good
+            classes=np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)),
+            absence=float(np.log(self.absence)),
         )
-
-    def _merge_instances(self, overlaps: Overlaps, instance_ids: Int32) -> None:
-        """Merges two instances that keep lying under one cluster and are hardly ever seen as two (after Voxblox++)."""
-        matched = sorted(set(instance_ids[instance_ids > 0].tolist()))
-        self._together.subtract(combinations(matched, 2))
-        for k, row in enumerate(overlaps.over_smaller(self.create_points)):
-            kept = int(instance_ids[k])
-            covered = overlaps.instance_ids[row > self.merge_overlap].tolist() if kept else []
-            for other in set(covered) - set(matched):
-                pair = (min(kept, other), max(kept, other))
-                self._together[pair] += 1
-                if self._together[pair] >= self.merge_frames:
-                    self.scene.merge(*pair)
-                    self._forget(pair[1])
-                    return  # overlaps are out of date now; what else is to be merged will be seen again
-
-    def _forget(self, instance_id: int) -> None:
-        self._together = Counter({pair: n for pair, n in self._together.items() if instance_id not in pair})
-
-
-def _class_gains(log_probabilities: Float64) -> tuple[npt.NDArray[np.float32], npt.NDArray[np.int16]]:
-    """Log-likelihoods (N, C) relative to the classes that a cluster does not name, and the classes that it names.
-
-    A cluster names its NEW_CLASSES most likely classes; the others share the mean of what is left.
-    """
-    c = log_probabilities.shape[1]
-    named = np.argsort(-log_probabilities, axis=1, kind="stable")[:, :NEW_CLASSES].astype(np.int16)
-    rest = np.exp(log_probabilities)
-    np.put_along_axis(rest, named.astype(np.int64), 0, axis=1)
-    base = np.log(np.maximum(rest.sum(axis=1) / max(c - NEW_CLASSES, 1), 1e-6))
-    gains = (log_probabilities - base[:, None]).astype(np.float32)
-    if named.shape[1] < NEW_CLASSES:  # fewer classes than slots: name the first one again, which changes nothing
-        named = np.concatenate([named, np.repeat(named[:, :1], NEW_CLASSES - named.shape[1], axis=1)], axis=1)
-    return gains, np.ascontiguousarray(named)

@@ -8,17 +8,19 @@ from hypothesis import strategies as st
 from framework.mapping.evidence import (
     NEW_CLASSES,
     SLOTS,
+    Combine,
     Evidence,
     EvidenceRows,
     Measurement,
+    Storage,
     add_evidence,
     best_class,
     best_counted_instance,
     best_instance,
+    named_classes,
     update_voxel,
 )
 from framework.mapping.voxel_grid import VoxelGrid
-from plugins.fusers.bayesian_tsdf import _class_gains
 
 FLOOR = 0.05
 
@@ -33,14 +35,18 @@ def blank() -> Evidence:
 
 
 def measured(
-    ids: list[int], scores: list[float], distributions: np.ndarray, absence: float, last_id: int
+    ids: list[int],
+    scores: list[float],
+    distributions: np.ndarray,
+    absence: float,
+    last_id: int,
 ) -> Measurement:
     """Every cluster covers the one pixel that there is."""
     n = len(ids)
     first, following = np.zeros((1, 1), np.int32), np.append(np.arange(1, n), -1).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
-    gains, named = _class_gains(np.log(distributions))
+    gains, named = named_classes(np.log(distributions), logarithmic=True)
     return Measurement(
         first,
         following,
@@ -51,6 +57,18 @@ def measured(
         matched,
         gains,
         named,
+        int(Combine.SUM),
+    )
+
+
+def voted(ids: list[int], weights: list[float], classes: list[int], combine: Combine, number: int = 6) -> Measurement:
+    """Clusters over the one pixel, each for an instance and one class, by a rule that is not Bayes'."""
+    evidence = np.zeros((len(ids), number))
+    evidence[np.arange(len(ids)), classes] = weights
+    gains, named = named_classes(evidence, logarithmic=False)
+    every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
+    return every._replace(
+        instance_gain=np.array(weights, np.float32), class_gain=gains, named_classes=named, combine=int(combine)
     )
 
 
@@ -79,13 +97,13 @@ def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) 
         instance_log[instance] += np.log(score / FLOOR)
         class_log += np.log(p)
     found = {
-        int(i): float(v) for i, v in zip(evidence.instance_ids[0, 3], evidence.instance_log[0, 3], strict=True) if i
+        int(i): float(v) for i, v in zip(evidence.instance_ids[0, 3], evidence.instance_value[0, 3], strict=True) if i
     }
     for i, log in found.items():
         assert abs(log - (instance_log[i] - instance_log[0])) < 1e-3
     assert best_instance(evidence, 0, 3) == 1 + np.argmax(instance_log[1:])
     order = evidence.class_ids[0, 3][: min(classes, SLOTS)]
-    ours = evidence.class_log[0, 3][: len(order)]
+    ours = evidence.class_value[0, 3][: len(order)]
     exact = class_log[order]
     assert np.allclose(ours - ours[0], exact - exact[0], atol=2e-3)
     assert best_class(evidence, 0, 3) == np.argmax(class_log)
@@ -117,7 +135,7 @@ def test_a_voxel_under_two_masks_hears_both() -> None:
     evidence = blank()
     p = np.full((2, 3), 1 / 3)
     update_voxel(evidence, 0, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), np.int32(0))
-    found = dict(zip(evidence.instance_ids[0, 0].tolist(), evidence.instance_log[0, 0].tolist(), strict=True))
+    found = dict(zip(evidence.instance_ids[0, 0].tolist(), evidence.instance_value[0, 0].tolist(), strict=True))
     assert found[1] == np.float32(np.log(0.9 / FLOOR))
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
 
@@ -126,11 +144,11 @@ def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
     update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(0))
-    before = float(evidence.instance_log[0, 0, 0])
+    before = float(evidence.instance_value[0, 0, 0])
     update_voxel(evidence, 0, 0, measured([2], [0.9], one, 0.5, 2), np.int32(-1))  # instance 2 found, not here
-    assert float(evidence.instance_log[0, 0, 0]) == before
+    assert float(evidence.instance_value[0, 0, 0]) == before
     update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))  # instance 1 found, not here
-    assert float(evidence.instance_log[0, 0, 0]) == np.float32(before + np.log(0.5))
+    assert float(evidence.instance_value[0, 0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
         update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))
     assert best_instance(evidence, 0, 0) == 0, "the rest has become more likely"
@@ -145,7 +163,7 @@ def test_a_cluster_without_instance_says_nothing() -> None:
 
 def test_class_gains_are_relative_to_the_classes_not_named() -> None:
     p = np.array([[0.5, 0.2, 0.1, 0.1, 0.04, 0.03, 0.03]])
-    gains, named = _class_gains(np.log(p))
+    gains, named = named_classes(np.log(p), logarithmic=True)
     assert named.tolist() == [[0, 1, 2, 3]]
     assert NEW_CLASSES == 4
     rest = (0.04 + 0.03 + 0.03) / 3
@@ -166,9 +184,11 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
 ) -> None:
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
     rows.row_count = 1
-    rows.evidence.instance_ids[0, 7], rows.evidence.instance_log[0, 7] = ids, logs
+    rows.evidence.instance_ids[0, 7], rows.evidence.instance_value[0, 7] = ids, logs
     rows.merge_instances(3, 2)
-    found = dict(zip(rows.evidence.instance_ids[0, 7].tolist(), rows.evidence.instance_log[0, 7].tolist(), strict=True))
+    found = dict(
+        zip(rows.evidence.instance_ids[0, 7].tolist(), rows.evidence.instance_value[0, 7].tolist(), strict=True)
+    )
     assert found == dict(zip(merged_ids, merged_logs, strict=True))
     assert rows.evidence.instance_ids[0, 7, 0] == merged_ids[0]
     assert ((rows.evidence.instance_ids[0, 7] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
@@ -176,18 +196,89 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
 
 def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
-    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5)) == 1
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM) == 1
     assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"
-    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5)) == 1
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM) == 1
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
 
 def test_the_likeliest_instance_that_counts_need_not_be_the_likeliest() -> None:
     evidence = blank()
-    evidence.instance_ids[0, 0], evidence.instance_log[0, 0] = [1, 5, 3, 2], [9, 4, 7, -1]
+    evidence.instance_ids[0, 0], evidence.instance_value[0, 0] = [1, 5, 3, 2], [9, 4, 7, -1]
     counts = np.ones(6, np.bool_)
     assert best_counted_instance(evidence, 0, 0, counts) == 1
     counts[1] = False
     assert best_counted_instance(evidence, 0, 0, counts) == 3
     counts[[3, 5]] = False
     assert best_counted_instance(evidence, 0, 0, counts) == 0, "the rest is likelier than 2"
+
+
+SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
+"""What four frames say of a voxel: instances, scores, classes."""
+
+
+@pytest.mark.parametrize(
+    ("combine", "weighed", "instance", "label"),
+    [
+        (Combine.SUM, False, 2, 2),  # counts: instance 2 twice; classes 2 and 3 twice each, and the smaller one wins
+        (Combine.LARGEST, True, 1, 2),
+        (Combine.LATEST, False, 3, 2),
+    ],
+)
+def test_the_other_rules(combine: Combine, weighed: bool, instance: int, label: int) -> None:
+    evidence = blank()
+    for ids, scores, classes in SEEN:
+        update_voxel(evidence, 0, 0, voted(ids, scores if weighed else [1.0], classes, combine), np.int32(0))
+    assert best_instance(evidence, 0, 0) == instance
+    assert best_class(evidence, 0, 0) == label
+
+
+def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> None:
+    evidence = blank()
+    update_voxel(evidence, 0, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), np.int32(0))
+    assert best_instance(evidence, 0, 0) == 2
+    assert best_class(evidence, 0, 0) == 5
+    assert (evidence.instance_ids[0, 0, 1:] == 0).all()
+
+
+def test_counts_are_counts() -> None:
+    evidence = blank()
+    for _ in range(3):
+        assert update_voxel(evidence, 0, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0)) == 0
+    assert evidence.instance_value[0, 0].tolist() == [3, 0, 0, 0]
+    assert evidence.class_value[0, 0].tolist() == [3, 0, 0, 0]
+
+
+def test_a_voxel_that_was_never_named_has_no_class_in_either_storage() -> None:
+    for storage in Storage:
+        rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
+        rows.begin(6)
+        rows.voxels.allocate(np.zeros((1, 3), np.int32))
+        rows._add_rows(np.zeros(1, np.int32))
+        assert best_class(rows.evidence, 0, 0) == -1
+        update_voxel(rows.evidence, 0, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0))
+        assert best_class(rows.evidence, 0, 0) == 2
+
+
+def test_exact_storage_never_forgets() -> None:
+    """Many more instances and classes than the compact slots: every sum is there."""
+    rng = np.random.default_rng(0)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
+    rows.begin(30)
+    rows.voxels.allocate(np.zeros((1, 3), np.int32))
+    rows._add_rows(np.zeros(1, np.int32))
+    class_log, instance_log = np.zeros(30), np.zeros(21)
+    for _ in range(100):
+        ids = rng.choice(np.arange(1, 21), 3, replace=False)
+        p = np.array([distribution(rng, 30) for _ in ids])
+        rows._make_room_for_instances(len(ids))
+        measurement = measured(ids.tolist(), [0.9] * 3, p, 1.0, 20)
+        assert update_voxel(rows.evidence, 0, 0, measurement, np.int32(0)) == 0
+        class_log += np.log(p).sum(axis=0)
+        instance_log[ids] += np.log(0.9 / FLOOR)
+    labels, values = rows.evidence.class_ids[0, 0], rows.evidence.class_value[0, 0]
+    assert sorted(labels.tolist()) == list(range(30))
+    assert np.allclose(values - values[0], class_log[labels] - class_log[labels[0]], atol=1e-2)
+    named = rows.evidence.instance_ids[0, 0] > 0
+    assert np.allclose(rows.evidence.instance_value[0, 0][named], instance_log[rows.evidence.instance_ids[0, 0][named]])
+    assert named.sum() == 20

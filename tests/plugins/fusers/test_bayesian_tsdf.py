@@ -106,7 +106,7 @@ def test_two_instances_that_keep_lying_under_one_cluster_are_merged(frames: list
     assert record.visible == 5, "a frame that had both in view counts once"
     assert record.detections == 6
     assert record.score_sum == pytest.approx(0.9 + 0.8 + 4 * 0.1)
-    assert record.class_probabilities[0] == pytest.approx(0.68**6 / (0.68**6 + 0.32**6), abs=1e-4)
+    assert fuser.scene.table.class_probabilities(record)[0] == pytest.approx(0.68**6 / (0.68**6 + 0.32**6), abs=1e-4)
     labels = fuser.scene.labels
     assert set(np.unique(labels.evidence.instance_ids[: labels.row_count])) == {0, 1}
     fused(fuser, dataclasses.replace(frames[0], index=5), [whole], [0.9])
