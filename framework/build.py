@@ -9,7 +9,7 @@ import pkgutil
 from collections.abc import Mapping
 from difflib import get_close_matches
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -93,28 +93,71 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
 
     Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing mandatory value.
     """
+    stages = plugin_fields(plugin_class)
     try:
-        schema = OmegaConf.structured(plugin_class)
+        schema = OmegaConf.structured(_without(plugin_class, stages) if stages else plugin_class)
     except OmegaConfBaseException as error:
         raise ConfigError(
             f"{where}: parameters must be bool, int, float, str, Path or Enum: {_first_line(error)}"
         ) from error
     names = [field.name for field in dataclasses.fields(plugin_class) if field.init]
+    plugins: dict[str, Any] = {}
     for key in node:
         if key == "_target_" or OmegaConf.is_missing(node, key):
             continue
         if key not in names:
             raise ConfigError(f"{where}: there is no parameter {str(key)!r}{_did_you_mean(str(key), names, 'it has')}")
+        if key in stages:
+            plugins[str(key)] = _plugins(f"{where}: {key}", stages[str(key)], node[key])
+            continue
         try:
             schema[key] = node[key]
         except OmegaConfBaseException as error:
             raise ConfigError(f"{where}: {key}: {_first_line(error)}") from error
-    missing = [name for name in names if OmegaConf.is_missing(schema, name)]
+    missing = [name for name in names if name not in stages and OmegaConf.is_missing(schema, name)]
+    missing += [name for name in stages if name not in plugins]
     if missing:
         stage = where.split()[0]
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
         raise ConfigError(f"{where}: {', '.join(missing)} must be given: {needed}")
-    return {name: schema[name] for name in names}
+    return {name: plugins[name] if name in stages else schema[name] for name in names}
+
+
+def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
+    """The fields that hold other plugins by name, Mapping[str, interface], and their interfaces."""
+    found = {}
+    for name, hint in get_type_hints(plugin_class).items():
+        of = get_args(hint)
+        if get_origin(hint) is Mapping and len(of) == 2 and of[1] in STAGES.values():
+            found[name] = of[1]
+    return found
+
+
+def _without(plugin_class: type, left_out: Mapping[str, Any]) -> type:
+    """A dataclass with the same fields but for some."""
+    hints = get_type_hints(plugin_class)
+    kept = [field for field in dataclasses.fields(plugin_class) if field.init and field.name not in left_out]
+    return dataclasses.make_dataclass(
+        plugin_class.__name__,
+        [
+            (f.name, hints[f.name], dataclasses.field(default=f.default, default_factory=f.default_factory))
+            for f in kept
+        ],
+    )
+
+
+def _plugins(where: str, interface: type[Plugin], node: Any) -> dict[str, Plugin]:
+    """The plugins that a mapping of configs describes, in its order; what is null is left out."""
+    if not isinstance(node, DictConfig):
+        raise ConfigError(f"{where}: expected plugins by name, found {_shown(node)}")
+    found = {}
+    for name in map(str, node):
+        if node[name] is not None:
+            try:
+                found[name] = build(interface, node[name])
+            except InstanceMapError as error:
+                raise type(error)(f"{where}.{name}: {error}") from error
+    return found
 
 
 def _import(where: str, module_name: str) -> ModuleType:

@@ -23,7 +23,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from framework.build import STAGES, find_class
+from framework.build import STAGES, find_class, plugin_fields
 from framework.command_line import CONF, one_line, one_line_errors
 from framework.errors import ConfigError
 
@@ -74,13 +74,17 @@ def _option(loader: Any, stage: str, name: str) -> Option:
         plugin_class = find_class(STAGES[stage], target)
     except (ConfigError, HydraException) as error:
         return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
+    nested = {
+        name: ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        for name in plugin_fields(plugin_class)
+    }
     texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
     comments = {match["key"]: match["comment"] for text in texts for match in _COMMENTED_KEY.finditer(text)}
     parameters = tuple(
         Parameter(
             name=field.name,
             type=field.type if isinstance(field.type, str) else field.type.__name__,
-            default=str(given.get(field.name, _default(field))),
+            default=nested.get(field.name) or str(given.get(field.name, _default(field))),
             comment=comments.get(field.name, ""),
         )
         for field in dataclasses.fields(plugin_class)

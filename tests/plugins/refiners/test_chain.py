@@ -1,0 +1,74 @@
+"""Refiners in a row, as Hydra composes them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Frame, PointClusters
+from framework.errors import ConfigError
+from plugins.refiners.chain import Chain
+from plugins.refiners.gmm_em import GmmEm
+from plugins.refiners.kmeans import KMeans
+from plugins.refiners.largest_component import LargestComponent
+from tests import registered
+
+
+class Halving(LargestComponent):
+    """Takes every other point: what it leaves depends on what it is given."""
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        return PointClusters(
+            clusters.points_world[::2],
+            clusters.pixels[::2],
+            clusters.cluster[::2],
+            clusters.class_probabilities,
+            clusters.scores,
+            clusters.classes,
+        )
+
+
+def test_each_link_refines_what_the_one_before_it_left() -> None:
+    camera = Camera(8, 8, 8.0, 8.0, 3.5, 3.5)
+    frame = Frame(0, 0.0, np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), camera)
+    points = np.arange(24, dtype=np.float32).reshape(8, 3)
+    pixels = np.zeros((8, 2), np.int32)
+    ones = np.ones((1, 1), np.float32)
+    clusters = PointClusters(points, pixels, np.zeros(8, np.int32), ones, ones[0], ("chair",))
+    left = Chain({"first": Halving(), "second": Halving()}).refine(clusters, frame)
+    assert left.points_world.tolist() == points[::4].tolist()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "links"),
+    [
+        (["refiner.links.gmm_em.std_floor=0.02"], {"gmm_em": GmmEm, "largest_component": LargestComponent}),
+        (["refiner.links.gmm_em=null"], {"largest_component": LargestComponent}),
+        (["refiner@refiner.links.gmm_em=kmeans"], {"gmm_em": KMeans, "largest_component": LargestComponent}),
+    ],
+)
+def test_links_are_set_left_out_and_swapped(overrides: list[str], links: dict[str, type]) -> None:
+    chain = registered.built("refiner", "chain", *overrides)
+    found = {name: type(link) for name, link in chain.links.items() if name in ("gmm_em", "largest_component")}
+    assert found == links
+    assert list(found) == list(links), "in their order"
+    if "std_floor" in overrides[0]:
+        assert chain.links["gmm_em"].std_floor == 0.02
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (["refiner.links.gmm_em.std_flor=1"], "Could not override|std_flor"),
+        (["refiner.links.gmm_em.std_floor=-1"], "links.gmm_em: refiner plugins.refiners.gmm_em.GmmEm"),
+        (["refiner.links=3"], "expected plugins by name, found 3|Could not|merge"),
+    ],
+)
+def test_a_fault_names_the_link(overrides: list[str], said: str) -> None:
+    with pytest.raises(Exception, match=said):
+        registered.built("refiner", "chain", *overrides)
+
+
+def test_a_chain_without_links_says_what_to_choose() -> None:
+    with pytest.raises(ConfigError, match="refiner=identity"):
+        Chain({})
