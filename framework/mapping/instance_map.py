@@ -22,9 +22,10 @@ from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
-from framework.mapping.meshing import SurfaceNets, look_up
+from framework.mapping.meshing import SurfaceNets
 from framework.mapping.raycasting import render, render_near
 from framework.mapping.sensor import Sensor
+from framework.mapping.vertex_labels import vertex_labels
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
 FORMAT = 3  # of the saved file; a change of meaning counts it up
@@ -118,14 +119,14 @@ class InstanceMap(SceneMap):
 
     @cached_property
     def _mesh(self) -> InstanceMesh:
-        vertices, triangles, voxels = self._surface.extract()
+        surface = self._surface.extract()
         counts = self._counts()
-        colors, instance_ids, class_ids = look_up(self.voxels.grid, self.labels.evidence, counts, voxels)
+        colors, instance_ids, class_ids = vertex_labels(self.voxels.grid, self.labels.evidence, counts, surface)
         too_small = np.bincount(instance_ids, minlength=len(counts)) < self.min_vertices
         dropped = too_small[instance_ids]
         instance_ids[dropped] = 0
         class_ids[dropped] = -1
-        return InstanceMesh(vertices, triangles, colors, instance_ids, class_ids, self.classes)
+        return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _counts(self) -> Bool:
         """(ids + 1,) whether an instance has been observed often enough, by id."""

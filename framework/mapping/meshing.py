@@ -22,19 +22,16 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Int32, UInt8
+from framework.data import Float32, Int32
 from framework.mapping.bit_slices import ONE, ahead_x, ahead_y, behind_x, behind_y, count_bits, lowest_bit
-from framework.mapping.evidence import Evidence, best_class, best_counted_instance
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
     UNSEEN,
-    Grid,
     VoxelGrid,
     device,
     find_block,
     grown,
-    unpack_color,
 )
 from framework.mapping.voxel_walk import voxel_number
 
@@ -45,7 +42,7 @@ MAX_JUMP = 8.0
 
 
 class Surface(NamedTuple):
-    """A mesh without colours and labels: those of a vertex are its nearest voxel's, to be looked up there."""
+    """A mesh without colours and labels: `vertex_labels` has those."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3), facing the side that the surface was seen from
@@ -291,29 +288,6 @@ def _write_triangles(grid, inside, cells, first, quad_first, counts, triangles):
                     triangles[t, 0], triangles[t, 1], triangles[t, 2] = p, q, r
                     triangles[t + 1, 0], triangles[t + 1, 1], triangles[t + 1, 2] = p, r, s
                     t += 2
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _look_up(grid, evidence, counts, voxels, colors, instance_ids, class_ids):
-    for v in prange(len(voxels)):
-        block, n = voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS
-        row = grid.label_row[block]
-        red, green, blue = unpack_color(grid.color[block, n])
-        colors[v, 0], colors[v, 1], colors[v, 2] = red / 4, green / 4, blue / 4
-        instance_ids[v] = best_counted_instance(evidence, row, n, counts) if row >= 0 else 0
-        class_ids[v] = best_class(evidence, row, n) if instance_ids[v] > 0 else -1
-
-
-def look_up(grid: Grid, evidence: Evidence, counts: Bool, voxels: Int32) -> tuple[UInt8, Int32, Int32]:
-    """(colors (V, 3), instance ids (V,), class ids (V,)) of voxels, numbered as in Surface.
-
-    Only instances with counts[id] are named; where another one is likelier, the likeliest that counts is. What belongs
-    to no object has no class, whatever mask once bled over it.
-    """
-    colors = np.empty((len(voxels), 3), np.uint8)
-    instance_ids, class_ids = np.empty(len(voxels), np.int32), np.empty(len(voxels), np.int32)
-    _look_up(grid, evidence, counts, voxels, colors, instance_ids, class_ids)
-    return colors, instance_ids, class_ids
 
 
 class SurfaceNets:
