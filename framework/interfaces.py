@@ -133,6 +133,11 @@ class SceneMap(ABC):
         """Bytes that the map's arrays take."""
 
     @property
+    def evictions(self) -> int:
+        """How often a voxel had to forget a label for want of room; a map that never forgets leaves it at 0."""
+        return 0
+
+    @property
     def instance_count(self) -> int:
         """The number of objects found so far; asked often, for the progress bar: override it where it can be cheap."""
         return len(self.instances())

@@ -9,32 +9,38 @@ stores each label's sum relative to the labels that nobody named there, whose su
 Other rules (a count of detections, the latest one, the most confident one) keep other numbers in the same place, and
 differ in how new evidence for a label meets the old one: `Combine`.
 
-Compact storage keeps a voxel's SLOTS likeliest instances and classes and drops the least likely one when another one
-is named (an eviction, counted). What a dropped or unnamed label would have gained over the rest is lost; everything
-that stays is exact. Exact storage has a slot for every class, and as many for instances as no voxel ever fills: the
-oracle that the compact one is compared with.
+Compact storage keeps a voxel's likeliest instances and classes and drops the least likely one when another one is
+named (an eviction, counted). What a dropped or unnamed label would have gained over the rest is lost. Exact storage has
+a slot for every class, and as many for instances as no voxel ever fills: the oracle that the compact one is compared
+with. On real detections (maskrcnn2go, replica_floor2) the likeliest instance is the same in every labelled voxel, the
+likeliest class in 99.8 %; with 4 class slots it was 98.6 %, with 8 it was 99.2 %.
 
-Rows of 512 voxels exist only for blocks in which something was detected: 8 bytes an instance slot, 6 a class slot, so
-56 bytes a labelled voxel in compact storage.
+Class evidence is kept in whole units, so that it can be small and its sums do not depend on their order. Rows of 512
+voxels exist only for blocks in which something was detected: 8 bytes an instance slot, 3 a class slot, so 68 bytes a
+voxel in compact storage.
 """
 
 from __future__ import annotations
 
 from enum import Enum, IntEnum
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32, UInt8
+from framework.errors import DataError
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more
 
-Int16 = npt.NDArray[np.int16]
+Int64 = npt.NDArray[np.int64]
+Integers = npt.NDArray[Any]  # of int16 or int64
 
-SLOTS = 4  # instances and classes that a voxel can tell apart in compact storage
-NEW_CLASSES = 4  # a detection can bring its best so many classes into a voxel's slots
+INSTANCE_SLOTS, CLASS_SLOTS = 4, 12  # labels that a voxel can tell apart in compact storage
+NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
+NO_CLASS = 255  # in a free slot
+MOST_UNITS = 32_000  # of class evidence in compact storage: where more speaks for a class, it is certain
 
 
 class Combine(IntEnum):
@@ -45,6 +51,7 @@ class Combine(IntEnum):
     LATEST = 2  # which also forgets what the other labels had
 
 
+UNBOUNDED = np.float32(np.inf)
 SUM, LARGEST, LATEST = (int(combine) for combine in Combine)  # for the kernels
 
 
@@ -60,8 +67,8 @@ class Evidence(NamedTuple):
 
     instance_ids: Int32  # (R, 512, S), 0 = free slot
     instance_value: Float32  # (R, 512, S)
-    class_ids: Int16  # (R, 512, T), -1 = free slot
-    class_value: Float32  # (R, 512, T)
+    class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
+    class_value: Integers  # (R, 512, T) units, int16 or in exact storage int64
 
 
 class Measurement(NamedTuple):
@@ -74,13 +81,14 @@ class Measurement(NamedTuple):
     instance_gain: Float32  # (N,) for that instance, over any other
     absence: np.float32  # not above 0, for an instance matched in this frame but not seen here
     matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
-    class_gain: Float32  # (N, C) for each class, over those that the cluster does not name
-    named_classes: Int16  # (N, NEW_CLASSES) each cluster's best classes
+    class_gain: Int64  # (N, C) units, for each class, over those that the cluster does not name
+    named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
     combine: int  # Combine
+    most_units: int  # that a class may have
 
 
-def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float32, Int16]:
-    """What clusters say of classes, evidence (N, C), as a Measurement has it: (class_gain, named_classes).
+def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8]:
+    """What clusters say of classes, evidence (N, C), as a Measurement has it: (class_gain (N, C), named_classes).
 
     Of log-likelihoods a cluster names its NEW_CLASSES best classes, and the others share the mean of what is left;
     otherwise it names its best one, and for those that it does not name it says nothing.
@@ -94,7 +102,7 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float32, Int16]
         np.put_along_axis(rest, named, 0, axis=1)
         gains = evidence - np.log(np.maximum(rest.sum(axis=1, keepdims=True) / max(c - NEW_CLASSES, 1), 1e-6))
     again = np.repeat(named[:, :1], NEW_CLASSES - names, axis=1)  # names the first one again, which changes nothing
-    return gains.astype(np.float32), np.concatenate([named, again], axis=1).astype(np.int16)
+    return gains, np.concatenate([named, again], axis=1).astype(np.uint8)
 
 
 @device
@@ -123,13 +131,15 @@ def best_counted_instance(evidence, row, n, counts):
 @device
 def best_class(evidence, row, n):
     """The most likely class of a voxel, -1 when none was ever named."""
-    return np.int32(evidence.class_ids[row, n, 0]) if evidence.instance_ids[row, n, 0] > 0 else np.int32(-1)
+    named = evidence.instance_ids[row, n, 0] > 0
+    return np.int32(evidence.class_ids[row, n, 0]) if named else np.int32(-1)
 
 
 @device
-def add_evidence(labels, values, free, label, gain, combine):
-    """Combines `gain` with a label's slot, or gives it the free or least likely one. Returns 1 when that evicted
-    another.
+def add_evidence(labels, values, free, label, gain, combine, most):
+    """Combines `gain` with a label's slot, to at most `most`, or gives it the free or least likely one.
+
+    Returns 1 when that evicted another.
     """
     if combine == LATEST:
         for s in range(1, len(labels)):
@@ -140,7 +150,7 @@ def add_evidence(labels, values, free, label, gain, combine):
     least = 0
     for s in range(len(labels)):
         if labels[s] == label:
-            values[s] = values[s] + gain if combine == SUM else max(values[s], gain)
+            values[s] = min(max(values[s] + gain, -most), most) if combine == SUM else max(values[s], gain)
             return 0
         if labels[s] == free:
             labels[s] = label
@@ -199,10 +209,13 @@ def update_voxel(evidence, row, n, measurement, point):
         p = measurement.next_point[p]
         if measurement.instance_id[k] == 0:
             continue
-        evicted += add_evidence(ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine)
+        evicted += add_evidence(
+            ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
+        )
         for s in range(len(classes) if combine == SUM else 0):
-            if classes[s] >= 0:
-                class_values[s] += measurement.class_gain[k, classes[s]]
+            if classes[s] != NO_CLASS:
+                value = class_values[s] + measurement.class_gain[k, classes[s]]
+                class_values[s] = min(max(value, -measurement.most_units), measurement.most_units)
         for m in range(NEW_CLASSES):
             label = measurement.named_classes[k, m]
             if m > 0 and label == measurement.named_classes[k, 0]:
@@ -211,9 +224,10 @@ def update_voxel(evidence, row, n, measurement, point):
             for s in range(len(classes) if combine == SUM else 0):
                 known = known or classes[s] == label
             if not known:
-                evicted += add_evidence(classes, class_values, -1, label, measurement.class_gain[k, label], combine)
+                gain = measurement.class_gain[k, label]
+                evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
     _best_first(ids, id_values, 0)
-    _best_first(classes, class_values, -1)
+    _best_first(classes, class_values, NO_CLASS)
     return evicted
 
 
@@ -279,7 +293,7 @@ def _merge(evidence, rows, kept, dropped, combine):
                         last -= 1
                     ids[s], values[s] = ids[last], values[last]
                     ids[last], values[last] = 0, 0
-                    add_evidence(ids, values, 0, kept, gain, combine)
+                    add_evidence(ids, values, 0, kept, gain, combine, UNBOUNDED)
                     _best_first(ids, values, 0)
                     break
 
@@ -293,7 +307,7 @@ class EvidenceRows:
         self.storage = storage
         self.row_count = 0
         self.evicted = 0  # slots given to another label so far
-        self._class_slots = SLOTS
+        self._class_slots = CLASS_SLOTS
         self.evidence = self._free_rows(64)
 
     @property
@@ -302,7 +316,9 @@ class EvidenceRows:
         return sum(array[: self.row_count].nbytes for array in self.evidence)
 
     def begin(self, classes: int) -> None:
-        """Says how many classes there are, before the first update."""
+        """Says how many classes there are, before the first update. Raises DataError when they are too many."""
+        if classes > NO_CLASS:
+            raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
         if self.storage is Storage.EXACT:
             self._class_slots = max(classes, 1)
             self.evidence = self._free_rows(64)
@@ -329,17 +345,18 @@ class EvidenceRows:
         _merge(self.evidence, self.row_count, np.int32(kept), np.int32(dropped), int(self.combine))
 
     def _free_rows(self, rows: int) -> Evidence:
+        class_shape = (rows, BLOCK_VOXELS, self._class_slots)
         return Evidence(
-            instance_ids=np.empty((rows, BLOCK_VOXELS, SLOTS), np.int32),
-            instance_value=np.empty((rows, BLOCK_VOXELS, SLOTS), np.float32),
-            class_ids=np.empty((rows, BLOCK_VOXELS, self._class_slots), np.int16),
-            class_value=np.empty((rows, BLOCK_VOXELS, self._class_slots), np.float32),
+            instance_ids=np.empty((rows, BLOCK_VOXELS, INSTANCE_SLOTS), np.int32),
+            instance_value=np.empty((rows, BLOCK_VOXELS, INSTANCE_SLOTS), np.float32),
+            class_ids=np.empty(class_shape, np.uint8),
+            class_value=np.empty(class_shape, np.int16 if self.storage is Storage.COMPACT else np.int64),
         )
 
-    def _first_classes(self) -> Int16:
+    def _first_classes(self) -> UInt8:
         """What a new voxel's class slots hold: nothing, or in exact storage every class."""
-        named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, -1)
-        return named.astype(np.int16)
+        named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
+        return named.astype(np.uint8)
 
     def _make_room_for_instances(self, new: int) -> None:
         """Doubles the slots until every voxel has `new` free ones."""

@@ -22,12 +22,13 @@ from framework.mapping.association import (
     look_up_instances,
     match_one_to_one,
 )
-from framework.mapping.evidence import Combine, Measurement, Storage, named_classes
+from framework.mapping.evidence import MOST_UNITS, Combine, Measurement, Storage, named_classes
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.integration import Integrator
 from framework.mapping.sensor import Sensor, pinhole
 from framework.parameters import check_bounds
 
+EXACT_BITS = 16  # by which exact storage's units are finer
 VOTES_ACROSS = 320  # pixels of an image row that vote in association: more cost time and tell the same
 
 
@@ -74,6 +75,7 @@ class InstanceFuser(MapFuser):
 
     combine = Combine.SUM  # how new evidence for a label meets the old one
     logarithmic = True  # whether evidence is the logarithm of what it says, or proportional to it
+    units = 64  # that class evidence of 1 has in compact storage
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -184,6 +186,8 @@ class InstanceFuser(MapFuser):
         matched = np.zeros(self.scene.table.last_id + 1, np.bool_)
         matched[instance_ids] = True
         class_gain, named = named_classes(evidence.classes, self.logarithmic)
+        compact = self.storage is Storage.COMPACT
+        units = self.units if compact else self.units << EXACT_BITS
         return Measurement(
             first_point=points.first,
             next_point=points.next,
@@ -192,9 +196,10 @@ class InstanceFuser(MapFuser):
             instance_gain=evidence.instances,
             absence=np.float32(evidence.absence),
             matched=matched,
-            class_gain=class_gain,
+            class_gain=np.rint(class_gain * units).astype(np.int64),
             named_classes=named,
             combine=int(self.combine),
+            most_units=MOST_UNITS if compact else 1 << 62,
         )
 
     def _merge_instances(self, overlaps: Overlaps, instance_ids: Int32) -> None:

@@ -77,6 +77,10 @@ class InstanceMap(SceneMap):
         return self.voxels.byte_count + self.labels.byte_count
 
     @property
+    def evictions(self) -> int:
+        return self.labels.evicted
+
+    @property
     def instance_count(self) -> int:
         """Without the condition on vertices, which takes a mesh."""
         return int(self._counts().sum())

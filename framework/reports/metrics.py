@@ -27,6 +27,7 @@ def run_metrics(result: RunResult) -> Metrics:
         "pose_source": pose_source(result),
         "map.voxels": result.scene.voxel_count,
         "map.bytes": result.scene.byte_count,
+        "map.evictions": result.scene.evictions,
     }
     for stage in STAGES_TIMED:
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]

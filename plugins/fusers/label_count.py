@@ -20,6 +20,7 @@ class LabelCount(InstanceFuser):
 
     combine = Combine.SUM
     logarithmic = False
+    units = 1
 
     def evidence(self, clusters: PointClusters) -> FrameEvidence:
         return FrameEvidence(np.ones(len(clusters), np.float32), only_best(clusters, np.ones(len(clusters))))

@@ -17,6 +17,7 @@ class MaxConfidence(InstanceFuser):
 
     combine = Combine.LARGEST
     logarithmic = False
+    units = 1 << 14  # scores are at most 1
 
     def evidence(self, clusters: PointClusters) -> FrameEvidence:
         scores = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 would be no evidence at all

@@ -5,9 +5,13 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from framework.errors import DataError
 from framework.mapping.evidence import (
+    CLASS_SLOTS,
+    INSTANCE_SLOTS,
+    MOST_UNITS,
     NEW_CLASSES,
-    SLOTS,
+    NO_CLASS,
     Combine,
     Evidence,
     EvidenceRows,
@@ -23,14 +27,15 @@ from framework.mapping.evidence import (
 from framework.mapping.voxel_grid import VoxelGrid
 
 FLOOR = 0.05
+UNITS = 1 << 16  # as fine as in exact storage
 
 
 def blank() -> Evidence:
     return Evidence(
-        np.zeros((1, 512, SLOTS), np.int32),
-        np.zeros((1, 512, SLOTS), np.float32),
-        np.full((1, 512, SLOTS), -1, np.int16),
-        np.zeros((1, 512, SLOTS), np.float32),
+        np.zeros((1, 512, INSTANCE_SLOTS), np.int32),
+        np.zeros((1, 512, INSTANCE_SLOTS), np.float32),
+        np.full((1, 512, CLASS_SLOTS), NO_CLASS, np.uint8),
+        np.zeros((1, 512, CLASS_SLOTS), np.int64),
     )
 
 
@@ -55,9 +60,10 @@ def measured(
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
         matched,
-        gains,
+        np.rint(gains * UNITS).astype(np.int64),
         named,
         int(Combine.SUM),
+        1 << 62,
     )
 
 
@@ -68,7 +74,10 @@ def voted(ids: list[int], weights: list[float], classes: list[int], combine: Com
     gains, named = named_classes(evidence, logarithmic=False)
     every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
     return every._replace(
-        instance_gain=np.array(weights, np.float32), class_gain=gains, named_classes=named, combine=int(combine)
+        instance_gain=np.array(weights, np.float32),
+        class_gain=np.rint(gains * 100).astype(np.int64),
+        named_classes=named,
+        combine=int(combine),
     )
 
 
@@ -78,7 +87,7 @@ def distribution(rng: np.random.Generator, classes: int) -> np.ndarray:
 
 
 @settings(max_examples=60, deadline=None)
-@given(seed=st.integers(0, 10_000), labels=st.integers(1, SLOTS))
+@given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
 def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) -> None:
     """With no more labels than slots, nothing is ever dropped, so posteriors are exact: eqs. [7] and [8]."""
     rng = np.random.default_rng(seed)
@@ -102,8 +111,8 @@ def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) 
     for i, log in found.items():
         assert abs(log - (instance_log[i] - instance_log[0])) < 1e-3
     assert best_instance(evidence, 0, 3) == 1 + np.argmax(instance_log[1:])
-    order = evidence.class_ids[0, 3][: min(classes, SLOTS)]
-    ours = evidence.class_value[0, 3][: len(order)]
+    order = evidence.class_ids[0, 3][: min(classes, CLASS_SLOTS)]
+    ours = evidence.class_value[0, 3][: len(order)] / UNITS
     exact = class_log[order]
     assert np.allclose(ours - ours[0], exact - exact[0], atol=2e-3)
     assert best_class(evidence, 0, 3) == np.argmax(class_log)
@@ -158,15 +167,14 @@ def test_a_cluster_without_instance_says_nothing() -> None:
     evidence = blank()
     update_voxel(evidence, 0, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), np.int32(0))
     assert (evidence.instance_ids == 0).all()
-    assert (evidence.class_ids == -1).all()
+    assert (evidence.class_ids == NO_CLASS).all()
 
 
 def test_class_gains_are_relative_to_the_classes_not_named() -> None:
-    p = np.array([[0.5, 0.2, 0.1, 0.1, 0.04, 0.03, 0.03]])
+    p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
     gains, named = named_classes(np.log(p), logarithmic=True)
-    assert named.tolist() == [[0, 1, 2, 3]]
-    assert NEW_CLASSES == 4
-    rest = (0.04 + 0.03 + 0.03) / 3
+    assert named.tolist() == [list(range(NEW_CLASSES))]
+    rest = p[0, NEW_CLASSES:].mean()
     assert np.allclose(gains, np.log(p / rest), atol=1e-5)
 
 
@@ -196,9 +204,9 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
 
 def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
-    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM) == 1
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
     assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"
-    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM) == 1
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM, np.float32(9)) == 1
     assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
 
 
@@ -246,7 +254,24 @@ def test_counts_are_counts() -> None:
     for _ in range(3):
         assert update_voxel(evidence, 0, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0)) == 0
     assert evidence.instance_value[0, 0].tolist() == [3, 0, 0, 0]
-    assert evidence.class_value[0, 0].tolist() == [3, 0, 0, 0]
+    assert evidence.class_value[0, 0, 0] == 300, "units"
+    assert evidence.class_ids[0, 0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
+
+
+def test_small_numbers_saturate_and_do_not_wrap() -> None:
+    evidence = blank()._replace(class_value=np.zeros((1, 512, CLASS_SLOTS), np.int16))
+    said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(most_units=MOST_UNITS)
+    gains = said.class_gain * 0
+    gains[:, 2], gains[:, 3] = 30_000, -30_000
+    for _ in range(4):
+        update_voxel(evidence, 0, 0, said._replace(class_gain=gains), np.int32(0))
+    assert evidence.class_value[0, 0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
+    assert best_class(evidence, 0, 0) == 2
+
+
+def test_too_many_classes_are_refused() -> None:
+    with pytest.raises(DataError, match="255 classes apart, and the detector has 256"):
+        EvidenceRows(VoxelGrid(0.01, 0.05, 10)).begin(256)
 
 
 def test_a_voxel_that_was_never_named_has_no_class_in_either_storage() -> None:
@@ -276,7 +301,7 @@ def test_exact_storage_never_forgets() -> None:
         assert update_voxel(rows.evidence, 0, 0, measurement, np.int32(0)) == 0
         class_log += np.log(p).sum(axis=0)
         instance_log[ids] += np.log(0.9 / FLOOR)
-    labels, values = rows.evidence.class_ids[0, 0], rows.evidence.class_value[0, 0]
+    labels, values = rows.evidence.class_ids[0, 0], rows.evidence.class_value[0, 0] / UNITS
     assert sorted(labels.tolist()) == list(range(30))
     assert np.allclose(values - values[0], class_log[labels] - class_log[labels[0]], atol=1e-2)
     named = rows.evidence.instance_ids[0, 0] > 0
