@@ -8,6 +8,7 @@ an object still finds the whole.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +23,13 @@ from framework.mapping.voxel_grid import Grid, find_block
 from framework.mapping.voxel_walk import voxel_number
 
 
+class OverlapRule(Enum):
+    """What shared pixels are compared with."""
+
+    SMALLER = "the smaller of cluster and instance: a part of an object still finds the whole"
+    IOU = "all pixels of either"
+
+
 @dataclass(frozen=True)
 class Overlaps:
     """How N clusters lie on the M instances that the frame sees."""
@@ -30,6 +38,15 @@ class Overlaps:
     visible: Int32  # (M,) pixels that see each instance
     sizes: Int32  # (N,) pixels of each cluster
     votes: Int32  # (N, M) pixels of both
+
+    def by(self, rule: OverlapRule, least: int) -> npt.NDArray[np.float64]:
+        """(N, M) overlaps in [0, 1] by either rule, with `least` as in `over_smaller`."""
+        return self.over_smaller(least) if rule is OverlapRule.SMALLER else self.over_union(least)
+
+    def over_union(self, least: int) -> npt.NDArray[np.float64]:
+        """(N, M) shared pixels over those of cluster or visible instance, counted as at least `least`, in [0, 1]."""
+        union = self.sizes[:, None] + self.visible[None, :] - self.votes
+        return np.asarray(self.votes / np.maximum(union, least))
 
     def over_smaller(self, least: int) -> npt.NDArray[np.float64]:
         """(N, M) shared pixels over the smaller of cluster and visible instance, in [0, 1].
@@ -138,6 +155,11 @@ def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1
         sizes=votes.sum(axis=1, dtype=np.int32) * stride**2,
         votes=votes[:, :-1] * stride**2,
     )
+
+
+def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
+    """(N, M) how alike distributions (N, C) and (M, C) are: their Bhattacharyya coefficient, in [0, 1], 1 = equal."""
+    return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 
 def match_one_to_one(overlap: npt.NDArray[np.float64], threshold: float) -> Int32:

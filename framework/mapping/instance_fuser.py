@@ -14,8 +14,10 @@ from framework.data import Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
 from framework.interfaces import MapFuser
 from framework.mapping.association import (
+    OverlapRule,
     Overlaps,
     PixelLists,
+    class_agreement,
     count_overlaps,
     cover_another,
     list_points_by_pixel,
@@ -62,7 +64,9 @@ class InstanceFuser(MapFuser):
     full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
     max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
     label_band: float = 2.0  # voxels, >= 1: label evidence goes to voxels within this distance of the measured surface
-    overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap over the smaller of the two
+    overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap
+    overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
+    class_gate: float = 0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
     duplicate_overlap: float = 0.6  # in (0, 1]: a cluster that shares this with a better one creates nothing
@@ -90,6 +94,7 @@ class InstanceFuser(MapFuser):
             max_blocks=(1, 2**31 // 512),
             label_band=(1.0, self.truncation),
             overlap=(0.0, 1.0),
+            class_gate=(0.0, 1.0),
             create_score=(0.0, 1.0),
             create_points=(1, 2**31),
             duplicate_overlap=(0.0, 1.0),
@@ -158,7 +163,12 @@ class InstanceFuser(MapFuser):
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame: Frame) -> Int32:
         """(N,) the instance of each cluster, an old or a new one; 0 = none."""
-        match = match_one_to_one(overlaps.over_smaller(self.create_points), self.overlap)
+        overlap = overlaps.by(self.overlap_rule, self.create_points)
+        if self.class_gate > 0 and overlap.size:
+            table = self.scene.table
+            known = np.stack([table.class_probabilities(table.records[int(k)]) for k in overlaps.instance_ids])
+            overlap[class_agreement(clusters.class_probabilities, known) < self.class_gate] = 0
+        match = match_one_to_one(overlap, self.overlap)
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (
             (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)

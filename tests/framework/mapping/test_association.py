@@ -7,7 +7,13 @@ from hypothesis import strategies as st
 
 from framework.data import PointClusters
 from framework.errors import DataError
-from framework.mapping.association import count_overlaps, cover_another, list_points_by_pixel, match_one_to_one
+from framework.mapping.association import (
+    class_agreement,
+    count_overlaps,
+    cover_another,
+    list_points_by_pixel,
+    match_one_to_one,
+)
 
 SHAPE = (4, 5)
 
@@ -41,7 +47,15 @@ def test_votes_are_pixels_shared() -> None:
     assert overlaps.sizes.tolist() == [12, 8, 4]
     assert overlaps.votes.tolist() == [[0, 8], [4, 0], [0, 0]]
     assert overlaps.over_smaller(least=1).tolist() == [[0, 1], [1, 0], [0, 0]]
+    assert overlaps.over_union(least=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
+    assert overlaps.over_union(least=16).tolist() == [[0, 8 / 16], [4 / 16, 0], [0, 0]]
     assert overlaps.over_smaller(least=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
+
+
+def test_classes_agree_by_their_bhattacharyya_coefficient() -> None:
+    clusters = np.float32([[1, 0, 0], [0.5, 0.5, 0]])
+    instances = np.float32([[1, 0, 0], [0, 0, 1]])
+    assert np.allclose(class_agreement(clusters, instances), [[1, 0], [0.5**0.5, 0]])
 
 
 def test_nothing_seen_and_nothing_detected() -> None:

@@ -9,6 +9,7 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError, MapFullError
 from framework.geometry import lift
+from framework.mapping.association import OverlapRule
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.analytic_scene import CAMERA, Scene, room, walk
 
@@ -37,7 +38,7 @@ def fused(fuser: BayesianTsdf, frame: Frame, masks: list[np.ndarray], scores: li
     fuser.fuse(frame, pose, lift(detections(masks, scores), frame, pose))
 
 
-def new_fuser(**parameters: float) -> BayesianTsdf:
+def new_fuser(**parameters: object) -> BayesianTsdf:
     return BayesianTsdf(voxel_size=0.02, max_depth=4.0, **parameters)  # type: ignore[arg-type]
 
 
@@ -64,6 +65,25 @@ def test_a_weak_detection_updates_but_does_not_create(frames: list[Frame]) -> No
     [record] = fuser.scene.table.records.values()
     assert record.observations == 2
     assert record.score_sum == pytest.approx(1.1)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "updates"),
+    [
+        ({}, True),
+        ({"overlap_rule": OverlapRule.IOU}, False),  # a part shares little of all that is covered
+        ({"class_gate": 0.9}, True),
+        ({"class_gate": 1.0}, False),  # the floor alone keeps distributions from agreeing wholly
+    ],
+)
+def test_what_must_overlap_and_agree_is_a_parameter(frames: list[Frame], parameters: dict, updates: bool) -> None:
+    fuser = new_fuser(**parameters)
+    whole = masks_of(frames[0])[0]
+    u = np.nonzero(whole)[1]
+    part = whole & (np.arange(CAMERA.width) < np.quantile(u, 0.3))
+    fused(fuser, frames[0], [whole], [0.9])
+    fused(fuser, frames[0], [part], [0.9])
+    assert (len(fuser.scene.table.records) == 1) == updates
 
 
 def test_the_same_object_detected_twice_is_created_once(frames: list[Frame]) -> None:

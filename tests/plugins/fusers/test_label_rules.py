@@ -1,0 +1,57 @@
+"""What the fusers make of the same three detections of one object."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, Pose
+from framework.geometry import lift
+from framework.mapping.instance_fuser import InstanceFuser
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.fusers.label_count import LabelCount
+from plugins.fusers.last_write import LastWrite
+from plugins.fusers.max_confidence import MaxConfidence
+from tests.analytic_scene import CAMERA, room, walk
+
+SEEN = [(0.5, [0.6, 0.3, 0.1]), (0.9, [0.2, 0.1, 0.7]), (0.4, [0.6, 0.4, 0.0])]
+"""Score and distribution over three classes, frame by frame."""
+
+
+def product() -> np.ndarray:
+    p = np.prod([0.9 * np.array(p) + 0.1 / 3 for _, p in SEEN], axis=0)
+    return np.asarray(p / p.sum())
+
+
+@pytest.mark.parametrize(
+    ("fuser_class", "expected"),
+    [
+        (BayesianTsdf, product()),
+        (LabelCount, [2 / 3, 0, 1 / 3]),
+        (LastWrite, [1, 0, 0]),
+        (MaxConfidence, [0.5 / 1.4, 0, 0.9 / 1.4]),  # the best score of each class
+    ],
+)
+def test_each_rule_has_its_own_opinion(fuser_class: type[InstanceFuser], expected: np.ndarray) -> None:
+    fuser = fuser_class(voxel_size=0.02, max_depth=4.0)
+    for k, (T, (score, probabilities)) in enumerate(zip(walk(3), SEEN, strict=True)):
+        frame = room().frame(T, k)
+        assert frame.truth is not None
+        mask = frame.truth.instance_ids == min(frame.truth.class_names)
+        detections = Detections(
+            mask[None],
+            np.zeros((1, 4), np.float32),
+            np.float32([score]),
+            np.float32([probabilities]),
+            ("chair", "bed", "couch"),
+        )
+        fuser.fuse(frame, Pose(T), lift(detections, frame, Pose(T)))
+    [instance] = fuser.scene.instances().values()
+    assert np.allclose(instance.class_probabilities, expected, atol=1e-5)
+    assert (instance.first_frame, instance.last_frame) == (0, 2)
+    # the voxels agree with the table, except that each saw but some of the frames
+    view = fuser.scene.render(CAMERA, walk(3)[1])
+    classes = view.class_ids[view.instance_ids == instance.id]
+    assert np.bincount(classes).argmax() == np.argmax(expected)
+    if fuser_class is not BayesianTsdf:
+        assert 1 not in classes, "only the best class of a detection counts"
