@@ -69,6 +69,8 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
         "steps": trainer.step,
         "batch": schedule.batch,
         "seed": int(config.seed),
+        "bfloat16": schedule.bfloat16,
+        "limits": "trained on rendered rooms only, at 320x240; of photographs it knows nothing",
     }
     save_network(trainer.trained(), folder / NETWORK, card, half=True)
     node = {"_target_": DETECTOR, "weights": str((folder / NETWORK).absolute()), "device": device}

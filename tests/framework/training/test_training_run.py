@@ -44,7 +44,8 @@ def test_it_leaves_a_network_that_goes_on_and_is_told_what_it_is(tmp_path: Path)
     assert described.architecture == architecture(config(tmp_path).network)
     assert len(described.architecture.classes) == 9
     other = f"network.start_from={tmp_path / 'run' / NETWORK}"
-    train(config(tmp_path / "rooms", "schedule.steps=1", other), tmp_path / "tuned")
+    train(config(tmp_path / "rooms", "schedule.steps=1", "schedule.bfloat16=true", other), tmp_path / "tuned")
+    assert describe_network(tmp_path / "tuned" / NETWORK).card["bfloat16"] is True
 
 
 def test_a_backbone_that_there_is_not(tmp_path: Path) -> None:

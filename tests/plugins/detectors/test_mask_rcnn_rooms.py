@@ -1,0 +1,52 @@
+"""The network that comes with the project, on rooms that it was never trained on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Frame
+from framework.detection.network_file import describe_network
+from framework.evaluation.mask_ap import mask_ap
+from framework.label_spaces import SCENENN_TO_COCO
+from framework.training.augmentation import SMALLEST
+from framework.training.room_pictures import RoomPictures, render_rooms
+from plugins.detectors.mask_rcnn import MaskRCNNDetector
+from tests import registered
+
+ROOMS = 2_000_000  # neither trained on nor held out in training
+MOST_BYTES = 20 << 20
+
+
+@pytest.fixture(scope="module")
+def detector() -> MaskRCNNDetector:
+    detector = registered.built("detector", "mask_rcnn_rooms", "device=cpu")
+    assert isinstance(detector, MaskRCNNDetector)
+    return detector
+
+
+def test_it_is_small_and_says_what_it_is(detector: MaskRCNNDetector) -> None:
+    assert Path(detector.weights).stat().st_size < MOST_BYTES
+    assert set(detector.classes) == set(SCENENN_TO_COCO.values())
+    card = describe_network(Path(detector.weights)).card
+    assert {"data", "steps", "seed", "mask_ap50", "limits"} <= set(card)
+    assert isinstance(card["mask_ap50"], float)
+    assert card["mask_ap50"] >= 0.5, "over the nine classes, on rooms held out in training"
+
+
+def test_it_finds_objects_in_rooms_that_nobody_has_seen(detector: MaskRCNNDetector, tmp_path: Path) -> None:
+    """Few pictures, so a loose bound: what it reaches on many is in its card."""
+    render_rooms(tmp_path, ROOMS, 2, 10, 1)
+    pictures = RoomPictures(tmp_path, ROOMS, 2)
+    found = []
+    for k in range(len(pictures)):
+        example = pictures[k]
+        height, width = example.color.shape[:2]
+        camera = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
+        frame = Frame(k, float(k), example.color, np.zeros((height, width), np.float32), camera)
+        found.append((example.masks, example.class_names, detector.detect(frame)))
+    precision = mask_ap(found, detector.classes, SMALLEST)
+    assert precision.objects >= 30
+    assert precision.ap50 >= 0.4
