@@ -198,29 +198,33 @@ def _slot(table: Int32, cells: Int64, x: int, y: int, z: int) -> int:
 def _cores(xyz: Float32, table: Int32, cells: Int64, starts: Int64, eps: float, min_points: int) -> Bool:
     """(P,) which points, in the order of their cells, are core points."""
     is_core = np.ones(len(xyz), np.bool_)
+    around = np.empty(2 * len(OFFSETS), np.int32)
     for c in range(len(cells)):
         if starts[c + 1] - starts[c] >= min_points:
             continue  # the cell alone is dense
+        n = 0
+        for o in range(2 * len(OFFSETS)):
+            a, sign = o // 2, 1 - 2 * (o % 2)
+            x, y, z = cells[c, 0] + sign * OFFSETS[a, 0], cells[c, 1] + sign * OFFSETS[a, 1], cells[c, 2]
+            other = table[_slot(table, cells, x, y, z + sign * OFFSETS[a, 2])]
+            if other >= 0:
+                around[n] = other
+                n += 1
         for s in range(starts[c], starts[c + 1]):
-            is_core[s] = _has_neighbors(xyz, s, c, table, cells, starts, eps, min_points)
+            is_core[s] = _has_neighbors(xyz, s, starts[c + 1] - starts[c], around[:n], starts, eps, min_points)
     return is_core
 
 
 @njit(cache=True, nogil=True)
 def _has_neighbors(
-    xyz: Float32, s: int, c: int, table: Int32, cells: Int64, starts: Int64, eps: float, min_points: int
+    xyz: Float32, s: int, count: int, around: Int32, starts: Int64, eps: float, min_points: int
 ) -> bool:
-    count = starts[c + 1] - starts[c]
-    for o in range(2 * len(OFFSETS)):
-        a, sign = o // 2, 1 - 2 * (o % 2)
-        x, y, z = (cells[c, 0] + sign * OFFSETS[a, 0], cells[c, 1] + sign * OFFSETS[a, 1],
-                   cells[c, 2] + sign * OFFSETS[a, 2])  # fmt: skip
-        other = table[_slot(table, cells, x, y, z)]
-        if other >= 0:
-            for t in range(starts[other], starts[other + 1]):
-                count += _are_near(xyz[s], xyz[t], eps)
-                if count >= min_points:
-                    return True
+    """Whether `count` and the points near point s in the cells `around` are at least `min_points`."""
+    for other in around:
+        for t in range(starts[other], starts[other + 1]):
+            count += _are_near(xyz[s], xyz[t], eps)
+            if count >= min_points:
+                return True
     return False
 
 
