@@ -22,17 +22,14 @@ MARGIN = 1e-6  # relative, by which cells are smaller, so that rounding takes no
 
 
 def _offsets() -> Int64:
-    """(62, 3) the half of the neighboring cells that within eps can reach, the touching ones first.
-
-    Most pairs of cells are united through the touching ones, which is quickly told.
-    """
+    """(124, 3) the neighboring cells that within eps can reach, the touching ones first."""
     side = np.arange(-REACH, REACH + 1)
     cells = np.stack(np.meshgrid(side, side, side, indexing="ij"), axis=-1).reshape(-1, 3)
-    later = cells[len(cells) // 2 + 1 :]
-    return np.asarray(later[np.argsort((later**2).sum(axis=1), kind="stable")], np.int64)
+    cells = cells[np.argsort((cells**2).sum(axis=1), kind="stable")]
+    return np.asarray(cells[1:], np.int64)
 
 
-OFFSETS = _offsets()
+AROUND = _offsets()
 
 
 @dataclass
@@ -198,27 +195,29 @@ def _slot(table: Int32, cells: Int64, x: int, y: int, z: int) -> int:
 def _cores(xyz: Float32, table: Int32, cells: Int64, starts: Int64, eps: float, min_points: int) -> Bool:
     """(P,) which points, in the order of their cells, are core points."""
     is_core = np.ones(len(xyz), np.bool_)
-    around = np.empty(2 * len(OFFSETS), np.int32)
+    around = np.empty(len(AROUND), np.int32)
     for c in range(len(cells)):
-        if starts[c + 1] - starts[c] >= min_points:
-            continue  # the cell alone is dense
-        n = 0
-        for o in range(2 * len(OFFSETS)):
-            a, sign = o // 2, 1 - 2 * (o % 2)
-            x, y, z = cells[c, 0] + sign * OFFSETS[a, 0], cells[c, 1] + sign * OFFSETS[a, 1], cells[c, 2]
-            other = table[_slot(table, cells, x, y, z + sign * OFFSETS[a, 2])]
-            if other >= 0:
-                around[n] = other
-                n += 1
-        for s in range(starts[c], starts[c + 1]):
-            is_core[s] = _has_neighbors(xyz, s, starts[c + 1] - starts[c], around[:n], starts, eps, min_points)
+        if starts[c + 1] - starts[c] < min_points:  # else the cell alone is dense
+            n = _cells_around(table, cells, cells[c, 0], cells[c, 1], cells[c, 2], around)
+            for s in range(starts[c], starts[c + 1]):
+                is_core[s] = _has_neighbors(xyz, s, starts[c + 1] - starts[c], around[:n], starts, eps, min_points)
     return is_core
 
 
 @njit(cache=True, nogil=True)
-def _has_neighbors(
-    xyz: Float32, s: int, count: int, around: Int32, starts: Int64, eps: float, min_points: int
-) -> bool:
+def _cells_around(table: Int32, cells: Int64, x: int, y: int, z: int, around: Int32) -> int:
+    """Fills `around` with the occupied cells within reach of the cell at x, y, z, without itself; their number."""
+    n = 0
+    for o in range(len(AROUND)):
+        other = table[_slot(table, cells, x + AROUND[o, 0], y + AROUND[o, 1], z + AROUND[o, 2])]
+        if other >= 0:
+            around[n] = other
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def _has_neighbors(xyz: Float32, s: int, count: int, around: Int32, starts: Int64, eps: float, min_points: int) -> bool:
     """Whether `count` and the points near point s in the cells `around` are at least `min_points`."""
     for other in around:
         for t in range(starts[other], starts[other + 1]):
@@ -241,13 +240,13 @@ def _pieces(xyz: Float32, is_core: Bool, table: Int32, cells: Int64, starts: Int
     for c in range(len(cells)):
         if is_core[starts[c] : starts[c + 1]].any():
             parents[c] = c
-    for o in range(len(OFFSETS)):
+    for o in range(len(AROUND)):  # touching cells first: most others are then united already
         for c in range(len(cells)):
             if parents[c] < 0:
                 continue
-            x, y, z = cells[c, 0] + OFFSETS[o, 0], cells[c, 1] + OFFSETS[o, 1], cells[c, 2] + OFFSETS[o, 2]
+            x, y, z = cells[c, 0] + AROUND[o, 0], cells[c, 1] + AROUND[o, 1], cells[c, 2] + AROUND[o, 2]
             other = table[_slot(table, cells, x, y, z)]
-            if other < 0 or parents[other] < 0:
+            if other < c or parents[other] < 0:  # each pair once
                 continue
             a, b = _root(parents, c), _root(parents, other)
             if a != b and _touch(xyz, is_core, starts, c, other, eps):
@@ -287,10 +286,9 @@ def _is_near(
     own = table[_slot(table, cells, x, y, z)]
     if own >= 0 and pieces[own] >= 0 and pieces[own] == piece:
         return True
-    for o in range(2 * len(OFFSETS)):
-        a, sign = o // 2, 1 - 2 * (o % 2)
-        other = table[_slot(table, cells, x + sign * OFFSETS[a, 0], y + sign * OFFSETS[a, 1], z + sign * OFFSETS[a, 2])]
-        if other >= 0 and pieces[other] == piece:
+    around = np.empty(len(AROUND), np.int32)
+    for other in around[: _cells_around(table, cells, x, y, z, around)]:
+        if pieces[other] == piece:
             for t in range(starts[other], starts[other + 1]):
                 if is_core[t] and _are_near(point, xyz[t], eps):
                     return True

@@ -69,7 +69,9 @@ def test_a_noisy_room_has_the_planes_of_open3d():
         assert planes.normals[k] @ (-m / np.linalg.norm(m)) > np.cos(np.deg2rad(0.3))
         assert 1 / np.linalg.norm(planes.m[k]) == pytest.approx(1 / np.linalg.norm(m), abs=0.01)
         assert planes.deviations[k] == pytest.approx(0.002, rel=0.2)
-    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector((rays() * depth[..., None])[::4, ::4].reshape(-1, 3)))
+    cloud = open3d.geometry.PointCloud(
+        open3d.utility.Vector3dVector((rays() * depth[..., None])[::4, ::4].reshape(-1, 3))
+    )
     open3d.utility.random.seed(0)
     (a, b, c, d), _ = cloud.segment_plane(0.03, 3, 500)
     k = nearest(planes, np.array([a, b, c]) / -d)

@@ -35,7 +35,8 @@ def blobs(seed: int, count: int = 1500) -> np.ndarray:
     sigmas = rng.uniform(0.02, 0.08, 4)
     which = rng.integers(0, 4, count)
     dense = centers[which] + rng.normal(size=(count, 3)) * sigmas[which, None]
-    return (np.concatenate([dense, rng.uniform(-0.6, 0.6, (count // 5, 3))]) + [-3, 5, 2]).astype(np.float32)
+    everywhere = rng.uniform(-0.6, 0.6, (count // 5, 3))
+    return (np.concatenate([dense, everywhere]) + np.array([-3, 5, 2])).astype(np.float32)
 
 
 def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
@@ -93,7 +94,9 @@ def test_of_two_equal_pieces_the_first_stays():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (50, 3))
     for offset in (1.0, -1.0):
-        refined = Dbscan(eps=0.05, min_points=5, stride=1).refine(clusters_of(np.concatenate([ball, ball + offset])), FRAME)
+        refined = Dbscan(eps=0.05, min_points=5, stride=1).refine(
+            clusters_of(np.concatenate([ball, ball + offset])), FRAME
+        )
         np.testing.assert_array_equal(refined.pixels[:, 0], np.arange(50))
 
 

@@ -42,7 +42,7 @@ def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Fr
 
 def heights(frame: Frame, pitch: float = PITCH) -> np.ndarray:
     """(H, W) m above the floor."""
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    v = np.arange(CAMERA.height)[:, None]
     return 1.2 - (np.cos(pitch) * (v - CAMERA.cy) / CAMERA.fy + np.sin(pitch)) * frame.depth
 
 
@@ -120,7 +120,7 @@ def test_a_screen_before_a_wall_keeps_its_front_and_loses_the_wall():
 def test_a_door_in_the_wall_shows_little_behind_it():
     """With a twentieth of the wall open it is structure, with a third of it it could be the side of a cupboard."""
     for width, dropped in ((12, True), (100, False)):
-        frame, ids = scene(BOX)
+        frame, _ = scene(BOX)
         depth = frame.depth.copy()
         door = (np.arange(320) < width) & (heights(frame) > 0.05)
         depth[door] = np.minimum(depth[door] * 1.5, 9.0)

@@ -54,7 +54,9 @@ def slow_groups(points: np.ndarray, k: int, threshold: float) -> np.ndarray:
 
 def blobs(seed: int, count: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    return (rng.normal(size=(count, 3)) * 0.1 + rng.uniform(-0.3, 0.3, (3, 3))[rng.integers(0, 3, count)]).astype(np.float32)
+    return (rng.normal(size=(count, 3)) * 0.1 + rng.uniform(-0.3, 0.3, (3, 3))[rng.integers(0, 3, count)]).astype(
+        np.float32
+    )
 
 
 def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
@@ -92,7 +94,7 @@ def test_the_definition_splits_the_sets_that_are_compared():
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
 def test_two_separated_blobs_come_apart_whatever_their_scale(scale):
     rng = np.random.default_rng(0)
-    small, large = rng.normal(0, 0.05, (200, 3)), rng.normal(0, 0.05, (300, 3)) + [0.0, 0.6, 0.0]
+    small, large = rng.normal(0, 0.05, (200, 3)), rng.normal(0, 0.05, (300, 3)) + np.array([0.0, 0.6, 0.0])
     points = (np.concatenate([small, large]) * scale).astype(np.float32)
     groups = rank_order_groups(points, 16, 1.0)
     assert not set(groups[:200]) & set(groups[200:])
