@@ -149,7 +149,7 @@ def _length(m: Float64) -> float:
 @njit(cache=True, nogil=True)
 def _lies_in(moment: Float64, m: Float64, distance: float, noise: float) -> bool:
     """A point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
-    return _deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0]
+    return bool(_deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0])
 
 
 @njit(cache=True, nogil=True)
@@ -157,7 +157,7 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
     """m^2 of the plane that the cell's readings stand for: each for spacing^2 z^2 / |n . r| = spacing^2 |m| z^3."""
     n = moment[0]
     z = n / moment[6]
-    return n * spacing * spacing * _length(m) * z * z * z
+    return float(n * spacing * spacing * _length(m) * z * z * z)
 
 
 @njit(cache=True, nogil=True)
