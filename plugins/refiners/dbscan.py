@@ -48,7 +48,7 @@ class Dbscan(ClusterRefiner):
     left as it is. A dropped point leaves the arrays, clusters keep their index.
     """
 
-    eps: float = 0.03  # m, from 0.001
+    eps: float = 0.04  # m, from 0.001
     eps_per_depth: float = 0.01  # m per m, from 0; the spacing of readings grows with depth
     min_points: int = 10  # from 1
     stride: int = 2  # px, from 1; 1 = no thinning
@@ -103,7 +103,7 @@ def _median_depth(pixels: Int32, members: Int64, depth: Float32) -> float:
     depths = np.empty(len(members), np.float32)
     for j, i in enumerate(members):
         depths[j] = depth[pixels[i, 1], pixels[i, 0]]
-    return np.median(depths)
+    return float(np.median(depths))
 
 
 @njit(cache=True, nogil=True)
@@ -230,7 +230,7 @@ def _has_neighbors(xyz: Float32, s: int, count: int, around: Int32, starts: Int6
 @njit(cache=True, nogil=True)
 def _are_near(p: Float32, q: Float32, eps: float) -> bool:
     x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
-    return x * x + y * y + z * z <= eps * eps
+    return bool(x * x + y * y + z * z <= eps * eps)
 
 
 @njit(cache=True, nogil=True)

@@ -25,7 +25,7 @@ class PlaneRemoval(ClusterRefiner):
     fills the image is the table's. A dropped point leaves the arrays, clusters keep their index.
     """
 
-    distance: float = 0.02  # m, from 0, from the plane; three standard deviations of the plane's own noise come on top
+    distance: float = 0.01  # m, from 0, from the plane; three standard deviations of the plane's own noise come on top
     noise: float = 0.003  # 1/m, from 0, of inverse depth, up to which a plane is one: 3 mm at 1 m, 27 mm at 3 m
     min_area: float = 0.8  # m^2, from 0, seen of a plane
     min_share: float = 0.04  # in [0, 1], of the frame's readings on a plane

@@ -41,7 +41,7 @@ class RankOrder(ClusterRefiner):
     """
 
     neighbors: int = 16  # from 2, k
-    threshold: float = 0.7  # from 0
+    threshold: float = 1.0  # from 0
     max_points: int = 500  # from 10, of a cluster that are compared
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int3
 def _distance(nearest: Int32, ranks: UInt8, a: int, b: int) -> float:
     """D(a, b). A rank beyond the k-th is never the smaller one: one of the two is among the k nearest of the other."""
     shared_rank = min(ranks[a, b], ranks[b, a])
-    return (_unshared(nearest, ranks, a, b) + _unshared(nearest, ranks, b, a)) / shared_rank
+    return float((_unshared(nearest, ranks, a, b) + _unshared(nearest, ranks, b, a)) / shared_rank)
 
 
 @njit(cache=True, nogil=True)
@@ -191,7 +191,7 @@ def _insert(distance: float, index: int, distances: Float64, found: Int32) -> No
 @njit(cache=True, nogil=True)
 def _squared_distance(p: Float32, q: Float32) -> float:
     x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
-    return x * x + y * y + z * z
+    return float(x * x + y * y + z * z)
 
 
 @njit(cache=True, nogil=True)

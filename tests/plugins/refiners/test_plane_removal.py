@@ -134,13 +134,13 @@ def test_floors_only():
     """With a tilt of 60 degrees the wall counts no longer, the floor does."""
     frame, ids = scene(BOX)
     mask = np.ones(CAMERA.shape, bool)
-    refiner = PlaneRemoval(max_tilt=60.0, max_own=1.0 - 1e-9)
+    refiner = PlaneRemoval(distance=0.02, max_tilt=60.0, max_own=1.0 - 1e-9)
     others = np.zeros_like(mask)
     others[:, :100] = True
     [left] = masks_of(refiner.refine(lifted(frame, others), frame))
     floor = np.abs(heights(frame)) <= 0.02
     np.testing.assert_array_equal(left, others & ~floor)
-    [left] = masks_of(PlaneRemoval(max_own=1.0 - 1e-9).refine(lifted(frame, others), frame))
+    [left] = masks_of(PlaneRemoval(distance=0.02, max_own=1.0 - 1e-9).refine(lifted(frame, others), frame))
     assert left.sum() < 0.01 * others.sum()
     assert ids.any()
 
