@@ -18,6 +18,7 @@ from framework.refinement.selection import keep_points
 Int64 = npt.NDArray[np.int64]
 
 REACH = 2  # cells on each side that eps spans, with cells whose diagonal is eps
+NEAR, FAR, UNCLEAR = 0, 1, 2  # what a cell tells about the distance of its points to a piece
 MARGIN = 1e-6  # relative, by which cells are smaller, so that rounding takes no two points of one cell apart
 
 
@@ -124,8 +125,28 @@ def _keep_largest_of(
     largest = np.argmax(core_counts)
     if core_counts[largest] == 0:
         return
+    clear = np.empty(len(cells), np.int8)
+    for c in range(len(cells)):
+        clear[c] = _clear_case(c, table, cells, pieces, largest)
     for j in range(len(points)):
-        kept[members[j]] = _is_near(points[j], size, xyz, is_core, table, cells, starts, pieces, largest, eps)
+        x, y, z = _coordinates(points[j], size)
+        own = table[_slot(table, cells, x, y, z)]
+        case = UNCLEAR if own < 0 else clear[own]
+        kept[members[j]] = case == NEAR or (
+            case == UNCLEAR and _is_near(points[j], x, y, z, xyz, is_core, table, cells, starts, pieces, largest, eps)
+        )
+
+
+@njit(cache=True, nogil=True)
+def _clear_case(c: int, table: Int32, cells: Int64, pieces: Int32, piece: int) -> int:
+    """Whether all points of the cell are NEAR the piece, FAR from it, or each has to be looked at."""
+    if pieces[c] == piece:
+        return NEAR
+    around = np.empty(len(AROUND), np.int32)
+    for other in around[: _cells_around(table, cells, cells[c, 0], cells[c, 1], cells[c, 2], around)]:
+        if pieces[other] == piece:
+            return UNCLEAR
+    return FAR
 
 
 @njit(cache=True, nogil=True)
@@ -278,14 +299,10 @@ def _touch(xyz: Float32, is_core: Bool, starts: Int64, c: int, other: int, eps: 
 
 @njit(cache=True, nogil=True)
 def _is_near(
-    point: Float32, size: float, xyz: Float32, is_core: Bool, table: Int32, cells: Int64, starts: Int64,
+    point: Float32, x: int, y: int, z: int, xyz: Float32, is_core: Bool, table: Int32, cells: Int64, starts: Int64,
     pieces: Int32, piece: int, eps: float,
 ) -> bool:  # fmt: skip
-    """Whether the point is within eps of a core point of the piece."""
-    x, y, z = _coordinates(point, size)
-    own = table[_slot(table, cells, x, y, z)]
-    if own >= 0 and pieces[own] >= 0 and pieces[own] == piece:
-        return True
+    """Whether a point of the cell at x, y, z, which holds no core point of the piece, is within eps of one."""
     around = np.empty(len(AROUND), np.int32)
     for other in around[: _cells_around(table, cells, x, y, z, around)]:
         if pieces[other] == piece:

@@ -74,10 +74,10 @@ def _keep_largest(
             sampled = _sampled(pixels, members, max_points)
             groups = rank_order_groups(points[sampled], neighbors, threshold)
             largest = np.argmax(np.bincount(groups))
-            by_axis, axis = _along_widest_axis(points[sampled])
-            xyz = points[sampled[by_axis]]
+            axis = _widest_axis(points[sampled])
+            names, swept = _sweep(points[sampled], axis)
             for i in members:
-                kept[i] = groups[by_axis[_nearest(points[i], xyz, axis, by_axis)]] == largest
+                kept[i] = groups[names[_nearest(points[i], axis, swept, names)]] == largest
 
 
 @njit(cache=True, nogil=True)
@@ -154,25 +154,26 @@ def nearest_neighbors(points: Float32, neighbors: int) -> Int32:
     """(P, min(`neighbors`, P - 1)) of each point the nearest others, nearest first; of equally near the first."""
     n = len(points)
     k = min(neighbors, n - 1)
-    by_axis, axis = _along_widest_axis(points)
-    xyz = points[by_axis]
+    names, swept = _sweep(points, _widest_axis(points))
+    x, y, z = swept
     nearest, distances = np.empty((n, k), np.int32), np.empty(k)
     for s in range(n):
         distances[:] = np.inf
-        found = nearest[by_axis[s]]
+        found = nearest[names[s]]
         found[:] = n
         left, right = s - 1, s + 1
         while k > 0 and (left >= 0 or right < n):
-            step_left = np.float64(xyz[s, axis]) - xyz[left, axis] if left >= 0 else np.inf
-            step_right = np.float64(xyz[right, axis]) - xyz[s, axis] if right < n else np.inf
-            t, step = (left, step_left) if step_left <= step_right else (right, step_right)
-            if step * step > distances[k - 1]:
+            step_left = x[s] - x[left] if left >= 0 else np.inf
+            step_right = x[right] - x[s] if right < n else np.inf
+            if min(step_left, step_right) ** 2 > distances[k - 1]:
                 break
-            if t == left:
-                left -= 1
+            if step_left <= step_right:
+                t, left = left, left - 1
             else:
-                right += 1
-            _insert(_squared_distance(xyz[s], xyz[t]), by_axis[t], distances, found)
+                t, right = right, right + 1
+            distance = (x[s] - x[t]) ** 2 + (y[s] - y[t]) ** 2 + (z[s] - z[t]) ** 2
+            if distance <= distances[k - 1]:
+                _insert(distance, names[t], distances, found)
     return nearest
 
 
@@ -189,39 +190,45 @@ def _insert(distance: float, index: int, distances: Float64, found: Int32) -> No
 
 
 @njit(cache=True, nogil=True)
-def _squared_distance(p: Float32, q: Float32) -> float:
-    x, y, z = np.float64(p[0]) - q[0], np.float64(p[1]) - q[1], np.float64(p[2]) - q[2]
-    return float(x * x + y * y + z * z)
-
-
-@njit(cache=True, nogil=True)
-def _along_widest_axis(points: Float32) -> tuple[Int64, int]:
-    """The order of the points along the axis on which they spread most, where a sweep meets the fewest."""
+def _widest_axis(points: Float32) -> int:
+    """The axis on which the points spread most: there a sweep meets the fewest."""
     axis, widest = 0, np.float32(-1.0)
     for a in range(3):
         extent = points[:, a].max() - points[:, a].min()
         if extent > widest:
             axis, widest = a, extent
-    return np.argsort(points[:, axis], kind="mergesort"), axis
+    return axis
 
 
 @njit(cache=True, nogil=True)
-def _nearest(point: Float32, xyz: Float32, axis: int, names: Int64) -> int:
-    """The nearest of the points `xyz` sorted along `axis`; of equally near ones that of the smallest name."""
-    right = np.searchsorted(xyz[:, axis], point[axis])
-    left = right - 1
+def _sweep(points: Float32, axis: int) -> tuple[Int64, Float64]:
+    """The points' indices in the order of that axis, and (3, P) their coordinates in this order, the axis first."""
+    names = np.argsort(points[:, axis], kind="mergesort")
+    swept = np.empty((3, len(points)))
+    for a in range(3):
+        for s in range(len(points)):
+            swept[a, s] = points[names[s], (axis + a) % 3]
+    return names, swept
+
+
+@njit(cache=True, nogil=True)
+def _nearest(point: Float32, axis: int, swept: Float64, names: Int64) -> int:
+    """The place in the sweep of the nearest point; of equally near ones that of the smallest name."""
+    n = swept.shape[1]
+    x, y, z = swept
+    px, py, pz = np.float64(point[axis]), np.float64(point[(axis + 1) % 3]), np.float64(point[(axis + 2) % 3])
+    start = np.searchsorted(x, px)
     best, least = -1, np.inf
-    while left >= 0 or right < len(xyz):
-        step_left = np.float64(point[axis]) - xyz[left, axis] if left >= 0 else np.inf
-        step_right = np.float64(xyz[right, axis]) - point[axis] if right < len(xyz) else np.inf
-        t, step = (left, step_left) if step_left <= step_right else (right, step_right)
-        if step * step > least:
+    for t in range(start, n):
+        if (x[t] - px) ** 2 > least:
             break
-        if t == left:
-            left -= 1
-        else:
-            right += 1
-        distance = _squared_distance(point, xyz[t])
+        distance = (x[t] - px) ** 2 + (y[t] - py) ** 2 + (z[t] - pz) ** 2
+        if distance < least or (distance == least and names[t] < names[best]):
+            best, least = t, distance
+    for t in range(start - 1, -1, -1):
+        if (x[t] - px) ** 2 > least:
+            break
+        distance = (x[t] - px) ** 2 + (y[t] - py) ** 2 + (z[t] - pz) ** 2
         if distance < least or (distance == least and names[t] < names[best]):
             best, least = t, distance
     return best
