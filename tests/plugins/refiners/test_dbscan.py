@@ -55,6 +55,16 @@ def test_core_points_and_their_partition_are_scikit_learns(seed, eps, min_points
     assert same_partition(labels[core], reference.labels_[core])
 
 
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_border_point_joins_no_pieces(step):
+    """At 0.95 a point with two neighbors within 1, one of each piece; it shares its cell with a core point at 1.1."""
+    x = np.array([0.0, -0.3, -0.6, -0.9, 0.95, 1.1, 2.0, 2.05, 2.5])[::step]
+    labels = dense_pieces(np.stack([x, 0 * x, 0 * x], axis=1).astype(np.float32), 1.0, 4)[::step]
+    assert labels[4] == -1
+    assert len(set(labels[:4])) == len(set(labels[5:8])) == 1
+    assert labels[0] != labels[5]
+
+
 @pytest.mark.parametrize("seed", range(6))
 def test_keeps_the_largest_piece_with_its_border(seed):
     """scikit-learn's largest cluster by core points, with all that is within eps of one of them."""
