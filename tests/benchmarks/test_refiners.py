@@ -16,10 +16,13 @@ from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
 from framework.refinement import mixture
 from framework.refinement.neighborhood import neighborhoods
+from plugins.refiners.dbscan import Dbscan
 from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.identity import Identity
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
+from plugins.refiners.plane_removal import PlaneRemoval
+from plugins.refiners.rank_order import RankOrder
 
 MASKS = 10
 CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
@@ -44,7 +47,11 @@ def ten_masks() -> tuple[PointClusters, Frame]:
     return lift(detections, frame, Pose(np.eye(4))), frame
 
 
-@pytest.mark.parametrize("refiner", [Identity(), GmmEm(), KMeans(), LargestComponent()], ids=lambda r: type(r).__name__)
+@pytest.mark.parametrize(
+    "refiner",
+    [Identity(), GmmEm(), KMeans(), LargestComponent(), PlaneRemoval(), Dbscan(), RankOrder()],
+    ids=lambda r: type(r).__name__,
+)
 def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
     clusters, frame = ten_masks()
     refiner.refine(clusters, frame)

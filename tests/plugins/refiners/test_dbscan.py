@@ -1,0 +1,164 @@
+"""Density clustering beside scikit-learn's, and what it keeps of clusters."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numba
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+from sklearn.cluster import DBSCAN
+
+from framework.data import Camera, Frame, PointClusters
+from framework.errors import ConfigError
+from plugins.refiners.dbscan import Dbscan, dense_pieces
+
+CAMERA = Camera(90, 60, 50.0, 50.0, 44.5, 29.5)
+FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np.float32), CAMERA)
+
+
+def clusters_of(*sets: np.ndarray) -> PointClusters:
+    """The point sets as clusters, their points seen at the pixels of a 90x60 image one after the other."""
+    points = np.concatenate([np.zeros((0, 3)), *sets]).astype(np.float32)
+    ones = np.ones(len(sets), np.float32)
+    at = np.concatenate([np.arange(0), *(np.arange(len(s)) for s in sets)])
+    pixels = np.stack([at % 90, at // 90], axis=1).astype(np.int32)
+    cluster = np.repeat(np.arange(len(sets)), [len(s) for s in sets]).astype(np.int32)
+    return PointClusters(points, pixels, cluster, ones[:, None], ones, ("thing",))
+
+
+def blobs(seed: int, count: int = 1500) -> np.ndarray:
+    """Four dense balls of different density that nearly touch, and noise around them, far from the origin."""
+    rng = np.random.default_rng(seed)
+    centers = rng.uniform(-0.4, 0.4, (4, 3))
+    sigmas = rng.uniform(0.02, 0.08, 4)
+    which = rng.integers(0, 4, count)
+    dense = centers[which] + rng.normal(size=(count, 3)) * sigmas[which, None]
+    everywhere = rng.uniform(-0.6, 0.6, (count // 5, 3))
+    return (np.concatenate([dense, everywhere]) + np.array([-3, 5, 2])).astype(np.float32)
+
+
+def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
+    pairs = np.unique(np.stack([a, b]), axis=1).shape[1]
+    return pairs == len(np.unique(a)) == len(np.unique(b))
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize(("eps", "min_points"), [(0.03, 5), (0.05, 3), (0.05, 20), (0.02, 1), (0.3, 50)])
+def test_core_points_and_their_partition_are_scikit_learns(seed, eps, min_points):
+    points = blobs(seed)
+    reference = DBSCAN(eps=eps, min_samples=min_points).fit(points)
+    labels = dense_pieces(points, eps, min_points)
+    core = np.flatnonzero(labels >= 0)
+    np.testing.assert_array_equal(core, reference.core_sample_indices_)
+    assert same_partition(labels[core], reference.labels_[core])
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_border_point_joins_no_pieces(step):
+    """At 0.95 a point with two neighbors within 1, one of each piece; it shares its cell with a core point at 1.1."""
+    x = np.array([0.0, -0.3, -0.6, -0.9, 0.95, 1.1, 2.0, 2.05, 2.5])[::step]
+    labels = dense_pieces(np.stack([x, 0 * x, 0 * x], axis=1).astype(np.float32), 1.0, 4)[::step]
+    assert labels[4] == -1
+    assert len(set(labels[:4])) == len(set(labels[5:8])) == 1
+    assert labels[0] != labels[5]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_keeps_the_largest_piece_with_its_border(seed):
+    """scikit-learn's largest cluster by core points, with all that is within eps of one of them."""
+    eps, min_points, points = 0.04, 12, blobs(seed)
+    reference = DBSCAN(eps=eps, min_samples=min_points).fit(points)
+    core = reference.core_sample_indices_
+    largest = core[reference.labels_[core] == np.bincount(reference.labels_[core]).argmax()]
+    right = (cdist(points.astype(np.float64), points[largest].astype(np.float64)) <= eps).any(axis=1)
+    assert right[reference.labels_ == reference.labels_[largest[0]]].all()
+    clusters = clusters_of(blobs(seed + 100), points)
+    refined = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1).refine(clusters, FRAME)
+    np.testing.assert_array_equal(refined.points_world[refined.cluster == 1], points[right])
+    assert 0 < right.sum() < len(points)
+
+
+def test_eps_grows_with_depth():
+    """Points 5 cm apart on a line at 2 m."""
+    line = np.stack([np.arange(20) * 0.05, np.zeros(20), np.full(20, 2.0)], axis=1)
+    line[12:, 0] += 0.06
+    for slope, kept in ((0.01, 12), (0.05, 20)):
+        refined = Dbscan(eps=0.035, eps_per_depth=slope, min_points=2, stride=1).refine(clusters_of(line), FRAME)
+        assert len(refined.pixels) == kept, slope
+
+
+def test_all_points_are_judged_by_the_thinned_ones():
+    """Two plates of different size; with a stride the pixels between follow those near them."""
+    v, u = np.mgrid[:60, :90]
+    plates = np.stack([u * 0.01, v * 0.01, np.where(u < 50, 2.0, 2.3)], axis=-1).reshape(-1, 3)
+    clusters = clusters_of(plates)
+    for stride in (1, 2, 3, 5):
+        refined = Dbscan(eps=0.08, eps_per_depth=0.0, min_points=4, stride=stride).refine(clusters, FRAME)
+        np.testing.assert_array_equal(refined.pixels[:, 0] < 50, True)
+        assert len(refined.pixels) == 60 * 50
+
+
+def test_of_two_equal_pieces_the_first_stays():
+    rng = np.random.default_rng(0)
+    ball = rng.normal(0, 0.01, (50, 3))
+    for offset in (1.0, -1.0):
+        refined = Dbscan(eps=0.05, min_points=5, stride=1).refine(
+            clusters_of(np.concatenate([ball, ball + offset])), FRAME
+        )
+        np.testing.assert_array_equal(refined.pixels[:, 0], np.arange(50))
+
+
+def test_what_is_too_sparse_to_tell_is_left_alone():
+    spread = np.arange(60).reshape(20, 3) * 1.0
+    assert len(Dbscan().refine(clusters_of(spread), FRAME).pixels) == 20
+
+
+def test_degenerate_clusters():
+    same = np.zeros((500, 3))
+    one = np.array([[1.0, 2.0, 3.0]])
+    none = np.zeros((0, 3))
+    refined = Dbscan(min_points=1).refine(clusters_of(same, none, one, none), FRAME)
+    assert np.bincount(refined.cluster, minlength=4).tolist() == [500, 0, 1, 0]
+    assert len(refined) == 4
+    assert len(Dbscan().refine(clusters_of(), FRAME)) == 0
+    far = np.array([[1e6, -1e6, 1e6], [-1e6, 1e6, 0]])
+    assert len(Dbscan(eps=0.001, eps_per_depth=0, min_points=1, stride=1).refine(clusters_of(far), FRAME).pixels) == 1
+
+
+def test_exact_clusters_and_points_of_no_cluster_stay():
+    clusters = clusters_of(blobs(0))
+    exact = replace(clusters, exact=True)
+    assert Dbscan().refine(exact, FRAME) is exact
+    cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, 0).astype(np.int32)
+    refined = Dbscan(stride=1).refine(replace(clusters, cluster=cluster), FRAME)
+    np.testing.assert_array_equal(refined.pixels[refined.cluster == -1], clusters.pixels[::3])
+    assert 0 < (refined.cluster == 0).sum() < (cluster == 0).sum()
+
+
+def test_same_with_one_thread_and_two():
+    clusters = clusters_of(*(blobs(seed) for seed in range(5)))
+    threads = numba.get_num_threads()
+    results = []
+    try:
+        for n in (1, threads):
+            numba.set_num_threads(n)
+            results.append(Dbscan().refine(clusters, FRAME).points_world)
+    finally:
+        numba.set_num_threads(threads)
+    np.testing.assert_array_equal(*results)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"eps": 0.0}, r"Dbscan.eps must be in \[0.001, inf\], found 0.0"),
+        ({"eps_per_depth": float("nan")}, "Dbscan.eps_per_depth"),
+        ({"min_points": 0}, "Dbscan.min_points"),
+        ({"stride": 0}, "Dbscan.stride"),
+    ],
+)
+def test_parameters_are_checked(parameters, message):
+    with pytest.raises(ConfigError, match=message):
+        Dbscan(**parameters)

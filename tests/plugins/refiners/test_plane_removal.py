@@ -1,0 +1,187 @@
+"""Floors and walls leave the clusters, the flat parts of objects stay: exact scenes of boxes in a room."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.errors import ConfigError
+from framework.geometry import exp_se3, lift
+from plugins.refiners.plane_removal import PlaneRemoval
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))  # gravity is along no axis of the world
+ROOM = (-2.5, -1.5, -2.0), (2.5, 1.2, 4.0)  # m; the floor is 1.2 m below the camera, which looks along z, y down
+BOX = (-0.25, 0.7, 2.9), (0.25, 1.2, 3.3)  # on the floor
+PITCH = 0.3  # rad, the camera looks down
+
+Corners = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+def scene(*boxes: Corners, pitch: float = PITCH, noise: float = 0.0) -> tuple[Frame, np.ndarray]:
+    """The room with the boxes in it, and the (H, W) ids: 0 room, k the k-th box. Noise in standard deviations / z^2."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
+    c, s = np.cos(pitch), np.sin(pitch)
+    rays = rays @ np.array([[1, 0, 0], [0, c, s], [0, -s, c]]).T  # level axes from the camera's
+    depth, ids = np.full(CAMERA.shape, np.inf), np.zeros(CAMERA.shape, np.int32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for k, (low, high) in enumerate((ROOM, *boxes)):
+            hits = np.sort([low / rays, high / rays], axis=0)
+            enters, leaves = hits[0].max(axis=-1), hits[1].min(axis=-1)
+            z = leaves if k == 0 else np.where((enters < leaves) & (enters > 0), enters, np.inf)
+            ids = np.where(z < depth, k, ids)
+            depth = np.minimum(z, depth)
+    depth += np.random.default_rng(0).normal(0, noise, depth.shape) * depth**2
+    return Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA), ids
+
+
+def heights(frame: Frame, pitch: float = PITCH) -> np.ndarray:
+    """(H, W) m above the floor."""
+    v = np.arange(CAMERA.height)[:, None]
+    return 1.2 - (np.cos(pitch) * (v - CAMERA.cy) / CAMERA.fy + np.sin(pitch)) * frame.depth
+
+
+def lifted(frame: Frame, *masks: np.ndarray) -> PointClusters:
+    n = len(masks)
+    ones = np.ones(n, np.float32)
+    boxes = np.zeros((n, 4), np.float32)
+    return lift(Detections(np.stack(masks), boxes, ones, ones[:, None], ("thing",)), frame, Pose(T_WORLD_CAMERA))
+
+
+def bleeding(mask: np.ndarray, px: int = 8) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * px + 1, 2 * px + 1), np.uint8)).astype(bool)
+
+
+def masks_of(clusters: PointClusters) -> np.ndarray:
+    """(N, H, W) the pixels that are left of each cluster."""
+    masks = np.zeros((len(clusters), *CAMERA.shape), bool)
+    masks[clusters.cluster, clusters.pixels[:, 1], clusters.pixels[:, 0]] = True
+    return masks
+
+
+@pytest.mark.parametrize("pitch", [0.0, PITCH, 0.6])
+def test_a_box_on_the_floor_loses_the_floor_and_keeps_its_sides_down_to_the_distance(pitch):
+    frame, ids = scene(BOX, pitch=pitch)
+    [left] = masks_of(PlaneRemoval(distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame))
+    np.testing.assert_array_equal(left, (ids == 1) & (heights(frame, pitch) > 0.02))
+
+
+def test_the_noise_of_the_sensor_comes_on_top_of_the_distance():
+    """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
+    frame, ids = scene(BOX, noise=0.002)
+    bled = bleeding(ids == 1)
+    [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
+    assert left[bled & (ids == 0)].mean() < 0.01
+    assert left[(ids == 1) & (heights(frame) > 0.06)].all()
+
+
+def test_a_table_top_stays():
+    """A table that fills the lower half of the image; what it hides of the floor and the room is behind its top."""
+    table = (-1.2, 0.45, 0.9), (1.2, 0.5, 2.2)
+    frame, ids = scene(table, BOX)
+    top = PlaneRemoval(min_area=0.1)
+    for mask in (ids == 1, (ids == 1) & (np.arange(320) < 160)):  # the whole top, or the half that a mask shows
+        [left] = masks_of(top.refine(lifted(frame, bleeding(mask, 4)), frame))
+        np.testing.assert_array_equal(left, bleeding(mask, 4) & (ids > 0))
+
+
+def test_a_plane_stays_in_the_cluster_that_holds_most_of_it_and_leaves_the_others():
+    """A table top that hides all: nothing is behind it, so that only the share that a cluster holds can tell."""
+    frame, ids = scene(((-9.0, 0.5, -9.0), (9.0, 0.6, 9.0)), ((-0.1, 0.3, 0.4), (0.1, 0.5, 0.6)), pitch=0.9)
+    assert (ids > 0).all()
+    top, cup = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, ids == 1, bleeding(ids == 2)), frame))
+    np.testing.assert_array_equal(top, ids == 1)
+    assert cup.sum() > 0.8 * (ids == 2).sum()
+    assert not cup[ids == 1].any()
+    half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
+    [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
+    assert not left.any()
+    [left] = masks_of(PlaneRemoval(min_area=0.3, max_own=0.4).refine(lifted(frame, half), frame))
+    np.testing.assert_array_equal(left, half)
+
+
+def test_a_screen_before_a_wall_keeps_its_front_and_loses_the_wall():
+    """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
+    screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
+    for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
+        frame, ids = scene(screen, pitch=0.0, noise=noise)
+        bled = bleeding(ids == 1)
+        for refiner in (PlaneRemoval(), PlaneRemoval(min_area=0.2, min_share=0.01)):
+            [left] = masks_of(refiner.refine(lifted(frame, bled), frame))
+            assert left[ids == 1].mean() >= kept
+            assert 1 - left[bled & (ids == 0)].mean() >= dropped
+
+
+def test_a_door_in_the_wall_shows_little_behind_it():
+    """With a twentieth of the wall open it is structure, with a third of it it could be the side of a cupboard."""
+    for width, dropped in ((12, True), (100, False)):
+        frame, _ = scene(BOX)
+        depth = frame.depth.copy()
+        door = (np.arange(320) < width) & (heights(frame) > 0.05)
+        depth[door] = np.minimum(depth[door] * 1.5, 9.0)
+        frame = replace(frame, depth=depth)
+        planes = PlaneRemoval().structure(frame)
+        is_wall = np.abs(np.linalg.norm(planes.m, axis=1) - 1 / 4.0) < 0.001
+        assert is_wall.any() == dropped, width
+
+
+def test_floors_only():
+    """With a tilt of 60 degrees the wall counts no longer, the floor does."""
+    frame, ids = scene(BOX)
+    mask = np.ones(CAMERA.shape, bool)
+    refiner = PlaneRemoval(distance=0.02, max_tilt=60.0, max_own=1.0 - 1e-9)
+    others = np.zeros_like(mask)
+    others[:, :100] = True
+    [left] = masks_of(refiner.refine(lifted(frame, others), frame))
+    floor = np.abs(heights(frame)) <= 0.02
+    np.testing.assert_array_equal(left, others & ~floor)
+    [left] = masks_of(PlaneRemoval(distance=0.02, max_own=1.0 - 1e-9).refine(lifted(frame, others), frame))
+    assert left.sum() < 0.01 * others.sum()
+    assert ids.any()
+
+
+def test_a_frame_without_any_plane_loses_nothing():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(1, 3, CAMERA.shape).astype(np.float32)
+    frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth, CAMERA)
+    clusters = lifted(frame, np.ones(CAMERA.shape, bool))
+    np.testing.assert_array_equal(PlaneRemoval().refine(clusters, frame).pixels, clusters.pixels)
+
+
+def test_a_small_plane_is_not_structure():
+    """Of 0.5 m^2, or of a twentieth of the frame, when more is asked."""
+    frame, ids = scene(BOX)
+    clusters = lifted(frame, bleeding(ids == 1))
+    for strict in (PlaneRemoval(min_area=100.0), PlaneRemoval(min_share=0.9)):
+        assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
+
+
+def test_exact_clusters_and_points_of_no_cluster_stay():
+    frame, ids = scene(BOX)
+    clusters = lifted(frame, bleeding(ids == 1), np.zeros_like(ids, bool))
+    exact = replace(clusters, exact=True)
+    assert PlaneRemoval().refine(exact, frame) is exact
+    cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, clusters.cluster).astype(np.int32)
+    refined = PlaneRemoval().refine(replace(clusters, cluster=cluster), frame)
+    np.testing.assert_array_equal(refined.pixels[refined.cluster == -1], clusters.pixels[::3])
+    assert 0 < (refined.cluster == 0).sum() < (cluster == 0).sum()
+    assert len(refined) == 2
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"distance": -0.1}, "PlaneRemoval.distance must be in"),
+        ({"max_own": 1.5}, r"PlaneRemoval.max_own must be in \[0, 1\], found 1.5"),
+        ({"noise": float("nan")}, "PlaneRemoval.noise"),
+        ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),
+    ],
+)
+def test_parameters_are_checked(parameters, message):
+    with pytest.raises(ConfigError, match=message):
+        PlaneRemoval(**parameters)
