@@ -162,6 +162,8 @@ class Open3DMap(SceneMap):
         s = self.settings
         apart = TOUCH_STRIDE * float(depth.max()) / min(camera.fx, camera.fy)
         larger = min(int(np.ceil(apart / (s.block_resolution * s.voxel_size / 2))), TOUCH_STRIDE)
+        if not depth[::TOUCH_STRIDE, ::TOUCH_STRIDE].any():  # it would raise an error
+            larger = TOUCH_STRIDE
         if larger > 1:
             depth = depth.repeat(larger, axis=0).repeat(larger, axis=1)
             camera = camera.scaled(larger)
@@ -267,21 +269,7 @@ class Open3DMap(SceneMap):
         depth, normals, color = _blank(camera)
         blocks, far = self._blocks_in_view(camera, T_world_camera)
         if len(blocks):
-            s = self.settings
-            hit = self.grid.ray_cast(
-                Tensor(blocks),
-                *_tensors(camera, T_world_camera),
-                camera.width,
-                camera.height,
-                ["depth", "normal", "color", "index", "mask", "interp_ratio"],
-                METRES,
-                NEAR,
-                far,
-                self._min_weight,
-                s.truncation,
-                RANGE_TILE,
-            )
-            found = {name: hit[name].numpy() for name in ("depth", "normal", "color", "index", "mask", "interp_ratio")}
+            found = self._cast(blocks, far, camera, T_world_camera)
             z = found["depth"][..., 0]
             length = np.linalg.norm(found["normal"], axis=-1)
             seen = (z > 0) & (length > 0.5)  # Open3D normalises what is not 0
@@ -290,6 +278,28 @@ class Open3DMap(SceneMap):
             normals[seen] = _towards(camera, T_world_camera, found["normal"] / np.maximum(length, 0.5)[..., None])[seen]
             color[seen] = np.rint(255 * found["color"][seen]).astype(np.uint8)
         return SurfaceView(camera, T_world_camera, depth, normals, color)
+
+    def _cast(self, blocks: Int32, far: float, camera: Camera, T_world_camera: Float64) -> dict[str, npt.NDArray[Any]]:
+        """What Open3D's rays find, each (H, W, channels).
+
+        Its map of ranges leaves out the last rows and columns of an image whose sides are no multiples of its tile.
+        """
+        names = ("depth", "normal", "color", "index", "mask", "interp_ratio")
+        width, height = (RANGE_TILE * int(np.ceil(side / RANGE_TILE)) for side in (camera.width, camera.height))
+        hit = self.grid.ray_cast(
+            Tensor(blocks),
+            *_tensors(camera, T_world_camera),
+            width,
+            height,
+            names,
+            METRES,
+            NEAR,
+            far,
+            self._min_weight,
+            self.settings.truncation,
+            RANGE_TILE,
+        )
+        return {name: hit[name].numpy()[: camera.height, : camera.width] for name in names}
 
     def _distance(self, corners: npt.NDArray[np.int64], shares: Float32) -> Float32:
         """(P,) m, the trilinear field at points with voxels `corners` (P, 8), of which `shares` (P, 8) were seen.
