@@ -224,7 +224,7 @@ def test_a_close_view_of_a_large_map_is_whole_and_silent(mapped: Open3DMap, capf
     small = Camera(8, 6, 6.5, 6.5, 3.5, 2.5)
     scene.render(small, np.eye(4))
     close = pose(0.0, 0.0, 1.0)
-    view = scene.render(CAMERA.scaled(4), close)
+    view = scene.render(CAMERA, close)
     assert (view.depth > 0).mean() > 0.9
     output = capfd.readouterr()
     assert (output.out, output.err) == ("", "")
@@ -301,7 +301,8 @@ def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch
         assert np.array_equal(getattr(small.mesh(), name), getattr(large.mesh(), name))
 
 
-def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame]) -> None:
+def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", 16)
     first = new_fuser()
     fused(first, frames[0], [], [])
     budget = first.scene.block_count
