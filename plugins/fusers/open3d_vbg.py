@@ -36,7 +36,7 @@ class Open3DVoxelBlockGrid(MapFuser):
     min_depth: float = 0.2  # m, > 0
     max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
     max_blocks: int = 200_000  # blocks, > 0: 14 KiB each, and Open3D copies the map to make room: 5.7 GB at its end
-    min_weight: float = 3.0  # frames, >= 1, that must have seen a voxel for it to be surface: Open3D's
+    min_weight: float = 1.0  # frames, >= 1, that must have seen a voxel: Open3D's 3 loses what is seen briefly
     label_band: float = 2.0  # voxels, >= 1: those within this distance of the measured surface vote
     overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap over the smaller of the two
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one

@@ -171,7 +171,7 @@ def test_views_show_the_surface_where_it_is(rotvec: tuple[float, float, float]) 
     assert np.median(np.abs(view.color[wall].astype(int) - color[wall])) <= 3
     normal = view.normals_world[wall] @ walls.planes[0][0]
     assert np.median(normal) > 0.95  # one view, nearest readings: the field has steps
-    assert np.quantile(normal, 0.01) > 0.5
+    assert np.quantile(normal, 0.1) > 0.8
     near = scene.render_near(CAMERA, elsewhere, depth)
     assert np.array_equal(near.depth, view.depth)
 
@@ -334,6 +334,9 @@ def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open
     assert loaded.instances()[2].confidence == mapped.instances()[2].confidence
     loaded.save(tmp_path / "again.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+    with np.load(tmp_path / "map.npz") as file:
+        coords = file["block_coords"].tolist()
+    assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), "Open3D's order differs between runs"
 
 
 def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path) -> None:
