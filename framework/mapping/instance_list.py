@@ -1,0 +1,53 @@
+"""The instances of a labelled mesh, with boxes around their vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import open3d as o3d
+
+from framework.data import Bool, Box, Float32, Instance, InstanceMesh, Int32
+from framework.mapping.instance_table import InstanceRecord, InstanceTable
+
+
+def instances_that_count(table: InstanceTable, min_observations: int, min_confidence: float) -> Bool:
+    """(ids + 1,) whether an instance has been observed often enough and is trusted enough, by id."""
+    counts = np.zeros(table.last_id + 1, np.bool_)
+    for record in table.records.values():
+        counts[record.id] = record.observations >= min_observations and record.confidence >= min_confidence
+    return counts
+
+
+def list_instances(mesh: InstanceMesh, table: InstanceTable) -> Mapping[int, Instance]:
+    """The instances that have vertices, by id, ascending."""
+    order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
+    ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
+    ends = [*starts[1:], len(order)]
+    return {
+        int(k): _instance(table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
+        for k, start, end in zip(ids, starts, ends, strict=False)
+        if k > 0
+    }
+
+
+def _instance(record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    return Instance(
+        id=record.id,
+        class_probabilities=record.class_probabilities,
+        confidence=record.confidence,
+        observations=record.observations,
+        vertices=vertices,
+        aabb=Box((low + high) / 2, high - low, np.eye(3)),
+        obb=_oriented_box(points),
+    )
+
+
+def _oriented_box(points: Float32) -> Box:
+    """The box along the principal axes of the points' convex hull (Open3D); `robust` lets flat and thin sets pass."""
+    four = np.resize(points, (max(len(points), 4), 3))  # Qhull refuses fewer; repeated points change nothing
+    box = o3d.geometry.OrientedBoundingBox.create_from_points(
+        o3d.utility.Vector3dVector(four.astype(np.float64)), robust=True
+    )
+    return Box(np.asarray(box.center), np.asarray(box.extent), np.asarray(box.R))

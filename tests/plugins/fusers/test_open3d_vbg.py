@@ -1,0 +1,390 @@
+"""Open3D's blocks as a fuser: what a voxel counts, where surfaces lie, and what is kept, on scenes known exactly."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, Pose
+from framework.errors import ConfigError, DataError, MapFullError
+from framework.geometry import lift
+from framework.mapping.open3d_map import BlockGridSettings, Open3DMap
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
+from tests.analytic_scene import CAMERA, Scene, pose, room, walk
+
+CLASSES = ("chair", "bed")
+SETTINGS = BlockGridSettings(
+    voxel_size=0.02,
+    block_resolution=8,
+    truncation=4.0,
+    min_depth=0.2,
+    max_depth=4.0,
+    max_blocks=10_000,
+    min_weight=3.0,
+    min_observations=3,
+    min_confidence=0.05,
+    min_vertices=30,
+)
+
+
+def masks_of(frame: Frame) -> list[np.ndarray]:
+    assert frame.truth is not None
+    return [frame.truth.instance_ids == i for i in frame.truth.class_names]
+
+
+def fused(fuser: Open3DVoxelBlockGrid, frame: Frame, masks: list[np.ndarray], scores: list[float]) -> None:
+    assert frame.T_world_camera is not None
+    n = len(masks)
+    detections = Detections(
+        masks=np.array(masks, np.bool_).reshape(n, *frame.depth.shape),
+        boxes=np.zeros((n, 4), np.float32),
+        scores=np.array(scores, np.float32),
+        class_probabilities=np.tile(np.float32([0.7, 0.3]), (n, 1)),
+        classes=CLASSES,
+    )
+    at = Pose(frame.T_world_camera)
+    fuser.fuse(frame, at, lift(detections, frame, at))
+
+
+def new_fuser(**parameters: float) -> Open3DVoxelBlockGrid:
+    return Open3DVoxelBlockGrid(voxel_size=0.02, max_depth=4.0, **parameters)  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return [room().frame(T, k) for k, T in enumerate(walk(6))]
+
+
+@pytest.fixture(scope="module")
+def mapped(frames: list[Frame]) -> Open3DMap:
+    """The room with its three spheres, from six frames."""
+    fuser = new_fuser()
+    for frame in frames:
+        fused(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
+    return fuser.scene
+
+
+def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
+    """A wall seen once."""
+    frame = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)]).frame(np.eye(4))
+    scene = Open3DMap(dataclasses.replace(SETTINGS, **changes))  # type: ignore[arg-type]
+    scene.integrate(frame, np.eye(4))
+    return scene, frame
+
+
+# Votes
+
+
+def majority(votes: list[int]) -> tuple[int, int]:
+    """Candidate and counter after Boyer and Moore, one vote at a time."""
+    candidate = count = 0
+    for vote in votes:
+        if vote == candidate:
+            count += 1
+        elif count == 0:
+            candidate, count = vote, 1
+        else:
+            count -= 1
+    return candidate, count
+
+
+@pytest.mark.parametrize("votes", [[1], [1, 2], [1, 2, 2], [1, 2, 3, 3], [2, 2, 1, 1, 1], [3, 3, 3, 1, 2]])
+def test_a_voxel_counts_as_boyer_and_moore_do(votes: list[int]) -> None:
+    scene, frame = one_view()
+    for vote in votes:
+        scene.vote(frame, np.eye(4), np.full(frame.depth.shape, vote, np.int32), band=2.0)
+    counted = scene._flat("instance") > 0
+    candidate, count = majority(votes)
+    assert counted.sum() > 1000
+    assert set(scene._flat("instance")[counted]) == {candidate}
+    assert set(scene._flat("votes")[counted]) == {count}
+
+
+def voxel_centres(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
+    """Flat numbers and places (m) of all voxels, the slow and obvious way."""
+    r, size = scene.settings.block_resolution, scene.settings.voxel_size
+    hashmap = scene.grid.hashmap()
+    z, y, x = np.mgrid[:r, :r, :r].reshape(3, -1)
+    numbers, places = [], []
+    for block in hashmap.active_buf_indices().numpy():
+        corner = hashmap.key_tensor().numpy()[block] * r
+        numbers.append(block.astype(np.int64) * r**3 + np.arange(r**3))
+        places.append((corner + np.stack([x, y, z], 1)) * size)
+    return np.concatenate(numbers), np.concatenate(places)
+
+
+def test_the_voxels_in_the_band_under_a_mask_vote_and_no_others(frames: list[Frame]) -> None:
+    frame = frames[3]
+    T = frame.T_world_camera
+    scene = Open3DMap(SETTINGS)
+    scene.integrate(frame, T)
+    mask = masks_of(frame)[0]
+    scene.vote(frame, T, np.where(mask, 7, 0).astype(np.int32), band=2.0)
+    numbers, places = voxel_centres(scene)
+    x, y, z = ((places - T[:3, 3]) @ T[:3, :3]).T
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = (np.rint(CAMERA.fx * x / z + CAMERA.cx), np.rint(CAMERA.fy * y / z + CAMERA.cy))
+        inside = (z > 0.2) & (u >= 0) & (v >= 0) & (u < CAMERA.width) & (v < CAMERA.height)
+    expected = np.zeros(len(numbers), bool)
+    at = (v[inside].astype(int), u[inside].astype(int))
+    expected[inside] = mask[at] & (np.abs(frame.depth[at] - z[inside]) <= 2.0 * 0.02)
+    found = scene._flat("instance")[numbers] == 7
+    assert expected.sum() > 500
+    assert (found != expected).mean() < 1e-4, "rounding at the border alone"
+    assert (scene._flat("instance") == 7).sum() == found.sum(), "a voxel in no block has voted"
+
+
+@pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
+def test_the_better_detection_gets_the_pixels_that_two_share(
+    frames: list[Frame], scores: list[float], winner: int
+) -> None:
+    first, second, _ = masks_of(frames[0])
+    v = np.arange(CAMERA.height)[:, None]
+    shared = first & (v > np.quantile(np.nonzero(first)[0], 0.7))
+    fuser = new_fuser()
+    fused(fuser, frames[0], [first, second | shared], scores)
+    ids = fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids
+    assert (ids[shared] == winner).mean() > 0.8
+    assert (ids[first & ~shared] == 1).mean() > 0.8
+
+
+# Surfaces
+
+
+@pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.1, 0.5, 0.0), (-0.2, -0.4, 0.3)])
+def test_views_show_the_surface_where_it_is(rotvec: tuple[float, float, float]) -> None:
+    """Open3D's own rays end 12 mm too far, and its depth look-up is off by half a pixel; neither is left."""
+    scene, T = Open3DMap(SETTINGS), pose(rotvec=rotvec)
+    walls = Scene(planes=[(np.array([-0.3, 0.1, -1.0]) / np.sqrt(1.1), -1.777)], spheres=room().spheres)
+    for _ in range(3):
+        scene.integrate(walls.frame(T), T)
+    elsewhere = T @ pose(0.05, 0.03, 0.02, (0.03, -0.08, 0.05))
+    depth, color, surface = walls.render(CAMERA, elsewhere)
+    view = scene.render(CAMERA, elsewhere)
+    wall = (view.depth > 0) & (surface == 1)
+    assert wall.mean() > 0.3
+    error = (view.depth - depth)[wall]
+    assert abs(np.median(error)) < 0.001
+    assert np.median(np.abs(error)) < 0.002
+    assert np.median(np.abs(view.color[wall].astype(int) - color[wall])) <= 3
+    normal = view.normals_world[wall] @ walls.planes[0][0]
+    assert np.median(normal) > 0.95  # one view, nearest readings: the field has steps
+    assert np.quantile(normal, 0.1) > 0.8
+    near = scene.render_near(CAMERA, elsewhere, depth)
+    assert np.array_equal(near.depth, view.depth)
+
+
+def test_the_mesh_lies_on_the_surface_and_is_the_same_in_every_run(mapped: Open3DMap, frames: list[Frame]) -> None:
+    mesh = mapped.mesh()
+    distance = room().distance(mesh.vertices.astype(np.float64))
+    assert np.median(distance) < 0.1 * 0.02
+    assert np.quantile(distance, 0.95) < 0.5 * 0.02
+    a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
+    towards = np.einsum("ij,ij->i", np.cross(b - a, c - a), -a)  # the camera stayed near the origin
+    assert (towards > 0).mean() > 0.98
+    again = Open3DMap(mapped.settings)
+    for frame in frames:
+        again.integrate(frame, frame.T_world_camera)
+    twin = again.mesh()
+    for name in ("vertices", "triangles", "colors"):
+        assert np.array_equal(getattr(mesh, name), getattr(twin, name)), name
+
+
+def test_the_first_frame_alone_is_a_surface_and_later_ones_need_more() -> None:
+    scene, frame = one_view()
+    view, mesh = scene.render(CAMERA, np.eye(4)), scene.mesh()
+    assert (view.depth > 0).mean() > 0.9
+    assert len(mesh.vertices) > 100
+    half = np.where(np.arange(CAMERA.width) < CAMERA.width // 2, frame.depth, np.float32(0))
+    for _ in range(2):
+        scene.integrate(dataclasses.replace(frame, depth=half), np.eye(4))
+    seen = scene.render(CAMERA, np.eye(4)).depth > 0
+    assert seen[:, : CAMERA.width // 2 - 4].mean() > 0.9
+    assert not seen[:, CAMERA.width // 2 + 4 :].any(), "the right half was seen once, three times are asked for"
+    assert scene.mesh().vertices[:, 0].max() < 0.1
+
+
+def test_a_coarse_image_leaves_no_holes() -> None:
+    """Open3D touches blocks at every 4th pixel only: here 12 cm apart, for blocks of 8 cm."""
+    coarse = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
+    scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01))
+    wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.2)])
+    for _ in range(3):
+        scene.integrate(wall.frame(np.eye(4), camera=coarse), np.eye(4))
+    assert (scene.render(coarse, np.eye(4)).depth > 0)[2:-2, 2:-2].all()
+
+
+def test_a_close_view_of_a_large_map_is_whole_and_silent(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
+    """Open3D sizes its map of ranges by the first view, prints a warning in a later one and leaves holes there."""
+    scene = Open3DMap(mapped.settings)
+    for T in walk(3):
+        scene.integrate(room().frame(T), T)
+    small = Camera(8, 6, 6.5, 6.5, 3.5, 2.5)
+    scene.render(small, np.eye(4))
+    close = pose(0.0, 0.0, 1.0)
+    view = scene.render(CAMERA, close)
+    assert (view.depth > 0).mean() > 0.9
+    output = capfd.readouterr()
+    assert (output.out, output.err) == ("", "")
+
+
+# Instances
+
+
+def test_ids_stay_with_their_objects_and_are_those_of_the_other_fuser(frames: list[Frame]) -> None:
+    ours, theirs = new_fuser(), BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    for k, frame in enumerate(frames):
+        order = np.roll(np.arange(3), k)
+        for fuser in (ours, theirs):
+            fused(fuser, frame, [masks_of(frame)[i] for i in order], [0.9] * 3)  # type: ignore[arg-type]
+    histories = [
+        {k: (r.observations, r.visible, r.detections, r.class_log.tolist()) for k, r in f.scene.table.records.items()}
+        for f in (ours, theirs)
+    ]
+    assert len(histories[0]) == 3
+    assert histories[0] == histories[1]
+    T = frames[3].T_world_camera
+    a, b = (fuser.scene.render(CAMERA, T).instance_ids for fuser in (ours, theirs))
+    assert (a == b).mean() > 0.97
+
+
+def test_each_sphere_is_one_instance_on_its_surface(mapped: Open3DMap) -> None:
+    mesh, instances = mapped.mesh(), mapped.instances()
+    assert sorted(instances) == [1, 2, 3]
+    for (center, radius), instance in zip(room().spheres, instances.values(), strict=True):
+        points = mesh.vertices[instance.vertices].astype(np.float64)
+        distance = np.abs(np.linalg.norm(points - center, axis=1) - radius)
+        assert np.quantile(distance, 0.95) < 2 * 0.02
+        assert instance.class_probabilities.argmax() == 0
+        assert instance.observations == 6
+        assert (mesh.class_ids[instance.vertices] == 0).all()
+
+
+def test_merging_moves_every_voxel(frames: list[Frame]) -> None:
+    fuser = new_fuser(merge_frames=1)
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
+    fused(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
+    assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1, 2}
+    for k in (1, 2):
+        fused(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
+    assert set(fuser.scene.table.records) == {1}
+    assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1}
+
+
+def test_an_instance_with_few_vertices_or_frames_does_not_count(frames: list[Frame]) -> None:
+    fuser = new_fuser(min_vertices=100_000)
+    for frame in frames[:3]:
+        fused(fuser, frame, masks_of(frame)[:1], [0.9])
+    assert not fuser.scene.instances()
+    assert (fuser.scene.mesh().class_ids == -1).all()
+    assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not gone"
+
+
+# Storage
+
+
+def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    maps = []
+    for first in (16, 5000):
+        monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", first)
+        fuser = new_fuser()
+        for frame in frames[:3]:
+            fused(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
+        maps.append(fuser.scene)
+    small, large = maps
+    assert small.block_count == large.block_count > 16
+    for name in ("vertices", "colors", "instance_ids"):
+        assert np.array_equal(getattr(small.mesh(), name), getattr(large.mesh(), name))
+
+
+def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", 16)
+    first = new_fuser()
+    fused(first, frames[0], [], [])
+    budget = first.scene.block_count
+    fuser = new_fuser(max_blocks=budget)
+    fused(fuser, frames[0], [], [])
+    before = fuser.scene.mesh()
+    with pytest.raises(MapFullError, match=f"{budget} blocks of 8"):
+        fused(fuser, dataclasses.replace(frames[0], T_world_camera=pose(0.3)), [], [])
+    assert fuser.scene.voxel_count == budget * 512
+    assert fuser.scene.grid.hashmap().capacity() <= budget
+    assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
+    fused(fuser, frames[0], [], [])  # what is there can still be seen again
+
+
+def test_bytes_are_those_of_the_blocks_in_use(mapped: Open3DMap) -> None:
+    assert mapped.byte_count == mapped.voxel_count * 4 * (1 + 1 + 3 + 1 + 1)
+    assert mapped.voxel_count == mapped.block_count * 512
+
+
+def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open3DMap, tmp_path: Path) -> None:
+    mapped.save(tmp_path / "map.npz")
+    loaded = Open3DMap.load(tmp_path / "map.npz")
+    assert (loaded.settings, loaded.classes, loaded.frames) == (mapped.settings, CLASSES, 6)
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        assert np.array_equal(getattr(mapped.mesh(), name), getattr(loaded.mesh(), name)), name
+    assert {k: vars(r).keys() for k, r in loaded.table.records.items()} == {
+        k: vars(r).keys() for k, r in mapped.table.records.items()
+    }
+    assert loaded.instances()[2].confidence == mapped.instances()[2].confidence
+    loaded.save(tmp_path / "again.npz")
+    assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+    with np.load(tmp_path / "map.npz") as file:
+        coords = file["block_coords"].tolist()
+    assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), "Open3D's order differs between runs"
+
+
+def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path) -> None:
+    path = tmp_path / "map.npz"
+    mapped.save(path)
+    whole = path.read_bytes()
+    for place in np.random.default_rng(0).integers(200, len(whole) // 2, 5):
+        damaged = bytearray(whole)
+        damaged[place] ^= 0xFF
+        path.write_bytes(damaged)
+        with pytest.raises(DataError, match=r"map\.npz"):
+            Open3DMap.load(path)
+    BayesianTsdf().scene.save(path)
+    with pytest.raises(DataError, match="map format 2, expected open3d_vbg"):
+        Open3DMap.load(path)
+    with pytest.raises(DataError, match=r"none\.npz"):
+        Open3DMap.load(tmp_path / "none.npz")
+
+
+# Odd input
+
+
+def test_an_empty_map_is_saved_and_an_empty_scene_changes_nothing(tmp_path: Path) -> None:
+    fuser = new_fuser()
+    fused(fuser, Scene().frame(np.eye(4)), [np.ones(CAMERA.shape, np.bool_)], [0.9])
+    assert (fuser.scene.voxel_count, len(fuser.scene.table.records)) == (0, 0)
+    fuser.scene.save(tmp_path / "map.npz")
+    assert Open3DMap.load(tmp_path / "map.npz").voxel_count == 0
+
+
+def test_a_single_reading_is_mapped(frames: list[Frame]) -> None:
+    """It lies between the pixels that Open3D looks at, which then raises an error."""
+    depth = np.zeros_like(frames[0].depth)
+    depth[61, 83] = 1.5
+    fuser = new_fuser()
+    fused(fuser, dataclasses.replace(frames[0], depth=depth), [np.ones(CAMERA.shape, np.bool_)], [0.9])
+    assert fuser.scene.voxel_count > 0
+
+
+def test_another_label_space_is_an_error(frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    fused(fuser, frames[0], [], [])
+    clusters = lift(Detections.none(CAMERA.shape, ("cup",)), frames[1], Pose(np.eye(4)))
+    with pytest.raises(DataError, match="label space"):
+        fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
+
+
+def test_parameters_are_checked() -> None:
+    for wrong in ({"voxel_size": 0.0}, {"max_depth": 0.1}, {"label_band": 9.0}, {"min_weight": float("nan")}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            Open3DVoxelBlockGrid(**wrong)  # type: ignore[arg-type]
