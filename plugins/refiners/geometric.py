@@ -1,0 +1,112 @@
+"""Cluster refinement by convexity: the geometric segments that Voxblox++ puts its instances together from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numba import njit
+
+from framework.data import Float32, Frame, Int32, PointClusters
+from framework.interfaces import ClusterRefiner
+from framework.parameters import check_bounds
+from framework.refinement.absolute_orientation import camera_pose, points_at
+from framework.refinement.convexity import Limits, segments
+from framework.refinement.selection import keep_points
+
+
+
+@dataclass
+class Geometric(ClusterRefiner):
+    """Makes each cluster the union of the convex segments of the depth image that its mask covers.
+
+    The rival idea: Voxblox++ (Grinvald et al., RA-L 2019) cuts the depth image where depth jumps or the surface is
+    concave, and gives each segment to the one mask that covers most of it, if that is more than `min_overlap` of its
+    pixels. A cluster so loses what its mask caught beside its segments. With `whole_segments` it also grows to their
+    pixels outside of the mask, as in Voxblox++: these have exact readings, and the camera's pose, which takes them to
+    the world, follows from the points that there are already; where those are too few or on one line, nothing is
+    added. A mask that covers no segment loses all its points; clusters keep their index. Points of no cluster stay.
+    """
+
+    cell: int = 2  # px, from 1: side of the squares whose readings are averaged
+    window: int = 3  # cells, from 1: planes are fitted to squares of 2 window + 1 cells
+    noise_factor: float = 3.0  # from 0.1, standard deviations of a structured-light camera's depth that count as noise
+    max_slope: float = 4.0  # m per m, from 0.1: steeper against the line of sight, depth jumps (4: 76 degrees)
+    max_angle: float = 15.0  # degrees, in (0, 90): a surface bent more towards the camera, and more than noise, is cut
+    closing: int = 1  # cells, from 0: gaps in edges up to twice as wide are closed
+    min_segment: int = 100  # px, from 1: smaller segments go to those beside them
+    min_overlap: float = 0.5  # in [0, 1), share of a segment that a mask must cover to get it
+    whole_segments: bool = True  # whether clusters grow to their segments' pixels outside of the mask
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            cell=(1, 16),
+            window=(1, 16),
+            noise_factor=(0.1, 100.0),
+            max_slope=(0.1, 100.0),
+            max_angle=(1e-3, 89.0),
+            closing=(0, 16),
+            min_segment=(1, 10**9),
+            min_overlap=(0.0, 1 - 1e-6),
+        )
+        self.limits = Limits(self.noise_factor, self.max_slope, float(np.deg2rad(self.max_angle)))
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        if clusters.exact or len(clusters) == 0:
+            return clusters
+        labels, count = segments(
+            frame.depth,
+            frame.camera,
+            cell=self.cell,
+            window=self.window,
+            limits=self.limits,
+            closing=self.closing,
+            min_pixels=self.min_segment,
+        )
+        owners = _owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, self.min_overlap)
+        owner_of = np.append(owners, np.int32(-1))[labels]  # (H, W) the cluster that each pixel is of, -1 = none
+        u, v = clusters.pixels[:, 0], clusters.pixels[:, 1]
+        kept = (clusters.cluster < 0) | (owner_of[v, u] == clusters.cluster)
+        refined = keep_points(clusters, np.asarray(kept, np.bool_))
+        return _grown(refined, clusters, frame, owner_of) if self.whole_segments else refined
+
+
+@njit(cache=True, nogil=True)
+def _owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: int, min_overlap: float) -> Int32:
+    """(count,) the cluster with the most pixels in each segment, the first of equals; -1 = none has enough of them."""
+    sizes, covered = np.zeros(count, np.int64), np.zeros((count, clusters), np.int64)
+    for label in labels.ravel():
+        if label >= 0:
+            sizes[label] += 1
+    for i in range(len(cluster)):
+        label = labels[pixels[i, 1], pixels[i, 0]]
+        if label >= 0 and cluster[i] >= 0:
+            covered[label, cluster[i]] += 1
+    owners = np.full(count, -1, np.int32)
+    for label in range(count):
+        best = np.argmax(covered[label])
+        if covered[label, best] > min_overlap * sizes[label]:
+            owners[label] = best
+    return owners
+
+
+def _grown(refined: PointClusters, clusters: PointClusters, frame: Frame, owner_of: Int32) -> PointClusters:
+    """The refined clusters with those pixels of theirs that were not in their masks."""
+    missing = owner_of >= 0
+    own = refined.cluster >= 0
+    missing[refined.pixels[own, 1], refined.pixels[own, 0]] = False  # a pixel has one owner: all others are gone
+    v, u = np.nonzero(missing)
+    if len(u) == 0:
+        return refined
+    T_world_camera = camera_pose(clusters, frame)
+    if T_world_camera is None:
+        return refined
+    pixels = np.stack([u, v], axis=1).astype(np.int32)
+    added: Float32 = points_at(pixels, frame, T_world_camera)
+    return replace(
+        refined,
+        points_world=np.concatenate([refined.points_world, added]),
+        pixels=np.concatenate([refined.pixels, pixels]),
+        cluster=np.concatenate([refined.cluster, owner_of[v, u]]),
+    )
