@@ -20,6 +20,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Int32
+from framework.refinement.union_find import root, unite
 
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
 FEWEST_CELLS = 6  # that a plane is fitted to: three would fit without telling anything
@@ -33,16 +34,24 @@ class Limits:
     """Where a surface ends."""
 
     noise_factor: float  # standard deviations of depth that count as noise
+    min_noise: float  # m, least standard deviation of depth, where readings come in coarser steps than the sensor's
     max_slope: float  # change of depth over the distance across the line of sight, m per m
     max_angle: float  # rad, by which a surface may bend towards the camera; what noise may bend it by comes on top
 
 
-def depth_sigma(z: float) -> float:
+Noise = tuple[float, float]  # noise_factor and min_noise of the limits, for kernels
+
+
+@njit(cache=True, nogil=True)
+def _sigma(z: float, min_noise: float) -> float:
     """Standard deviation (m) of a structured-light camera's depth z (m), Nguyen et al. 2012, eq. 2 for small angles."""
-    return 0.0012 + 0.0019 * (z - 0.4) ** 2
+    return max(0.0012 + 0.0019 * (z - 0.4) ** 2, min_noise)
 
 
-_sigma = njit(cache=True, nogil=True)(depth_sigma)
+@njit(cache=True, nogil=True)
+def _noise_at(inverse: float, noise: Noise) -> np.float32:
+    """By how much inverse depth (1 / m) may be off by noise."""
+    return np.float32(noise[0] * _sigma(1.0 / inverse, noise[1]) * inverse * inverse)
 
 
 def segments(
@@ -57,18 +66,19 @@ def segments(
     pinhole = np.array(
         [camera.fx / cell, camera.fy / cell, (camera.cx + 0.5) / cell - 0.5, (camera.cy + 0.5) / cell - 0.5], np.float32
     )
-    inverse = _cells(depth, cell, limits.noise_factor, slope)
-    fits = _fit_planes(inverse, window, limits.noise_factor, slope)
-    planes = _best_planes(inverse, fits, window)
-    edges = _edges(planes, pinhole, limits.noise_factor, limits.max_angle, normal_sigma(1.0, window, cell, camera))
+    noise = (limits.noise_factor, limits.min_noise)
+    inverse = _cells(depth, cell, noise, slope)
+    fits = _fit_planes(inverse, window, noise, slope)
+    planes = _best_planes(inverse, fits, window, limits.min_noise)
+    edges = _edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
     min_cells = max(min_pixels // cell**2, 1)
-    labels, count = _connected(inverse, _closed(edges, closing), limits.noise_factor, slope, min_cells)
+    labels, count = _connected(inverse, _closed(edges, closing), noise, slope, min_cells)
     for _ in range(2 + 2 * closing):  # as wide as edges are
-        labels, planes = _absorbed(inverse, labels, planes, limits.noise_factor)
+        labels, planes = _absorbed(inverse, labels, planes, noise)
     # poles and legs are edges all over: what no segment took hangs together by depth alone
-    rest, rest_count = _connected(inverse, (labels >= 0) | (inverse <= 0), limits.noise_factor, slope, min_cells)
+    rest, rest_count = _connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
     labels = np.where(rest >= 0, rest + count, labels)
-    return _pixel_labels(depth, inverse, labels, planes, cell, limits.noise_factor), int(count + rest_count)
+    return _pixel_labels(depth, inverse, labels, planes, cell, noise), int(count + rest_count)
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
@@ -82,7 +92,7 @@ def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> 
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _cells(depth: Float32, cell: int, noise_factor: float, slope: np.float32) -> Float32:
+def _cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
     """(rows, columns) mean inverse depth of each cell's nearest surface, 1 / m; 0 = no reading."""
     height, width = depth.shape
     rows, columns = -(-height // cell), -(-width // cell)
@@ -97,7 +107,7 @@ def _cells(depth: Float32, cell: int, noise_factor: float, slope: np.float32) ->
                         nearest = depth[v, u]
             if nearest == np.inf:
                 continue
-            farthest = nearest * (1 + slope) + 2 * noise_factor * _sigma(nearest)
+            farthest = nearest * (1 + slope) + 2 * noise[0] * _sigma(nearest, noise[1])
             total, count = np.float32(0), 0
             for v in range(r * cell, min((r + 1) * cell, height)):
                 for u in range(c * cell, min((c + 1) * cell, width)):
@@ -134,24 +144,24 @@ def _add_offset(
 
 
 @njit(cache=True, nogil=True)
-def _gates(inverse: Float32, noise_factor: float, slope: np.float32, gate: Float32, gate_slope: Float32) -> None:
+def _gates(inverse: Float32, noise: Noise, slope: np.float32, gate: Float32, gate_slope: Float32) -> None:
     """How far inverse depth may be off between a row's cells and others: by noise, and a cell's distance apart."""
     for c in range(len(inverse)):
         d = inverse[c]
         if d > 0:
-            gate[c] = noise_factor * _sigma(1.0 / d) * d * d
+            gate[c] = _noise_at(d, noise)
             gate_slope[c] = slope * d
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _fit_planes(inverse: Float32, window: int, noise_factor: float, slope: np.float32) -> Float32:
+def _fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
     """(4, rows, columns) inverse depth a x + b y + c around each cell, and the mean squared residual (inf = no fit)."""
     rows, columns = inverse.shape
     fits = np.zeros((4, rows, columns), np.float32)
     for row in prange(rows):
         r = np.int64(row)  # prange counts in unsigned numbers
         gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-        _gates(inverse[r], noise_factor, slope, gate, gate_slope)
+        _gates(inverse[r], noise, slope, gate, gate_slope)
         sums = np.zeros((10, columns), np.float32)
         for dy in range(max(-window, -r), min(window, rows - 1 - r) + 1):
             for dx in range(-window, window + 1):
@@ -188,7 +198,7 @@ def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _best_planes(inverse: Float32, fits: Float32, window: int) -> Float32:
+def _best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) -> Float32:
     """(3, rows, columns) a, b, c of the window that fits each cell best, of that around it and the eight beside it.
 
     Where noise alone would misfit as much, the window around the cell stays. c = 0 where no window fits.
@@ -197,12 +207,12 @@ def _best_planes(inverse: Float32, fits: Float32, window: int) -> Float32:
     planes = fits[:3].copy()
     for row in prange(rows):
         r = np.int64(row)
-        score, noise = np.empty(columns, np.float32), np.zeros(columns, np.float32)
+        score, variance = np.empty(columns, np.float32), np.zeros(columns, np.float32)
         for c in range(columns):
             d = inverse[r, c]
             if d > 0:
-                noise[c] = (_sigma(1.0 / d) * d * d) ** 2
-            score[c] = noise[c] + fits[3, r, c] + (d - fits[2, r, c]) ** 2
+                variance[c] = (_sigma(1.0 / d, min_noise) * d * d) ** 2
+            score[c] = variance[c] + fits[3, r, c] + (d - fits[2, r, c]) ** 2
         for dy in (0, -window, window):
             if not 0 <= r + dy < rows:
                 continue
@@ -212,14 +222,14 @@ def _best_planes(inverse: Float32, fits: Float32, window: int) -> Float32:
                 first, last = max(0, -dx), min(columns, columns - dx)
                 _take_better(
                     inverse[r, first:last], fits[:, r + dy, first + dx : last + dx], np.float32(dx), np.float32(dy),
-                    noise[first:last], score[first:last], planes[:, r, first:last],
+                    variance[first:last], score[first:last], planes[:, r, first:last],
                 )  # fmt: skip
     return planes
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _take_better(
-    own: Float32, fit: Float32, dx: np.float32, dy: np.float32, noise: Float32, score: Float32, plane: Float32
+    own: Float32, fit: Float32, dx: np.float32, dy: np.float32, variance: Float32, score: Float32, plane: Float32
 ) -> None:  # fmt: skip
     switch = np.float32(SWITCH)
     fit_a, fit_b, fit_c, residual = fit
@@ -227,7 +237,7 @@ def _take_better(
     for c in range(len(own)):
         here = fit_c[c] - fit_a[c] * dx - fit_b[c] * dy
         off = own[c] - here
-        offered = switch * (noise[c] + residual[c] + off * off)
+        offered = switch * (variance[c] + residual[c] + off * off)
         better = (offered < score[c]) & (own[c] > np.float32(0))
         plane_a[c] = fit_a[c] if better else plane_a[c]
         plane_b[c] = fit_b[c] if better else plane_b[c]
@@ -236,13 +246,13 @@ def _take_better(
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _edges(planes: Float32, pinhole: Float32, noise_factor: float, max_angle: float, normal_sigma_1m: float) -> Bool:
+def _edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
     """(rows, columns) cells without a plane, and those between two opposite neighbors where the surface ends."""
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
     for r in prange(rows):
         y = np.float32(r) - pinhole[3]
-        _set_surface(planes[:, r], y, pinhole, noise_factor, max_angle, normal_sigma_1m, surface[:, r])
+        _set_surface(planes[:, r], y, pinhole, noise, max_angle, normal_sigma_1m, surface[:, r])
     edges = np.zeros((rows, columns), np.bool_)
     for row in prange(rows):
         r = np.int64(row)
@@ -261,7 +271,7 @@ def _edges(planes: Float32, pinhole: Float32, noise_factor: float, max_angle: fl
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _set_surface(
-    plane: Float32, y: np.float32, pinhole: Float32, noise_factor: float, max_angle: float, normal_sigma_1m: float,
+    plane: Float32, y: np.float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float,
     surface: Float32,
 ) -> None:  # fmt: skip
     """Of a row: unit normals (3) away from the camera, the planes' distances, points (3), what distance to a plane is
@@ -273,7 +283,8 @@ def _set_surface(
     fx, fy, cx, _ = pinhole
     a, b, d = plane
     nx, ny, nz, distance, px, py, pz, gate, min_cosine = surface
-    k, angle, angle_sigma = np.float32(noise_factor), np.float32(max_angle), np.float32(normal_sigma_1m)
+    k, floor = np.float32(noise[0]), np.float32(noise[1])
+    angle, angle_sigma = np.float32(max_angle), np.float32(normal_sigma_1m)
     for c in range(len(d)):
         there = d[c] > zero
         x = np.float32(c) - cx
@@ -283,7 +294,8 @@ def _set_surface(
         nx[c], ny[c], nz[c], distance[c] = mx * length, my * length, mz * length, length
         px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if there else zero
         offset = z - np.float32(0.4)
-        gate[c] = k * (np.float32(0.0012) + np.float32(0.0019) * offset * offset)
+        sigma = np.float32(0.0012) + np.float32(0.0019) * offset * offset
+        gate[c] = k * (sigma if sigma > floor else floor)
         # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; an angle beyond it is no crease
         t = angle + gate[c] * angle_sigma / z
         t2 = t * t
@@ -341,29 +353,11 @@ def _pass_on(source: Bool, value: bool, target: Bool) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _root(parents: Int32, cell: int) -> int:
-    while parents[cell] != cell:
-        parents[cell] = parents[parents[cell]]
-        cell = parents[cell]
-    return cell
-
-
-@njit(cache=True, nogil=True)
-def _unite(parents: Int32, a: int, b: int) -> None:
-    """The smaller cell becomes the root: a piece is named after its first cell, whatever the order of unions."""
-    a, b = _root(parents, a), _root(parents, b)
-    if a < b:
-        parents[b] = a
-    else:
-        parents[a] = b
-
-
-@njit(cache=True, nogil=True)
 def _unite_row(
-    inverse: Float32, edges: Bool, noise_factor: float, slope: np.float32, r: int, upwards: bool, parents: Int32
+    inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
 ) -> None:  # fmt: skip
     """Unites the cells of row r with those to their left, or above them, where depth does not jump."""
-    rows, columns = inverse.shape
+    columns = inverse.shape[1]
     step = columns if upwards else 1
     flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
     for cell in range(r * columns + (not upwards), (r + 1) * columns):
@@ -371,14 +365,12 @@ def _unite_row(
         if flat_edges[cell] or flat_edges[other] or parents[cell] == parents[other]:
             continue
         d, e = flat_inverse[cell], flat_inverse[other]
-        if abs(d - e) < noise_factor * _sigma(1.0 / d) * d * d + slope * d:
-            _unite(parents, cell, other)
+        if abs(d - e) < _noise_at(d, noise) + slope * d:
+            unite(parents, cell, other)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _connected(
-    inverse: Float32, edges: Bool, noise_factor: float, slope: np.float32, min_cells: int
-) -> tuple[Int32, int]:
+def _connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
     """Connected pieces of cells that are no edge: (rows, columns) in [0, count), -1 = edge or too small a piece."""
     rows, columns = inverse.shape
     parents = np.arange(rows * columns).astype(np.int32)
@@ -386,31 +378,31 @@ def _connected(
     for strip in prange(strips):
         s = np.int64(strip)
         for r in range(s * STRIP, min((s + 1) * STRIP, rows)):
-            _unite_row(inverse, edges, noise_factor, slope, r, False, parents)
+            _unite_row(inverse, edges, noise, slope, r, False, parents)
             if r > s * STRIP:
-                _unite_row(inverse, edges, noise_factor, slope, r, True, parents)
+                _unite_row(inverse, edges, noise, slope, r, True, parents)
     for s in range(1, strips):
-        _unite_row(inverse, edges, noise_factor, slope, s * STRIP, True, parents)
+        _unite_row(inverse, edges, noise, slope, s * STRIP, True, parents)
     sizes = np.zeros(rows * columns, np.int32)
     flat_edges = edges.ravel()
     for cell in range(rows * columns):
         if not flat_edges[cell]:
-            sizes[_root(parents, cell)] += 1
+            sizes[root(parents, cell)] += 1
     numbers, count = np.full(rows * columns, -1, np.int32), 0
     labels = np.full(rows * columns, -1, np.int32)
     for cell in range(rows * columns):
-        root = _root(parents, cell)
-        if flat_edges[cell] or sizes[root] < min_cells:
+        first = root(parents, cell)
+        if flat_edges[cell] or sizes[first] < min_cells:
             continue
-        if numbers[root] < 0:
-            numbers[root] = count
+        if numbers[first] < 0:
+            numbers[first] = count
             count += 1
-        labels[cell] = numbers[root]
+        labels[cell] = numbers[first]
     return labels.reshape((rows, columns)), count
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise_factor: float) -> tuple[Int32, Float32]:
+def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
     """One step of the segments into the cells that have none: to the neighbor whose plane foretells the cell best."""
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
@@ -420,7 +412,7 @@ def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise_factor: fl
             d = inverse[r, c]
             if labels[r, c] >= 0 or d <= 0:
                 continue
-            least = np.float32(noise_factor * _sigma(1.0 / d)) * d * d
+            least = _noise_at(d, noise)
             for dy, dx in ((0, -1), (-1, 0), (0, 1), (1, 0)):
                 s, t = r + dy, c + dx
                 if not (0 <= s < rows and 0 <= t < columns) or labels[s, t] < 0:
@@ -436,7 +428,7 @@ def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise_factor: fl
 
 @njit(cache=True, nogil=True, parallel=True)
 def _pixel_labels(
-    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise_factor: float
+    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise
 ) -> Int32:  # fmt: skip
     """(H, W) of the cells nearest to a pixel (its own, and those beside it) the label of the one that foretells it."""
     height, width = depth.shape
@@ -450,7 +442,7 @@ def _pixel_labels(
             if inverse[r, c] <= 0:
                 continue
             d = inverse[r, c]
-            gate = np.float32(noise_factor * _sigma(1.0 / d)) * d * d
+            gate = _noise_at(d, noise)
             label = labels[r, c]
             alone = True  # in the midst of a segment there is nothing to choose
             for n in range(9):

@@ -215,7 +215,8 @@ def _level(fitted: mixture.Mixtures, boxes: Float64, chosen: Int64, above: Float
     outliers = np.where(kept.any(axis=1), fitted.outlier_weights, 0.0)
     totals = weights.sum(axis=1) + outliers
     scale = above[chosen] / np.where(totals > 0, totals, 1.0)
-    counts, outlier_weights, outlier_boxes = np.zeros(len(above), np.int64), np.zeros(len(above)), np.zeros((len(above), 2, 3))
+    counts, outlier_weights = np.zeros(len(above), np.int64), np.zeros(len(above))
+    outlier_boxes = np.zeros((len(above), 2, 3))
     counts[chosen] = kept.sum(axis=1)
     outlier_weights[chosen] = outliers * scale
     outlier_boxes[chosen] = np.where(kept.any(axis=1)[:, None, None], boxes, 0.0)

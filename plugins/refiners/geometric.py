@@ -15,7 +15,6 @@ from framework.refinement.convexity import Limits, segments
 from framework.refinement.selection import keep_points
 
 
-
 @dataclass
 class Geometric(ClusterRefiner):
     """Makes each cluster the union of the convex segments of the depth image that its mask covers.
@@ -31,6 +30,7 @@ class Geometric(ClusterRefiner):
     cell: int = 2  # px, from 1: side of the squares whose readings are averaged
     window: int = 3  # cells, from 1: planes are fitted to squares of 2 window + 1 cells
     noise_factor: float = 3.0  # from 0.1, standard deviations of a structured-light camera's depth that count as noise
+    min_noise: float = 0.0  # m, from 0, least standard deviation of depth: where readings are rounded, half a step
     max_slope: float = 4.0  # m per m, from 0.1: steeper against the line of sight, depth jumps (4: 76 degrees)
     max_angle: float = 15.0  # degrees, in (0, 90): a surface bent more towards the camera, and more than noise, is cut
     closing: int = 1  # cells, from 0: gaps in edges up to twice as wide are closed
@@ -44,13 +44,14 @@ class Geometric(ClusterRefiner):
             cell=(1, 16),
             window=(1, 16),
             noise_factor=(0.1, 100.0),
+            min_noise=(0.0, 1.0),
             max_slope=(0.1, 100.0),
             max_angle=(1e-3, 89.0),
             closing=(0, 16),
             min_segment=(1, 10**9),
             min_overlap=(0.0, 1 - 1e-6),
         )
-        self.limits = Limits(self.noise_factor, self.max_slope, float(np.deg2rad(self.max_angle)))
+        self.limits = Limits(self.noise_factor, self.min_noise, self.max_slope, float(np.deg2rad(self.max_angle)))
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact or len(clusters) == 0:
