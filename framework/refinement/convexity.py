@@ -78,7 +78,7 @@ def segments(
     # poles and legs are edges all over: what no segment took hangs together by depth alone
     rest, rest_count = _connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
     labels = np.where(rest >= 0, rest + count, labels)
-    return _pixel_labels(depth, inverse, labels, planes, cell, noise), int(count + rest_count)
+    return _pixel_labels(depth, inverse, labels, planes, cell, noise, slope), int(count + rest_count)
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
@@ -98,7 +98,7 @@ def _cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float3
     rows, columns = -(-height // cell), -(-width // cell)
     inverse = np.zeros((rows, columns), np.float32)
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         for c in range(columns):
             nearest = np.float32(np.inf)
             for v in range(r * cell, min((r + 1) * cell, height)):
@@ -159,7 +159,7 @@ def _fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) 
     rows, columns = inverse.shape
     fits = np.zeros((4, rows, columns), np.float32)
     for row in prange(rows):
-        r = np.int64(row)  # prange counts in unsigned numbers
+        r = int(np.int64(row))  # prange counts in unsigned numbers
         gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
         _gates(inverse[r], noise, slope, gate, gate_slope)
         sums = np.zeros((10, columns), np.float32)
@@ -206,7 +206,7 @@ def _best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float)
     rows, columns = inverse.shape
     planes = fits[:3].copy()
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         score, variance = np.empty(columns, np.float32), np.zeros(columns, np.float32)
         for c in range(columns):
             d = inverse[r, c]
@@ -255,7 +255,7 @@ def _edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, no
         _set_surface(planes[:, r], y, pinhole, noise, max_angle, normal_sigma_1m, surface[:, r])
     edges = np.zeros((rows, columns), np.bool_)
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         for c in range(columns):
             edges[r, c] = planes[2, r, c] <= 0
         for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
@@ -264,7 +264,7 @@ def _edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, no
             first, last = abs(dx), columns - abs(dx)
             _mark_between(
                 surface[:, r - dy, first - dx : last - dx], surface[:, r + dy, first + dx : last + dx],
-                edges[r, first:last],
+                np.float32(4 * np.sqrt(dx * dx + dy * dy) / (pinhole[0] + pinhole[1])), edges[r, first:last],
             )  # fmt: skip
     return edges
 
@@ -303,8 +303,12 @@ def _set_surface(
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
-def _mark_between(one: Float32, other: Float32, edges: Bool) -> None:
-    """Marks cells whose two opposite neighbors are too far off each other's plane, or bend towards the camera."""
+def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
+    """Marks cells whose two opposite neighbors are too far off each other's plane, or bend towards the camera.
+
+    `spacing` is the distance between the two at 1 m. By as much each may lie behind the other's plane, which is how
+    two faces meet at a convex edge; before a step, one of them lies in front.
+    """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
     bx, by, bz, bd, bpx, bpy, bpz, _, _ = other
@@ -314,7 +318,8 @@ def _mark_between(one: Float32, other: Float32, edges: Bool) -> None:
         g = bd[c] - (bx[c] * apx[c] + by[c] * apy[c] + bz[c] * apz[c])
         cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
         far, near = h if h > zero else -h, g if g > zero else -g
-        jump = (far if far < near else near) > gate[c]
+        z = apz[c] if apz[c] < bpz[c] else bpz[c]
+        jump = (far if far < near else near) > gate[c] + (spacing * z if h * g > zero else zero)
         concave = (h + g > zero) & (cosine < min_cosine[c])
         both = (apz[c] > zero) & (bpz[c] > zero)
         edges[c] |= both & (jump | concave)
@@ -333,13 +338,13 @@ def _spread(marked: Bool, radius: int, value: bool) -> Bool:
     rows, columns = marked.shape
     across, both = np.empty_like(marked), np.empty_like(marked)
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         across[r] = marked[r]
         for dx in range(1, min(radius, columns - 1) + 1):
             _pass_on(marked[r, dx:], value, across[r, :-dx])
             _pass_on(marked[r, :-dx], value, across[r, dx:])
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         both[r] = across[r]
         for s in range(max(r - radius, 0), min(r + radius + 1, rows)):
             _pass_on(across[s], value, both[r])
@@ -376,7 +381,7 @@ def _connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, m
     parents = np.arange(rows * columns).astype(np.int32)
     strips = -(-rows // STRIP)
     for strip in prange(strips):
-        s = np.int64(strip)
+        s = int(np.int64(strip))
         for r in range(s * STRIP, min((s + 1) * STRIP, rows)):
             _unite_row(inverse, edges, noise, slope, r, False, parents)
             if r > s * STRIP:
@@ -407,7 +412,7 @@ def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) ->
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         for c in range(columns):
             d = inverse[r, c]
             if labels[r, c] >= 0 or d <= 0:
@@ -428,15 +433,19 @@ def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) ->
 
 @njit(cache=True, nogil=True, parallel=True)
 def _pixel_labels(
-    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise
+    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise,
+    slope: np.float32,
 ) -> Int32:  # fmt: skip
-    """(H, W) of the cells nearest to a pixel (its own, and those beside it) the label of the one that foretells it."""
+    """(H, W) of the cells nearest to a pixel (its own, and those beside it) the label of the one that foretells it.
+
+    What none of their planes foretells takes the label of its own cell, where it lies near that cell's mean.
+    """
     height, width = depth.shape
     rows, columns = labels.shape
     found = np.full((height, width), -1, np.int32)
     middle = np.float32(0.5 * (cell - 1))
     for row in prange(rows):
-        r = np.int64(row)
+        r = int(np.int64(row))
         near_labels, near_planes = np.empty(9, np.int32), np.empty((9, 3), np.float32)
         for c in range(columns):
             if inverse[r, c] <= 0:
@@ -450,12 +459,9 @@ def _pixel_labels(
                 inside = 0 <= s < rows and 0 <= t < columns
                 near_labels[n] = labels[s, t] if inside else label
                 alone &= near_labels[n] == label
-            if not alone:
-                for n in range(9):
-                    s, t = min(max(r + n // 3 - 1, 0), rows - 1), min(max(c + n % 3 - 1, 0), columns - 1)
-                    _plane_of_cell(planes, inverse, s, t, near_planes[n])
-            else:
-                _plane_of_cell(planes, inverse, r, c, near_planes[4])
+            for n in range(0 if alone else 9):
+                s, t = min(max(r + n // 3 - 1, 0), rows - 1), min(max(c + n % 3 - 1, 0), columns - 1)
+                _plane_of_cell(planes, inverse, s, t, near_planes[n])
             for v in range(r * cell, min((r + 1) * cell, height)):
                 y = (np.float32(v - r * cell) - middle) / np.float32(cell)
                 for u in range(c * cell, min((c + 1) * cell, width)):
@@ -463,10 +469,9 @@ def _pixel_labels(
                         continue
                     x = (np.float32(u - c * cell) - middle) / np.float32(cell)
                     e = np.float32(1) / depth[v, u]
-                    plane = near_planes[4]
+                    if abs(e - d) < gate + slope * d:
+                        found[v, u] = label
                     if alone:
-                        if abs(e - plane[2] - plane[0] * x - plane[1] * y) < gate:
-                            found[v, u] = label
                         continue
                     least = gate
                     for dy in range(0 if y < 0 else 1, 3 if y > 0 else 2):

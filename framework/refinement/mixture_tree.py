@@ -13,10 +13,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32
 from framework.refinement import mixture
 from framework.refinement.gaussian import (
     ABSENT,
+    SIMD,
     constant_exponential,
     exponentials,
     log_densities,
@@ -59,15 +60,7 @@ class Level:
     def outlier_densities(self) -> Float64:
         """(Q,) of the uniform component within its box, 1 / m^3; 0 for a leaf, which has none."""
         volumes = np.prod(self.outlier_boxes[:, 1] - self.outlier_boxes[:, 0], axis=1)
-        return np.divide(1.0, volumes, out=np.zeros_like(volumes), where=volumes > 0)
-
-
-@dataclass(frozen=True)
-class Passage:
-    """What one level makes of points that have come down to the nodes above it."""
-
-    child: Int64  # (S,) the best node of the level; -1 = the uniform component is likelier than each of them
-    share: Float32  # (S,) in [0, 1], what the level's own nodes say together; see `MixtureTree.passed`
+        return np.asarray(np.where(volumes > 0, 1.0 / np.where(volumes > 0, volumes, 1.0), 0.0), np.float64)
 
 
 @dataclass(frozen=True)
@@ -117,23 +110,32 @@ class MixtureTree:
         totals = np.bincount(sets, sums, n)  # in the order of the blocks, whatever thread came first
         return np.asarray(totals / np.maximum(np.diff(starts), 1), np.float64)
 
-    def passed(
-        self, k: int, points: Float32, starts: Int64, shares: Float32 | None = None, log_odds: Float32 | None = None
-    ) -> Passage:
-        """Passes the points that came down to level `k` on: `points[starts[q]:starts[q + 1]]` are at node q above it.
+    def passed(self, k: int, points: Float32, starts: Int64) -> Int64:
+        """(S,) the best node of level `k` for each point; -1 = the uniform component is likelier than each of them.
 
-        Where each node of the level belongs by `shares` (M,) in [0, 1] to us, the passage's share of a point is that
-        of its responsibilities which is ours, with our densities multiplied by exp(`log_odds`) (S,).
+        `points[starts[q]:starts[q + 1]]` have come down to node q of the level above.
+        """
+        nodes, ones, odds = np.ones(len(self.levels[k])), np.ones(len(starts) - 1), np.zeros(len(points))
+        child, _ = self.shared(
+            k, points, starts, nodes.astype(np.float32), ones.astype(np.float32), odds.astype(np.float32)
+        )
+        return child
+
+    def shared(
+        self, k: int, points: Float32, starts: Int64, shares: Float32, above: Float32, log_odds: Float32
+    ) -> tuple[Int64, Float32]:
+        """`passed`, and (S,) in [0, 1] how much of each point is ours by the densities of this level.
+
+        A node is ours by its share in `shares` (M,), the uniform component below node q by `above[q]` (Q,). Our part
+        of the density is multiplied by exp(`log_odds`) (S,). A point at a leaf is not ours.
         """
         level = self.levels[k]
-        shares = np.ones(len(level), np.float32) if shares is None else shares
-        log_odds = np.zeros(len(points), np.float32) if log_odds is None else log_odds
         child, share = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
         _pass_down(
             points, log_odds, *_blocks(starts), _coefficients_of(level), shares, level.firsts, _log_outliers(level),
-            child, share,
+            above, child, share,
         )  # fmt: skip
-        return Passage(child, share)
+        return child, share
 
 
 def fit(
@@ -176,9 +178,11 @@ def fit(
         )
         boxes = _boxes(own, own_starts, 4 * np.sqrt(variance_floor))
         level = _level(fitted, boxes, chosen, above, min_support)
+        if grown and len(level) == 0:
+            break
         grown.append(level)
         if len(grown) < levels:
-            child = MixtureTree((level,)).passed(0, points, starts).child
+            child = MixtureTree((level,)).passed(0, points, starts)
             order, starts = grouped(child.astype(np.int32), len(level))
             points, above = points[order], level.weights
     return MixtureTree(tuple(grown))
@@ -209,8 +213,7 @@ def own_shares(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 def _level(fitted: mixture.Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
     """The level below nodes of the weights `above` (Q,), of which the `chosen` ones have been given children."""
-    kept = fitted.weights * above[chosen, None] >= min_support
-    kept &= fitted.weights > 0
+    kept: Bool = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     weights = np.where(kept, fitted.weights, 0.0)
     outliers = np.where(kept.any(axis=1), fitted.outlier_weights, 0.0)
     totals = weights.sum(axis=1) + outliers
@@ -345,21 +348,21 @@ def _boxes(points: Float32, starts: Int64, least_side: float) -> Float64:
 @njit(cache=True, nogil=True, parallel=True)
 def _pass_down(
     points: Float32, log_odds: Float32, nodes: Int64, begins: Int64, ends: Int64, rows: Float32, shares: Float32,
-    firsts: Int64, log_outliers: Float32, child: Int64, share: Float32,
+    firsts: Int64, log_outliers: Float32, above: Float32, child: Int64, share: Float32,
 ) -> None:  # fmt: skip
     for b in prange(len(nodes)):
         q, begin, end = nodes[b], begins[b], ends[b]
         first, last = firsts[q], firsts[q + 1]
         _pass_block(
             points[begin:end], log_odds[begin:end], rows[first:last], shares[first:last], first, log_outliers[q],
-            child[begin:end], share[begin:end],
+            above[q], child[begin:end], share[begin:end],
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _pass_block(
     points: Float32, log_odds: Float32, rows: Float32, shares: Float32, first: int, log_outlier: np.float32,
-    child: Int64, share: Float32,
+    above: np.float32, child: Int64, share: Float32,
 ) -> None:  # fmt: skip
     n, children = len(points), len(rows)
     child[:] = -1
@@ -379,13 +382,20 @@ def _pass_block(
                 child[i] = first + j
     evidence = np.empty(n, np.float32)
     constant_exponential(log_outlier, largest, evidence, n)
+    for i in range(n):
+        share[i] = above * evidence[i]
     for j in range(children):
         exponentials(densities[j], largest, evidence, n)
-        for i in range(n):
-            share[i] += shares[j] * densities[j, i]
+        _add_scaled(densities[j], shares[j], share)
     for i in range(n):
         ours = share[i] * np.exp(log_odds[i])
         share[i] = ours / (ours + max(evidence[i] - share[i], np.float32(0)))
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def _add_scaled(densities: Float32, share: np.float32, values: Float32) -> None:
+    for i in range(len(values)):
+        values[i] += share * densities[i]
 
 
 @njit(cache=True, nogil=True, parallel=True)

@@ -18,7 +18,7 @@ def root(parents: Int32, cell: int) -> int:
 
 @njit(cache=True, nogil=True)
 def unite(parents: Int32, a: int, b: int) -> None:
-    """Joins the pieces of two cells. The smaller root stays one: a piece is named after its first cell, in any order."""
+    """Joins the pieces of two cells. The smaller root stays one: pieces are named after their first cells."""
     a, b = root(parents, a), root(parents, b)
     if a < b:
         parents[b] = a

@@ -85,10 +85,10 @@ def _owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: 
         if label >= 0 and cluster[i] >= 0:
             covered[label, cluster[i]] += 1
     owners = np.full(count, -1, np.int32)
-    for label in range(count):
-        best = np.argmax(covered[label])
-        if covered[label, best] > min_overlap * sizes[label]:
-            owners[label] = best
+    for s in range(count):
+        best = np.argmax(covered[s])
+        if covered[s, best] > min_overlap * sizes[s]:
+            owners[s] = best
     return owners
 
 

@@ -26,7 +26,8 @@ class GmmTree(ClusterRefiner):
     flatter one. The mask comes in as evidence: every point has log-odds for the object by its place in mask or ring
     (those of `gmm_em`), and a node belongs to the object by the share that makes its points' evidence likeliest, held
     near its parent's where points are few (our choice). A point stays when the leaves that it comes down to, with its
-    own evidence, give the object more than `min_posterior`; a uniform component takes outliers.
+    own evidence, give the object more than `min_posterior`. Outliers, which a uniform component takes, are not the
+    object's; those below a node are by that node's share.
 
     Clusters only shrink: a dropped point leaves the arrays, clusters keep their index. Clusters with fewer than
     `min_points` points, or with as few in their ring, are left as they are.
@@ -99,7 +100,7 @@ class GmmTree(ClusterRefiner):
         points, odds, starts = sample.points_camera, self._evidence(sample), sample.starts
         above, shares = np.full(len(sample), 0.5, np.float32), []
         for k, level in enumerate(tree.levels):
-            child = tree.passed(k, points, starts).child
+            child = tree.passed(k, points, starts)
             order, starts = grouped(child.astype(np.int32), len(level))
             points, odds = points[order], odds[order]
             above = own_shares(odds, starts, above[level.parents], self.parent_points)
@@ -112,14 +113,15 @@ class GmmTree(ClusterRefiner):
         claimed = np.zeros(len(around.source), bool)
         points, odds = around.points_camera[of_mask], self._evidence(around)[of_mask]
         starts: Int64 = np.concatenate([[0], np.cumsum(around.mask_counts)])
+        above = np.zeros(len(around), np.float32)
         for k, level in enumerate(tree.levels):
-            passage = tree.passed(k, points, starts, shares[k], odds)
-            claimed[of_mask] = passage.share > self.min_posterior
+            child, share = tree.shared(k, points, starts, shares[k], above, odds)
+            claimed[of_mask] = share > self.min_posterior
             if k + 1 < len(tree.levels):
                 goes_on = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # -1, an outlier, ends here
-                key = np.where(goes_on[passage.child], passage.child, -1)
+                key = np.where(goes_on[child], child, -1)
                 order, starts = grouped(key.astype(np.int32), len(level))
-                of_mask, points, odds = of_mask[order], points[order], odds[order]
+                of_mask, points, odds, above = of_mask[order], points[order], odds[order], shares[k]
         return claimed
 
     def _evidence(self, around: Neighborhoods) -> Float32:
