@@ -10,6 +10,7 @@ from framework.errors import DataError
 from framework.geometry import nearest_rotation
 
 LEAST_SPREAD = 0.02  # m, root of the second eigenvalue of the scatter; single precision then moves 5 m by under 0.1 mm
+SAMPLE = 4096  # points that are looked at, evenly spaced: more change the pose by less than single precision does
 TOLERANCE = 1e-3  # m, that a point may lie off the reading that it comes from
 
 
@@ -20,14 +21,16 @@ def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
     Sets", PAMI 1987). None where the points leave a rotation open: too few, or all on one line. Raises DataError
     where no motion explains them, because they come from other readings.
     """
-    sums, scatter, cross = _sums(clusters.points_world, clusters.pixels, frame.depth, _pinhole(frame))
+    step = max(len(clusters.pixels) // SAMPLE, 1)
+    points_world, pixels = clusters.points_world[::step], clusters.pixels[::step]
+    sums, scatter, cross = _sums(points_world, pixels, frame.depth, _pinhole(frame))
     count = sums[0]
     if count < 3 or np.sqrt(max(np.linalg.eigvalsh(scatter)[1], 0.0)) < LEAST_SPREAD:
         return None
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = nearest_rotation(cross)
     T_world_camera[:3, 3] = sums[4:7] / count - T_world_camera[:3, :3] @ (sums[1:4] / count)
-    farthest = _farthest(clusters.points_world, clusters.pixels, frame.depth, _pinhole(frame), T_world_camera)
+    farthest = _farthest(points_world, pixels, frame.depth, _pinhole(frame), T_world_camera)
     if farthest > TOLERANCE:
         raise DataError(
             f"frame {frame.index}: the clusters' points lie up to {farthest:.3g} m off the depth readings at their "

@@ -163,9 +163,9 @@ def _fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) 
         gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
         _gates(inverse[r], noise, slope, gate, gate_slope)
         sums = np.zeros((10, columns), np.float32)
-        for dy in range(max(-window, -r), min(window, rows - 1 - r) + 1):
+        for dy in range(-window, window + 1):
             for dx in range(-window, window + 1):
-                if abs(dx) >= columns:
+                if not 0 <= r + dy < rows or abs(dx) >= columns:
                     continue
                 first, last = max(0, -dx), min(columns, columns - dx)
                 _add_offset(
@@ -346,8 +346,9 @@ def _spread(marked: Bool, radius: int, value: bool) -> Bool:
     for row in prange(rows):
         r = int(np.int64(row))
         both[r] = across[r]
-        for s in range(max(r - radius, 0), min(r + radius + 1, rows)):
-            _pass_on(across[s], value, both[r])
+        for dy in range(-radius, radius + 1):
+            if 0 <= r + dy < rows:
+                _pass_on(across[r + dy], value, both[r])
     return both
 
 

@@ -373,13 +373,12 @@ def _pass_block(
     for i in range(n):
         for a in range(3):
             xyz[a, i] = points[i, a]
-    largest = np.full(n, log_outlier)
+    largest, best = np.full(n, log_outlier), np.full(n, -1, np.int32)
     for j in range(children):
         log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
-        for i in range(n):
-            if densities[j, i] > largest[i]:
-                largest[i] = densities[j, i]
-                child[i] = first + j
+        _take_better(densities[j], np.int32(j), largest, best)
+    for i in range(n):
+        child[i] = first + best[i] if best[i] >= 0 else -1
     evidence = np.empty(n, np.float32)
     constant_exponential(log_outlier, largest, evidence, n)
     for i in range(n):
@@ -390,6 +389,14 @@ def _pass_block(
     for i in range(n):
         ours = share[i] * np.exp(log_odds[i])
         share[i] = ours / (ours + max(evidence[i] - share[i], np.float32(0)))
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def _take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
+    for i in range(len(largest)):
+        better = densities[i] > largest[i]
+        best[i] = j if better else best[i]
+        largest[i] = densities[i] if better else largest[i]
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
-from framework.data import Float32, Frame, Int32, PointClusters
+from framework.data import Bool, Frame, Int32, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.absolute_orientation import camera_pose, points_at
@@ -66,11 +66,9 @@ class Geometric(ClusterRefiner):
             min_pixels=self.min_segment,
         )
         owners = _owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, self.min_overlap)
-        owner_of = np.append(owners, np.int32(-1))[labels]  # (H, W) the cluster that each pixel is of, -1 = none
-        u, v = clusters.pixels[:, 0], clusters.pixels[:, 1]
-        kept = (clusters.cluster < 0) | (owner_of[v, u] == clusters.cluster)
-        refined = keep_points(clusters, np.asarray(kept, np.bool_))
-        return _grown(refined, clusters, frame, owner_of) if self.whole_segments else refined
+        kept, missing, missing_owner = _judged(clusters.pixels, clusters.cluster, labels, owners)
+        refined = keep_points(clusters, kept)
+        return _grown(refined, clusters, frame, missing, missing_owner) if self.whole_segments else refined
 
 
 @njit(cache=True, nogil=True)
@@ -92,22 +90,43 @@ def _owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: 
     return owners
 
 
-def _grown(refined: PointClusters, clusters: PointClusters, frame: Frame, owner_of: Int32) -> PointClusters:
-    """The refined clusters with those pixels of theirs that were not in their masks."""
-    missing = owner_of >= 0
-    own = refined.cluster >= 0
-    missing[refined.pixels[own, 1], refined.pixels[own, 0]] = False  # a pixel has one owner: all others are gone
-    v, u = np.nonzero(missing)
-    if len(u) == 0:
-        return refined
-    T_world_camera = camera_pose(clusters, frame)
+@njit(cache=True, nogil=True)
+def _judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
+    """(P,) the points that stay; (A, 2) pixels of owned segments that their owner lacks, and (A,) the owner."""
+    height, width = labels.shape
+    kept, there = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
+    for i in range(len(cluster)):
+        u, v = pixels[i, 0], pixels[i, 1]
+        if cluster[i] >= 0:
+            kept[i] = labels[v, u] >= 0 and owners[labels[v, u]] == cluster[i]
+            there[v, u] |= kept[i]
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            there[v, u] |= labels[v, u] < 0 or owners[labels[v, u]] < 0
+            count += not there[v, u]
+    missing, owner = np.empty((count, 2), np.int32), np.empty(count, np.int32)
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            if not there[v, u]:
+                missing[count, 0], missing[count, 1] = u, v
+                owner[count] = owners[labels[v, u]]
+                count += 1
+    return kept, missing, owner
+
+
+def _grown(
+    refined: PointClusters, clusters: PointClusters, frame: Frame, missing: Int32, missing_owner: Int32
+) -> PointClusters:
+    """The refined clusters with the readings at the `missing` pixels, each in its owner's."""
+    T_world_camera = camera_pose(clusters, frame) if len(missing) else None
     if T_world_camera is None:
         return refined
-    pixels = np.stack([u, v], axis=1).astype(np.int32)
-    added: Float32 = points_at(pixels, frame, T_world_camera)
+    added = points_at(missing, frame, T_world_camera)
     return replace(
         refined,
         points_world=np.concatenate([refined.points_world, added]),
-        pixels=np.concatenate([refined.pixels, pixels]),
-        cluster=np.concatenate([refined.cluster, owner_of[v, u]]),
+        pixels=np.concatenate([refined.pixels, missing]),
+        cluster=np.concatenate([refined.cluster, missing_owner]),
     )
