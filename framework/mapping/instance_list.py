@@ -25,19 +25,21 @@ def list_instances(mesh: InstanceMesh, table: InstanceTable) -> Mapping[int, Ins
     ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
     ends = [*starts[1:], len(order)]
     return {
-        int(k): _instance(table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
+        int(k): _instance(table, table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
         for k, start, end in zip(ids, starts, ends, strict=False)
         if k > 0
     }
 
 
-def _instance(record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
+def _instance(table: InstanceTable, record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return Instance(
         id=record.id,
-        class_probabilities=record.class_probabilities,
+        class_probabilities=table.class_probabilities(record),
         confidence=record.confidence,
         observations=record.observations,
+        first_frame=record.first_frame,
+        last_frame=record.last_frame,
         vertices=vertices,
         aabb=Box((low + high) / 2, high - low, np.eye(3)),
         obb=_oriented_box(points),

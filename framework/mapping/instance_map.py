@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
-import zlib
 from collections.abc import Mapping
-from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import open3d as o3d
 
-from framework.atomic_files import written_whole
-from framework.data import Bool, Box, Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
-from framework.errors import DataError
+from framework.data import Bool, Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.interfaces import SceneMap
 from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
-from framework.mapping.instance_table import InstanceRecord, InstanceTable
+from framework.mapping.instance_list import instances_that_count, list_instances
+from framework.mapping.instance_table import InstanceTable
+from framework.mapping.map_file import plain_table, read_map, table_of, write_map
 from framework.mapping.meshing import SurfaceNets
 from framework.mapping.raycasting import render, render_near
 from framework.mapping.sensor import Sensor
@@ -133,37 +127,10 @@ class InstanceMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def _counts(self) -> Bool:
-        """(ids + 1,) whether an instance has been observed often enough, by id."""
-        counts = np.zeros(self.table.last_id + 1, np.bool_)
-        for record in self.table.records.values():
-            enough = record.observations >= self.min_observations
-            counts[record.id] = enough and record.confidence >= self.min_confidence
-        return counts
+        return instances_that_count(self.table, self.min_observations, self.min_confidence)
 
     def instances(self) -> Mapping[int, Instance]:
-        mesh = self.mesh()
-        order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
-        ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
-        ends = [*starts[1:], len(order)]
-        return {
-            int(k): self._instance(self.table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
-            for k, start, end in zip(ids, starts, ends, strict=False)
-            if k > 0
-        }
-
-    def _instance(self, record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
-        low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
-        return Instance(
-            id=record.id,
-            class_probabilities=self.table.class_probabilities(record),
-            confidence=record.confidence,
-            observations=record.observations,
-            first_frame=record.first_frame,
-            last_frame=record.last_frame,
-            vertices=vertices,
-            aabb=Box((low + high) / 2, high - low, np.eye(3)),
-            obb=_oriented_box(points),
-        )
+        return list_instances(self.mesh(), self.table)
 
     def save(self, path: Path) -> None:
         grid, evidence = self.voxels.grid, self.labels.evidence
@@ -176,32 +143,21 @@ class InstanceMap(SceneMap):
             "min_observations": self.min_observations,
             "min_confidence": self.min_confidence,
             "min_vertices": self.min_vertices,
-            "combine": self.labels.combine.name,
-            "logarithmic": self.table.logarithmic,
             "storage": self.labels.storage.name,
             "classes": self.classes,
-            "last_id": self.table.last_id,
             "evicted": self.labels.evicted,
-            "instances": [
-                {
-                    **asdict(record),
-                    "class_evidence": record.class_evidence.tolist(),
-                    "observed_in": sorted(record.observed_in),
-                }
-                for record in self.table.records.values()
-            ],
+            "table": plain_table(self.table),
         }
         arrays: dict[str, npt.NDArray[Any]] = {
-            "header": np.frombuffer(json.dumps(header).encode(), np.uint8),
             **{name: getattr(grid, name)[:b] for name in BLOCK_ARRAYS},
             **{name: array[:r] for name, array in evidence._asdict().items()},
         }
-        with written_whole(path) as temporary:
-            _write(temporary, arrays)
+        write_map(path, header, arrays)
 
     @classmethod
     def load(cls, path: Path) -> InstanceMap:
-        header, arrays = _read(path)
+        header, arrays = read_map(path, FORMAT, ARRAYS)
+        table = table_of(header["table"])
         scene = cls(
             header["voxel_size"],
             Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()}),
@@ -209,8 +165,8 @@ class InstanceMap(SceneMap):
             header["min_observations"],
             header["min_confidence"],
             header["min_vertices"],
-            Combine[header["combine"]],
-            header["logarithmic"],
+            table.combine,
+            table.logarithmic,
             Storage[header["storage"]],
         )
         scene.begin(tuple(header["classes"]))
@@ -222,48 +178,5 @@ class InstanceMap(SceneMap):
         scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
         scene.labels.row_count = len(scene.labels.evidence.instance_ids)
         scene.labels.evicted = header["evicted"]
-        scene.table.last_id = header["last_id"]
-        for entry in header["instances"]:
-            evidence, observed_in = np.array(entry.pop("class_evidence")), set(entry.pop("observed_in"))
-            record = InstanceRecord(class_evidence=evidence, observed_in=observed_in, **entry)
-            scene.table.records[record.id] = record
+        scene.table = table
         return scene
-
-
-def _write(path: Path, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
-    """Writes an .npz as np.load reads it: the same arrays give the same bytes, and light compression.
-
-    Label rows are mostly zeros and distances far from the surface all alike: level 1 makes a map a fifth of its size,
-    at about the speed of a disk.
-    """
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, array in arrays.items():
-            file = io.BytesIO()
-            np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), file.getbuffer(), zipfile.ZIP_DEFLATED, compresslevel=1)
-
-
-def _read(path: Path) -> tuple[dict[str, Any], dict[str, npt.NDArray[Any]]]:
-    """The header and the arrays of a saved map. Raises DataError for another format or a checksum that fails."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-        if damaged is not None:
-            raise DataError(f"{path}: the checksum of {damaged} does not hold; the file is damaged, map again")
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(file["header"].tobytes())
-            if header.get("format") != FORMAT:  # its arrays may have other names
-                raise DataError(f"{path} has map format {header.get('format')}, this version reads {FORMAT}; map again")
-            arrays = {name: file[name] for name in ARRAYS}
-    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
-        raise DataError(f"{path} is not a map that can be read: {error}") from error
-    return header, arrays
-
-
-def _oriented_box(points: Float32) -> Box:
-    """The box along the principal axes of the points' convex hull (Open3D); `robust` lets flat and thin sets pass."""
-    four = np.resize(points, (max(len(points), 4), 3))  # Qhull refuses fewer; repeated points change nothing
-    box = o3d.geometry.OrientedBoundingBox.create_from_points(
-        o3d.utility.Vector3dVector(four.astype(np.float64)), robust=True
-    )
-    return Box(np.asarray(box.center), np.asarray(box.extent), np.asarray(box.R))

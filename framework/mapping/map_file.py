@@ -16,6 +16,7 @@ import numpy as np
 from framework.atomic_files import written_whole
 from framework.data import Array
 from framework.errors import DataError
+from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 
 
@@ -47,7 +48,7 @@ def read_map(path: Path, expected_format: object, names: Sequence[str]) -> tuple
             header = json.loads(file["header"].tobytes())
             found = header.get("format")
             if found != expected_format:  # its arrays may have other names
-                raise DataError(f"{path} has map format {found}, expected {expected_format}; map again")
+                raise DataError(f"{path} has map format {found}, this version reads {expected_format}; map again")
             arrays = {name: file[name] for name in names}
     except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise DataError(f"{path} is not a map that can be read: {error}") from error
@@ -57,9 +58,15 @@ def read_map(path: Path, expected_format: object, names: Sequence[str]) -> tuple
 def plain_table(table: InstanceTable) -> dict[str, Any]:
     """The table of instances as JSON can hold it."""
     return {
+        "combine": table.combine.name,
+        "logarithmic": table.logarithmic,
         "last_id": table.last_id,
         "instances": [
-            {**asdict(record), "class_log": record.class_log.tolist(), "observed_in": sorted(record.observed_in)}
+            {
+                **asdict(record),
+                "class_evidence": record.class_evidence.tolist(),
+                "observed_in": sorted(record.observed_in),
+            }
             for record in table.records.values()
         ],
     }
@@ -67,10 +74,10 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
 
 def table_of(plain: Mapping[str, Any]) -> InstanceTable:
     """The table that `plain_table` wrote down."""
-    table = InstanceTable()
+    table = InstanceTable(Combine[plain["combine"]], plain["logarithmic"])
     table.last_id = plain["last_id"]
     for entry in plain["instances"]:
-        mended = {"class_log": np.array(entry["class_log"]), "observed_in": set(entry["observed_in"])}
+        mended = {"class_evidence": np.array(entry["class_evidence"]), "observed_in": set(entry["observed_in"])}
         record = InstanceRecord(**{**entry, **mended})
         table.records[record.id] = record
     return table

@@ -365,7 +365,7 @@ class Open3DMap(SceneMap):
         """(ids + 1,) the most likely class of each instance; -1 for none."""
         class_ids = np.full(self.table.last_id + 1, -1, np.int32)
         for record in self.table.records.values():
-            class_ids[record.id] = record.class_log.argmax()
+            class_ids[record.id] = record.class_evidence.argmax()
         return class_ids
 
     def instances(self) -> Mapping[int, Instance]:

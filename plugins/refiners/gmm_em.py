@@ -10,6 +10,7 @@ from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement import lloyd, mixture
+from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, neighborhoods
 from framework.refinement.selection import keep_points
 
@@ -110,13 +111,7 @@ class GmmEm(ClusterRefiner):
         return labels
 
     def _prior(self, around: Neighborhoods) -> Float32:
-        """(S,) log-odds of each point for the object, from where it lies in the mask or the ring.
-
-        A mask too thin for the whole ramp gets a shorter one, so that its innermost points always speak for the object.
-        """
-        reach = np.maximum(np.minimum(around.ring_widths, around.mask_radii), 1).astype(np.float32)
-        ramp = (around.depth_in_mask / reach[around.owner] - self.expected_bleed) / (1 - self.expected_bleed)
-        return np.asarray(self.mask_log_odds * np.clip(ramp, -1, 1), np.float32)
+        return mask_log_odds(around, self.mask_log_odds, self.expected_bleed)
 
 
 def _counts(chosen: Bool, sample: Neighborhoods) -> Int64:

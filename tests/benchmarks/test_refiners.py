@@ -1,4 +1,4 @@
-"""Speed of the refiners: ten masks in a 640x480 frame, and gmm_em's mixtures beside scikit-learn's.
+"""Speed of the refiners: ten masks in a 640x480 frame, and gmm_em's mixtures beside scikit-learn's and gmm_tree's.
 
 Run with `python -m pytest tests/benchmarks/test_refiners.py -s`.
 """
@@ -14,10 +14,12 @@ from sklearn.mixture import GaussianMixture
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
-from framework.refinement import mixture
+from framework.refinement import mixture, mixture_tree
 from framework.refinement.neighborhood import neighborhoods
 from plugins.refiners.dbscan import Dbscan
+from plugins.refiners.geometric import Geometric
 from plugins.refiners.gmm_em import GmmEm
+from plugins.refiners.gmm_tree import GmmTree
 from plugins.refiners.identity import Identity
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
@@ -49,7 +51,17 @@ def ten_masks() -> tuple[PointClusters, Frame]:
 
 @pytest.mark.parametrize(
     "refiner",
-    [Identity(), GmmEm(), KMeans(), LargestComponent(), PlaneRemoval(), Dbscan(), RankOrder()],
+    [
+        Identity(),
+        GmmEm(),
+        GmmTree(),
+        KMeans(),
+        LargestComponent(),
+        PlaneRemoval(),
+        Dbscan(),
+        RankOrder(),
+        Geometric(),
+    ],
     ids=lambda r: type(r).__name__,
 )
 def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
@@ -104,3 +116,35 @@ def test_em_beside_scikit_learn(benchmark):
     print(f"\nEM of {MASKS} mixtures: {1e3 * benchmark.stats.stats.median:.1f} ms, scikit-learn "
           f"{1e3 * their_seconds:.0f} ms: {ratio:.0f} times faster")  # fmt: skip
     assert ratio > 5
+
+
+@pytest.mark.parametrize(("levels", "components"), [(2, 64), (3, 512)])
+def test_tree_beside_flat_mixture(benchmark, levels: int, components: int):
+    """As many Gaussians, the same kind of start, iterations and points, of ten masks at once: who is faster."""
+    clusters, frame = ten_masks()
+    sample = neighborhoods(clusters, frame, 0.25, 4, 12).thinned(10_000)
+    points, starts = sample.points_camera, sample.starts
+    em = {"max_iterations": 8, "tolerance": 1e-3, "variance_floor": 0.01**2, "outlier_fraction": 0.02}
+
+    def tree() -> mixture_tree.MixtureTree:
+        return mixture_tree.fit(points, starts, levels=levels, children=8, min_support=0.0, min_points=32, **em)
+
+    def flat() -> mixture.Mixtures:
+        return mixture.fit(points, starts, mixture_tree.cut(points, starts, components), components, **em)
+
+    tree(), flat()
+    grown = benchmark.pedantic(tree, rounds=9)
+    seconds = []
+    for _ in range(5):
+        begin = time.perf_counter()
+        fitted = flat()
+        seconds.append(time.perf_counter() - begin)
+    ratio = float(np.median(seconds)) / benchmark.stats.stats.median
+    benchmark.extra_info["times faster than flat"] = ratio
+    leaves = sum(len(rows) for _, rows in grown.leaves(levels)) / MASKS
+    likelihood = float(grown.log_likelihoods(points, starts).mean())
+    tree_ms, flat_ms = 1e3 * benchmark.stats.stats.median, 1e3 * float(np.median(seconds))
+    print(f"\n{MASKS} mixtures of {components} ({leaves:.0f} leaves): tree {tree_ms:.0f} ms, flat {flat_ms:.0f} ms, "
+          f"{ratio:.1f} times faster; log p {likelihood:.2f} and {fitted.log_likelihoods.mean():.2f}")  # fmt: skip
+    assert leaves > 0.8 * components
+    assert ratio > 1

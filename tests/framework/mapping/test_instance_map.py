@@ -10,7 +10,8 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import lift
-from framework.mapping.instance_map import FORMAT, InstanceMap, _oriented_box
+from framework.mapping.instance_list import _oriented_box
+from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.integration import Integrator
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.analytic_scene import Scene, room, walk

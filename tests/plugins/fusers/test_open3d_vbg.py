@@ -240,7 +240,7 @@ def test_ids_stay_with_their_objects_and_are_those_of_the_other_fuser(frames: li
         for fuser in (ours, theirs):
             fused(fuser, frame, [masks_of(frame)[i] for i in order], [0.9] * 3)  # type: ignore[arg-type]
     histories = [
-        {k: (r.observations, r.visible, r.detections, r.class_log.tolist()) for k, r in f.scene.table.records.items()}
+        {k: (r.observations, r.visible, r.detections, r.class_evidence.tolist()) for k, r in f.scene.table.records.items()}
         for f in (ours, theirs)
     ]
     assert len(histories[0]) == 3
@@ -350,7 +350,7 @@ def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path)
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match="map format 2, expected open3d_vbg"):
+    with pytest.raises(DataError, match="map format 3, this version reads open3d_vbg"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")

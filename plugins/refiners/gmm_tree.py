@@ -1,0 +1,128 @@
+"""Cluster refinement by a tree of Gaussian mixtures: many small patches of surface at the price of a few."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Bool, Float32, Frame, PointClusters
+from framework.interfaces import ClusterRefiner
+from framework.parameters import check_bounds
+from framework.refinement import mixture_tree
+from framework.refinement.mask_evidence import mask_log_odds
+from framework.refinement.mixture_tree import MixtureTree, own_shares
+from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, grouped, neighborhoods
+from framework.refinement.selection import keep_points
+
+
+@dataclass
+class GmmTree(ClusterRefiner):
+    """Drops the points on patches of surface that lie outside of the object, found by hierarchical EM.
+
+    One tree of mixtures (Eckart et al., CVPR 2016) for each mask, over its points and the ring around it together. A
+    tree cannot start from mask and ring as `gmm_em` does: what its first level put on the wrong side no deeper level
+    could bring back. So its nodes know nothing of the mask; each is a patch of surface, at deeper levels a smaller and
+    flatter one. The mask comes in as evidence: every point has log-odds for the object by its place in mask or ring
+    (those of `gmm_em`), and a node belongs to the object by the share that makes its points' evidence likeliest, held
+    near its parent's where points are few (our choice). A point stays when the leaves that it comes down to, with its
+    own evidence, give the object more than `min_posterior`. Outliers, which a uniform component takes, are not the
+    object's; those below a node are by that node's share.
+
+    Clusters only shrink: a dropped point leaves the arrays, clusters keep their index. Clusters with fewer than
+    `min_points` points, or with as few in their ring, are left as they are.
+    """
+
+    levels: int = 2  # from 1, of a tree
+    children: int = 8  # from 2, of a node: the paper's J
+    max_iterations: int = 8  # from 1, of EM in a node
+    tolerance: float = 1e-3  # nats a point; EM ends when the mean log-likelihood gains less
+    std_floor: float = 0.01  # m, least standard deviation of a node along any axis
+    outlier_fraction: float = 0.02  # in [0, 1), share of outliers at the start of each node
+    min_support: float = 1e-4  # in [0, 1), a node with a smaller share of its tree's points is dropped
+    min_node: int = 32  # from 8, points that a node needs to get children
+    parent_points: float = 4.0  # from 0, points that the parent's share counts for in its children's
+    min_posterior: float = 0.5  # in (0, 1), a point stays when the object's share of it is larger
+    mask_log_odds: float = 2.0  # nats, from 0, of a point deep in the mask
+    expected_bleed: float = 0.5  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
+    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
+    min_ring: int = 4  # px, least width
+    max_ring: int = 12  # px, largest width
+    max_points: int = 1000  # from 100, points of a mask and its ring that EM sees; all are judged at the end
+    min_points: int = 30  # from 10, smaller clusters or rings are too little for a mixture
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            levels=(1, 8),
+            children=(2, 64),
+            max_iterations=(1, 1000),
+            tolerance=(0.0, np.inf),
+            std_floor=(1e-4, 1.0),
+            outlier_fraction=(0.0, 0.99),
+            min_support=(0.0, 0.99),
+            min_node=(8, 10**9),
+            parent_points=(0.0, 1e9),
+            min_posterior=(1e-6, 1 - 1e-6),
+            mask_log_odds=(0.0, 20.0),
+            expected_bleed=(0.0, 0.99),
+            ring_fraction=(0.0, 10.0),
+            min_ring=(1, MAX_RING_WIDTH),
+            max_ring=(self.min_ring, MAX_RING_WIDTH),
+            max_points=(100, 10**9),
+            min_points=(10, 10**9),
+        )
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        if clusters.exact:
+            return clusters
+        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.thinned(self.max_points)
+        tree = mixture_tree.fit(
+            sample.points_camera,
+            sample.starts,
+            levels=self.levels,
+            children=self.children,
+            max_iterations=self.max_iterations,
+            tolerance=self.tolerance,
+            variance_floor=self.std_floor**2,
+            outlier_fraction=self.outlier_fraction,
+            min_support=self.min_support,
+            min_points=self.min_node,
+        )
+        shares = self._object_shares(tree, sample)
+        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        judged &= np.diff(tree.levels[0].firsts) > 0  # nothing is known against a mask whose tree has no node
+        return keep_points(clusters, around.kept(self._claimed(tree, shares, around), judged, len(clusters.cluster)))
+
+    def _object_shares(self, tree: MixtureTree, sample: Neighborhoods) -> list[Float32]:
+        """For each level (M,) how much of each node is the object's."""
+        points, odds, starts = sample.points_camera, self._evidence(sample), sample.starts
+        above, shares = np.full(len(sample), 0.5, np.float32), []
+        for k, level in enumerate(tree.levels):
+            child = tree.passed(k, points, starts)
+            order, starts = grouped(child.astype(np.int32), len(level))
+            points, odds = points[order], odds[order]
+            above = own_shares(odds, starts, above[level.parents], self.parent_points)
+            shares.append(above)
+        return shares
+
+    def _claimed(self, tree: MixtureTree, shares: list[Float32], around: Neighborhoods) -> Bool:
+        """(S,) which points the object claims, of those of the masks; each level overrules the one above."""
+        of_mask = np.nonzero(around.source >= 0)[0]
+        claimed = np.zeros(len(around.source), bool)
+        points, odds = around.points_camera[of_mask], self._evidence(around)[of_mask]
+        starts: Int64 = np.concatenate([[0], np.cumsum(around.mask_counts)])
+        above = np.zeros(len(around), np.float32)
+        for k, level in enumerate(tree.levels):
+            child, share = tree.shared(k, points, starts, shares[k], above, odds)
+            claimed[of_mask] = share > self.min_posterior
+            if k + 1 < len(tree.levels):
+                goes_on = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # -1, an outlier, ends here
+                key = np.where(goes_on[child], child, -1)
+                order, starts = grouped(key.astype(np.int32), len(level))
+                of_mask, points, odds, above = of_mask[order], points[order], odds[order], shares[k]
+        return claimed
+
+    def _evidence(self, around: Neighborhoods) -> Float32:
+        return mask_log_odds(around, self.mask_log_odds, self.expected_bleed)

@@ -1,0 +1,179 @@
+"""Masks that claim convex segments: a box on a table under masks that fall short, bleed and overlap."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.errors import ConfigError
+from framework.geometry import exp_se3, lift
+from plugins.refiners.geometric import Geometric
+
+CAMERA = Camera(320, 240, 180.0, 180.0, 159.5, 119.5)
+POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))
+
+
+def table() -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) m and ids: 1 a box whose front is 1.2 m away, 0 the table below and the wall 2 m away."""
+    v, u = np.mgrid[:240, :320]
+    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    depth = np.minimum(2.0, 0.7 / np.maximum(y, 1e-9))
+    front = (np.abs(1.2 * x) < 0.3) & (1.2 * y > 0.42) & (1.2 * y < 0.7)
+    top_z = 0.42 / np.maximum(y, 1e-9)
+    top = (top_z > 1.2) & (top_z < 1.6) & (np.abs(top_z * x) < 0.3)
+    return np.where(front, 1.2, np.where(top, top_z, depth)).astype(np.float32), (front | top).astype(np.int32)
+
+
+def frame_of(depth: np.ndarray) -> Frame:
+    return Frame(3, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
+
+
+def lifted(masks: np.ndarray, frame: Frame) -> PointClusters:
+    n = len(masks)
+    ones = np.ones(n, np.float32)
+    detections = Detections(
+        masks, np.zeros((n, 4), np.float32), ones, np.tile(np.float32([0.3, 0.7]), (n, 1)), ("a", "b")
+    )
+    return lift(detections, frame, POSE)
+
+
+def image_of(clusters: PointClusters, k: int) -> np.ndarray:
+    image = np.zeros(CAMERA.shape, bool)
+    u, v = clusters.pixels[clusters.cluster == k].T
+    assert not image[v, u].any()
+    image[v, u] = True
+    assert image.sum() == (clusters.cluster == k).sum(), "no pixel twice"
+    return image
+
+
+def shifted(mask: np.ndarray, dv: int, du: int) -> np.ndarray:
+    moved = np.zeros_like(mask)
+    v, u = np.nonzero(mask)
+    inside = (v + dv >= 0) & (v + dv < mask.shape[0]) & (u + du >= 0) & (u + du < mask.shape[1])
+    moved[v[inside] + dv, u[inside] + du] = True
+    return moved
+
+
+def test_a_shifted_mask_becomes_the_box():
+    """Eight pixels too far right: the table on the right goes, the box's left rim comes, with the points of lift."""
+    depth, ids = table()
+    frame = frame_of(depth)
+    mask = shifted(ids == 1, 0, 8)
+    before = lifted(mask[None], frame)
+    after = Geometric().refine(before, frame)
+    box = image_of(after, 0)
+    assert (box & (ids == 1)).sum() > 0.97 * (ids == 1).sum()
+    assert (box & (ids == 0)).sum() < 2 * 90, "of the table, along its border"
+    assert (box & ~mask).sum() > 200, "it has grown"
+    everything = lifted(np.ones((1, *CAMERA.shape), bool), frame).points_world.reshape(*CAMERA.shape, 3)
+    u, v = after.pixels.T
+    np.testing.assert_allclose(after.points_world, everything[v, u], atol=1e-5)
+    assert after.points_world.dtype == np.float32
+    np.testing.assert_array_equal(after.scores, before.scores)
+    np.testing.assert_array_equal(after.class_probabilities, before.class_probabilities)
+
+
+def test_without_whole_segments_it_only_shrinks():
+    depth, ids = table()
+    frame = frame_of(depth)
+    mask = shifted(ids == 1, 0, 8)
+    grown = image_of(Geometric().refine(lifted(mask[None], frame), frame), 0)
+    shrunk = image_of(Geometric(whole_segments=False).refine(lifted(mask[None], frame), frame), 0)
+    np.testing.assert_array_equal(shrunk, grown & mask)
+
+
+def test_a_segment_goes_to_the_mask_that_covers_most_of_it():
+    depth, ids = table()
+    frame = frame_of(depth)
+    u = np.arange(320)[None]
+    more, less = (ids == 1) & (u < 168), (ids == 1) & (u >= 160)  # 59 and 50 % of the box, overlapping
+    refined = Geometric().refine(lifted(np.stack([less, more, np.zeros_like(more)]), frame), frame)
+    assert len(refined) == 3
+    assert set(refined.cluster.tolist()) == {1}
+    assert image_of(refined, 1)[ids == 1].mean() > 0.97
+    equal = Geometric().refine(lifted(np.stack([ids == 1, ids == 1]), frame), frame)
+    assert set(equal.cluster.tolist()) == {0}, "of equals the first"
+
+
+@pytest.mark.parametrize(("min_overlap", "claimed"), [(0.4, True), (0.6, False)])
+def test_too_little_of_a_segment_is_no_claim(min_overlap, claimed):
+    depth, ids = table()
+    frame = frame_of(depth)
+    half = (ids == 1) & (np.arange(320)[None] < 160)
+    refined = Geometric(min_overlap=min_overlap).refine(lifted(half[None], frame), frame)
+    assert (len(refined.cluster) > 0) == claimed
+    assert len(refined) == 1
+
+
+def test_points_of_no_cluster_and_exact_clusters_stay():
+    depth, ids = table()
+    frame = frame_of(depth)
+    before = lifted((ids == 1)[None], frame)
+    cluster = before.cluster.copy()
+    cluster[::7] = -1
+    arrays = (before.points_world, before.pixels, cluster, before.class_probabilities, before.scores, before.classes)
+    after = Geometric().refine(PointClusters(*arrays), frame)
+    np.testing.assert_array_equal(after.pixels[after.cluster == -1], before.pixels[::7])
+    exact = PointClusters(*arrays, exact=True)
+    assert Geometric().refine(exact, frame) is exact
+
+
+def test_nothing_is_added_where_the_pose_is_open():
+    """A mask of one column of a narrow segment has points on a line: they stay, no other comes."""
+    depth = np.zeros(CAMERA.shape, np.float32)
+    depth[40:80, 60:62] = 1.0
+    frame = frame_of(depth)
+    mask = np.zeros((1, *CAMERA.shape), bool)
+    mask[0, 40:80, 60] = True
+    refiner = Geometric(cell=1, min_segment=10, min_overlap=0.3)
+    before = lifted(mask, frame)
+    np.testing.assert_array_equal(refiner.refine(before, frame).pixels, before.pixels)
+    mask[0, 40:80, 61] = True
+    mask[0, 70:80, 61] = False
+    assert len(refiner.refine(lifted(mask, frame), frame).pixels) == 80, "two columns fix the pose"
+
+
+def test_degenerate_input():
+    refiner = Geometric()
+    depth, _ = table()
+    nothing = lifted(np.zeros((0, *CAMERA.shape), bool), frame_of(depth))
+    assert len(refiner.refine(nothing, frame_of(depth))) == 0
+    blind = frame_of(np.zeros_like(depth))
+    empty = refiner.refine(lifted(np.ones((2, *CAMERA.shape), bool), blind), blind)
+    assert (len(empty), len(empty.points_world)) == (2, 0)
+    one = np.zeros((1, *CAMERA.shape), bool)
+    one[0, 60, 80] = True
+    assert len(refiner.refine(lifted(one, frame_of(depth)), frame_of(depth)).points_world) <= 1
+
+
+def test_same_result_with_one_thread_and_with_two():
+    depth, ids = table()
+    noise = np.random.default_rng(0).normal(0, 0.003, depth.shape)
+    frame = frame_of(depth + noise)
+    before = lifted(np.stack([shifted(ids == 1, 0, 8), ids == 0]), frame)
+    threads, results = numba.get_num_threads(), []
+    try:
+        for n in {1, threads}:
+            numba.set_num_threads(n)
+            results.append(Geometric().refine(before, frame))
+    finally:
+        numba.set_num_threads(threads)
+    for result in results[1:]:
+        np.testing.assert_array_equal(results[0].pixels, result.pixels)
+        np.testing.assert_array_equal(results[0].points_world, result.points_world)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"cell": 0}, "Geometric.cell must be in"),
+        ({"noise_factor": float("nan")}, "noise_factor .* found nan"),
+        ({"max_angle": 90.0}, "Geometric.max_angle"),
+        ({"min_overlap": 1.0}, "Geometric.min_overlap"),
+    ],
+)
+def test_parameters_are_checked(parameters, message):
+    with pytest.raises(ConfigError, match=message):
+        Geometric(**parameters)

@@ -1,0 +1,151 @@
+"""The tree of mixtures on a toy scene: a box on a floor before a wall, under a mask that bleeds."""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.errors import ConfigError
+from framework.geometry import exp_se3, lift
+from plugins.refiners.gmm_tree import GmmTree
+from plugins.refiners.identity import Identity
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+
+
+def room() -> tuple[np.ndarray, np.ndarray]:
+    """Depth (H, W) m with noise and ids: the box of 0.5 m with its front (1) 2 m away, and its top (2), 16 px high.
+
+    It stands on a floor before a wall at 3 m.
+    """
+    v, u = np.mgrid[:240, :320]
+    ray_x, ray_y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    depth = np.minimum(3.0, 0.8 / np.maximum(ray_y, 1e-9))
+    front = (np.abs(2.0 * ray_x) < 0.25) & (2.0 * ray_y > 0.3) & (2.0 * ray_y < 0.8)
+    top_z = 0.3 / np.maximum(ray_y, 1e-9)
+    top = (top_z > 2.0) & (top_z < 2.5) & (np.abs(top_z * ray_x) < 0.25)
+    depth = np.where(front, 2.0, np.where(top, top_z, depth))
+    noise = np.random.default_rng(0).normal(0, 0.003, depth.shape) * depth
+    return (depth + noise).astype(np.float32), front + 2 * (top & ~front).astype(np.int32)
+
+
+def frame_of(depth: np.ndarray) -> Frame:
+    return Frame(0, 0.0, np.zeros((*depth.shape, 3), np.uint8), depth, CAMERA)
+
+
+def lifted(masks: np.ndarray, frame: Frame) -> PointClusters:
+    n = len(masks)
+    ones = np.ones(n, np.float32)
+    detections = Detections(masks, np.zeros((n, 4), np.float32), ones, ones[:, None], ("thing",))
+    return lift(detections, frame, Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))))
+
+
+def bleeding(mask: np.ndarray, px: int) -> np.ndarray:
+    """The mask grown by `px` to all sides."""
+    v, u = np.nonzero(mask)
+    grown = np.zeros_like(mask)
+    for dv in range(-px, px + 1):
+        for du in range(-px, px + 1):
+            grown[np.clip(v + dv, 0, mask.shape[0] - 1), np.clip(u + du, 0, mask.shape[1] - 1)] = True
+    return grown
+
+
+def kept(refined: PointClusters, cluster: int = 0) -> np.ndarray:
+    mask = np.zeros(CAMERA.shape, bool)
+    pixels = refined.pixels[refined.cluster == cluster]
+    mask[pixels[:, 1], pixels[:, 0]] = True
+    return mask
+
+
+@pytest.mark.parametrize("levels", [1, 2, 3])
+@pytest.mark.parametrize("px", [4, 6, 8])
+def test_takes_the_bleeding_away(px, levels):
+    depth, ids = room()
+    frame = frame_of(depth)
+    mask = bleeding(ids > 0, px)
+    after = kept(GmmTree(levels=levels).refine(lifted(mask[None], frame), frame))
+    assert after[ids == 1].mean() > 0.98, "the top is no deeper in the mask than it bleeds: nobody can tell"
+    assert 1 - after[mask & (ids == 0)].mean() > 0.92
+    before = kept(Identity().refine(lifted(mask[None], frame), frame))
+    assert before[mask].all(), "there was something to take away"
+
+
+def test_evidence_pulls_points_to_its_side():
+    """Object and wall in one plane: geometry says nothing, and the mask alone decides, to where its log-odds are 0."""
+    depth = np.full(CAMERA.shape, 2.0, np.float32)
+    frame = frame_of(depth)
+    mask = np.zeros((1, *CAMERA.shape), bool)
+    mask[0, 60:180, 100:220] = True
+    clusters = lifted(mask, frame)
+    after = kept(GmmTree().refine(clusters, frame))
+    assert after[85:155, 125:195].mean() > 0.98
+    assert len(GmmTree(mask_log_odds=0.0).refine(clusters, frame).pixels) == 0, "without evidence nobody's: a draw"
+
+
+def test_two_masks_do_not_disturb_each_other():
+    depth, ids = room()
+    frame = frame_of(depth)
+    wall = np.zeros_like(ids, bool)
+    wall[20:80, 20:80] = True
+    masks = np.stack([bleeding(ids > 0, 6), np.zeros_like(wall), wall])
+    both = GmmTree().refine(lifted(masks, frame), frame)
+    alone = GmmTree().refine(lifted(masks[:1], frame), frame)
+    np.testing.assert_array_equal(both.pixels[both.cluster == 0], alone.pixels)
+    assert (both.cluster != 1).all()
+
+
+def test_too_little_to_tell_is_left_alone():
+    depth, ids = room()
+    frame = frame_of(depth)
+    tiny = np.zeros((1, *CAMERA.shape), bool)
+    tiny[0, 100:105, 150:155] = True
+    assert len(GmmTree().refine(lifted(tiny, frame), frame).pixels) == 25, "fewer than min_points"
+    lonely = frame_of(np.where(ids > 0, depth, 0).astype(np.float32))
+    box = lifted((ids > 0)[None], lonely)
+    assert len(GmmTree().refine(box, lonely).pixels) == (ids > 0).sum(), "a ring without readings"
+    sparse = frame_of(np.where((np.indices(depth.shape).sum(axis=0) % 40) == 0, depth, 0).astype(np.float32))
+    few = lifted(bleeding(ids > 0, 8)[None], sparse)
+    assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
+
+
+def test_points_of_no_cluster_and_exact_clusters_stay():
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(bleeding(ids > 0, 8)[None], frame)
+    cluster = before.cluster.copy()
+    cluster[::7] = -1
+    arrays = (before.points_world, before.pixels, cluster, before.class_probabilities, before.scores, before.classes)
+    assert (GmmTree().refine(PointClusters(*arrays), frame).cluster == -1).sum() == (cluster == -1).sum()
+    exact = PointClusters(*arrays, exact=True)
+    assert GmmTree().refine(exact, frame) is exact
+
+
+def test_same_result_with_one_thread_and_with_two():
+    depth, ids = room()
+    frame = frame_of(depth)
+    before = lifted(np.stack([bleeding(ids > 0, 8), ids > 0]), frame)
+    threads, results = numba.get_num_threads(), []
+    try:
+        for n in {1, threads}:
+            numba.set_num_threads(n)
+            results.append(GmmTree(levels=3, min_node=16).refine(before, frame).pixels)
+    finally:
+        numba.set_num_threads(threads)
+    for result in results[1:]:
+        np.testing.assert_array_equal(results[0], result)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"levels": 0}, "GmmTree.levels must be in"),
+        ({"children": 1}, "GmmTree.children must be in"),
+        ({"min_support": 1.0}, "GmmTree.min_support"),
+        ({"min_ring": 20}, r"max_ring must be in \[20, 80\], found 12"),
+    ],
+)
+def test_parameters_are_checked(parameters, message):
+    with pytest.raises(ConfigError, match=message):
+        GmmTree(**parameters)
