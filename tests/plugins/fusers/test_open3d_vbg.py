@@ -240,7 +240,10 @@ def test_ids_stay_with_their_objects_and_are_those_of_the_other_fuser(frames: li
         for fuser in (ours, theirs):
             fused(fuser, frame, [masks_of(frame)[i] for i in order], [0.9] * 3)  # type: ignore[arg-type]
     histories = [
-        {k: (r.observations, r.visible, r.detections, r.class_evidence.tolist()) for k, r in f.scene.table.records.items()}
+        {
+            k: (r.observations, r.visible, r.detections, r.class_evidence.tolist())
+            for k, r in f.scene.table.records.items()
+        }
         for f in (ours, theirs)
     ]
     assert len(histories[0]) == 3
