@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32
+from framework.data import Float32, Float64, Int32
 from framework.refinement import mixture
 from framework.refinement.gaussian import (
     ABSENT,
@@ -213,17 +213,17 @@ def own_shares(log_odds: Float32, starts: Int64, above: Float32, above_points: f
 
 def _level(fitted: mixture.Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
     """The level below nodes of the weights `above` (Q,), of which the `chosen` ones have been given children."""
-    kept: Bool = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
+    kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
+    survivors = np.count_nonzero(kept, axis=1)
     weights = np.where(kept, fitted.weights, 0.0)
-    has_children = np.any(kept, axis=1)
-    outliers = np.where(has_children, fitted.outlier_weights, 0.0)
+    outliers = np.where(survivors > 0, fitted.outlier_weights, 0.0)
     totals = weights.sum(axis=1) + outliers
     scale = above[chosen] / np.where(totals > 0, totals, 1.0)
     counts, outlier_weights = np.zeros(len(above), np.int64), np.zeros(len(above))
     outlier_boxes = np.zeros((len(above), 2, 3))
-    counts[chosen] = kept.sum(axis=1)
+    counts[chosen] = survivors
     outlier_weights[chosen] = outliers * scale
-    outlier_boxes[chosen] = np.where(has_children[:, None, None], boxes, 0.0)
+    outlier_boxes[chosen] = np.where((survivors > 0)[:, None, None], boxes, 0.0)
     return Level(
         weights=(weights * scale[:, None])[kept],
         means=fitted.means[kept],

@@ -35,7 +35,7 @@ class Geometric(ClusterRefiner):
     max_angle: float = 15.0  # degrees, in (0, 90): a surface bent more towards the camera, and more than noise, is cut
     closing: int = 1  # cells, from 0: gaps in edges up to twice as wide are closed
     min_segment: int = 100  # px, from 1: smaller segments go to those beside them
-    min_overlap: float = 0.5  # in [0, 1), share of a segment that a mask must cover to get it
+    min_overlap: float = 0.8  # in [0, 1), share of a segment that a mask must cover to get it
     whole_segments: bool = True  # whether clusters grow to their segments' pixels outside of the mask
 
     def __post_init__(self) -> None:

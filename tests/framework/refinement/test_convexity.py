@@ -102,6 +102,20 @@ def faces_of(box: np.ndarray, pitch: float, camera: Camera, depth: np.ndarray, i
     return [inside & (np.abs(point[a] - box[a]) < 1e-9) for a in range(3)]
 
 
+@pytest.mark.parametrize("cell", [1, 2])
+def test_a_step_between_parallel_planes_is_cut(cell):
+    """2.5 cm, as a book on a table: a slope may rise by more from pixel to pixel, but is no step."""
+    depth = np.full(CAMERA.shape, 1.025)
+    depth[30:90, 40:100] = 1.0
+    labels, count = cut(depth, cell=cell)
+    assert count == 2
+    assert (labels[31:89, 41:99] != labels[0, 0]).all()
+    x = np.arange(CAMERA.width) - CAMERA.cx
+    sloped = np.tile(1.0 / (1.0 - 0.01 * x), (CAMERA.height, 1))[:, :130]
+    assert np.diff(sloped[0]).max() > 0.025
+    assert cut(sloped, Camera(130, 120, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy), cell=cell)[1] == 1
+
+
 def test_a_ball_is_one_segment():
     """However much a surface bends away from the camera."""
     v, u = np.mgrid[:120, :160]

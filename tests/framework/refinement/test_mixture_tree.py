@@ -219,6 +219,9 @@ def test_own_shares_are_the_likeliest():
     objective = np.log(grid * ratios + 1 - grid).sum(axis=0) + 4 * (0.5 * np.log(grid) + 0.5 * np.log(1 - grid))
     assert shares[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
     assert shares[1] == pytest.approx(0.7), "without points, the parent's"
+    leaning = mixture_tree.own_shares(odds, starts, np.full(4, 0.9, np.float32), 4.0)
+    objective += 4 * (0.4 * np.log(grid) - 0.4 * np.log(1 - grid))
+    assert leaning[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
     assert shares[2] > 0.6 > 0.4 > shares[3]
     assert shares[2] + shares[3] == pytest.approx(1.0, abs=1e-5), "the two sides are alike"
 

@@ -89,7 +89,7 @@ def test_a_segment_goes_to_the_mask_that_covers_most_of_it():
     frame = frame_of(depth)
     u = np.arange(320)[None]
     more, less = (ids == 1) & (u < 168), (ids == 1) & (u >= 160)  # 59 and 50 % of the box, overlapping
-    refined = Geometric().refine(lifted(np.stack([less, more, np.zeros_like(more)]), frame), frame)
+    refined = Geometric(min_overlap=0.5).refine(lifted(np.stack([less, more, np.zeros_like(more)]), frame), frame)
     assert len(refined) == 3
     assert set(refined.cluster.tolist()) == {1}
     assert image_of(refined, 1)[ids == 1].mean() > 0.97
