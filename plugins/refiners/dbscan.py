@@ -14,6 +14,7 @@ from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.neighborhood import grouped
 from framework.refinement.selection import keep_points
+from framework.refinement.union_find import root
 
 Int64 = npt.NDArray[np.int64]
 
@@ -269,21 +270,13 @@ def _pieces(xyz: Float32, is_core: Bool, table: Int32, cells: Int64, starts: Int
             other = table[_slot(table, cells, x, y, z)]
             if other < c or parents[other] < 0:  # each pair once
                 continue
-            a, b = _root(parents, c), _root(parents, other)
+            a, b = root(parents, c), root(parents, other)
             if a != b and _touch(xyz, is_core, starts, c, other, eps):
                 parents[max(a, b)] = min(a, b)
     for c in range(len(cells)):
         if parents[c] >= 0:
-            parents[c] = _root(parents, c)
+            parents[c] = root(parents, c)
     return parents
-
-
-@njit(cache=True, nogil=True)
-def _root(parents: Int32, c: int) -> int:
-    while parents[c] != c:
-        parents[c] = parents[parents[c]]
-        c = parents[c]
-    return c
 
 
 @njit(cache=True, nogil=True)

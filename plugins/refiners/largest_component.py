@@ -13,6 +13,7 @@ from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.neighborhood import grouped
 from framework.refinement.selection import keep_points
+from framework.refinement.union_find import root, unite
 
 Int64 = npt.NDArray[np.int64]
 
@@ -83,28 +84,10 @@ def _keep_largest_of(
                     continue  # not in the cluster, or united already
                 z_neighbor = depth[v + dv, u + du]
                 if abs(z - z_neighbor) < gap + gap_per_depth * min(z, z_neighbor):
-                    _unite(parents, cell, neighbor)
+                    unite(parents, cell, neighbor)
     sizes = np.zeros(rows * columns, np.int32)
     for i in members:
-        sizes[_root(parents, (pixels[i, 1] - v0) * columns + pixels[i, 0] - u0)] += 1
+        sizes[root(parents, (pixels[i, 1] - v0) * columns + pixels[i, 0] - u0)] += 1
     largest = np.argmax(sizes)
     for i in members:
-        kept[i] = _root(parents, (pixels[i, 1] - v0) * columns + pixels[i, 0] - u0) == largest
-
-
-@njit(cache=True, nogil=True)
-def _root(parents: Int32, cell: int) -> int:
-    while parents[cell] != cell:
-        parents[cell] = parents[parents[cell]]
-        cell = parents[cell]
-    return cell
-
-
-@njit(cache=True, nogil=True)
-def _unite(parents: Int32, a: int, b: int) -> None:
-    """The smaller cell becomes the root: a piece is named after its first pixel, whatever the order of unions."""
-    a, b = _root(parents, a), _root(parents, b)
-    if a < b:
-        parents[b] = a
-    else:
-        parents[a] = b
+        kept[i] = root(parents, (pixels[i, 1] - v0) * columns + pixels[i, 0] - u0) == largest

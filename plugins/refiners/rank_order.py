@@ -13,6 +13,7 @@ from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.neighborhood import grouped
 from framework.refinement.selection import keep_points
+from framework.refinement.union_find import root
 
 Int64 = npt.NDArray[np.int64]
 
@@ -113,11 +114,11 @@ def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int3
         for i in range(nearest.shape[1]):
             b = nearest[a, i]
             if a < b or ranks[b, a] == ABSENT:  # each pair once
-                r, s = _root(parents, a), _root(parents, b)
+                r, s = root(parents, a), root(parents, b)
                 if r != s and _distance(nearest, ranks, a, b) <= threshold:
                     parents[max(r, s)] = min(r, s)
     for a in range(len(points)):
-        parents[a] = _root(parents, a)
+        parents[a] = root(parents, a)
     return parents
 
 
@@ -232,11 +233,3 @@ def _nearest(point: Float32, axis: int, swept: Float64, names: Int64) -> int:
         if distance < least or (distance == least and names[t] < names[best]):
             best, least = t, distance
     return best
-
-
-@njit(cache=True, nogil=True)
-def _root(parents: Int32, a: int) -> int:
-    while parents[a] != a:
-        parents[a] = parents[parents[a]]
-        a = parents[a]
-    return a
