@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -10,15 +9,15 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from framework.data import Bool, Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
-from framework.interfaces import SceneMap
+from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
+from framework.mapping.association import look_up_instances
 from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
-from framework.mapping.instance_list import instances_that_count, list_instances
 from framework.mapping.instance_table import InstanceTable
+from framework.mapping.labeled_map import LabeledMap
 from framework.mapping.map_file import plain_table, read_map, table_of, write_map
 from framework.mapping.meshing import SurfaceNets
 from framework.mapping.raycasting import render, render_near
-from framework.mapping.sensor import Sensor
+from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.vertex_labels import vertex_labels
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
@@ -28,13 +27,8 @@ NO_BLOCKS = np.zeros(0, np.int32)
 ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
 
 
-class InstanceMap(SceneMap):
-    """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads.
-
-    An instance counts, in `mesh` and `instances`, once it has been observed `min_observations` times, its confidence
-    is `min_confidence` and it has `min_vertices` vertices; before, it is tentative: `render` shows it, as association
-    needs it.
-    """
+class InstanceMap(LabeledMap):
+    """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads."""
 
     def __init__(
         self,
@@ -48,14 +42,10 @@ class InstanceMap(SceneMap):
         logarithmic: bool = True,
         storage: Storage = Storage.COMPACT,
     ) -> None:
-        self.classes: tuple[str, ...] = ()
+        super().__init__(InstanceTable(combine, logarithmic), min_observations, min_confidence, min_vertices)
         self.sensor = sensor
-        self.min_observations = min_observations
-        self.min_confidence = min_confidence
-        self.min_vertices = min_vertices
         self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
         self.labels = EvidenceRows(self.voxels, combine, storage)
-        self.table = InstanceTable(combine, logarithmic)
 
     @property
     def voxel_size(self) -> float:
@@ -74,14 +64,8 @@ class InstanceMap(SceneMap):
     def evictions(self) -> int:
         return self.labels.evicted
 
-    @property
-    def instance_count(self) -> int:
-        """Without the condition on vertices, which takes a mesh."""
-        return int(self._counts().sum())
-
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Takes the first frame's label space for the map's."""
-        self.classes = classes
+        super().begin(classes)
         self.labels.begin(len(classes))
 
     def changed(self, blocks: Int32 | None = None) -> None:
@@ -95,8 +79,13 @@ class InstanceMap(SceneMap):
         elif "_surface" in self.__dict__:
             self._surface.changed(blocks)
 
+    def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
+        instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
+        view = pinhole(frame.camera, T_world_camera)
+        look_up_instances(self.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
+        return instance_ids
+
     def merge(self, kept: int, dropped: int) -> None:
-        """Makes instance `dropped` a part of `kept`, in the table and in every voxel."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
         self.changed(NO_BLOCKS)
@@ -125,12 +114,6 @@ class InstanceMap(SceneMap):
         instance_ids[dropped] = 0
         class_ids[dropped] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
-
-    def _counts(self) -> Bool:
-        return instances_that_count(self.table, self.min_observations, self.min_confidence)
-
-    def instances(self) -> Mapping[int, Instance]:
-        return list_instances(self.mesh(), self.table)
 
     def save(self, path: Path) -> None:
         grid, evidence = self.voxels.grid, self.labels.evidence

@@ -6,7 +6,6 @@ as it is where it is only slow; where it is wrong, the call is made so that the 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -18,24 +17,11 @@ import numpy.typing as npt
 import open3d as o3d
 from open3d.core import Tensor
 
-from framework.data import (
-    Bool,
-    Camera,
-    Float32,
-    Float64,
-    Frame,
-    Instance,
-    InstanceMesh,
-    Int32,
-    SurfaceView,
-    UInt8,
-    View,
-)
+from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, UInt8, View
 from framework.errors import MapFullError
-from framework.geometry import inverse
-from framework.interfaces import SceneMap
-from framework.mapping.instance_list import instances_that_count, list_instances
+from framework.geometry import back_project, inverse, transform
 from framework.mapping.instance_table import InstanceTable
+from framework.mapping.labeled_map import LabeledMap
 from framework.mapping.map_file import plain_table, read_map, table_of, write_map
 
 FORMAT = "open3d_vbg 1"  # of the saved file; a change of meaning counts it up
@@ -72,17 +58,15 @@ class BlockGridSettings:
     min_vertices: int
 
 
-class Open3DMap(SceneMap):
-    """Open3D's voxel blocks and the table of instances as one SceneMap.
+class Open3DMap(LabeledMap):
+    """Open3D's voxel blocks and the table of instances as one map.
 
-    An instance counts, in `mesh` and `instances`, under the same conditions as in `InstanceMap`; before, it is
-    tentative: `render` shows it. Its class is that of the table, the same for all its voxels.
+    An instance's class is that of the table, the same for all its voxels.
     """
 
     def __init__(self, settings: BlockGridSettings) -> None:
-        self.classes: tuple[str, ...] = ()
+        super().__init__(InstanceTable(), settings.min_observations, settings.min_confidence, settings.min_vertices)
         self.settings = settings
-        self.table = InstanceTable()
         self.frames = 0  # integrated
         self._new_grid()
 
@@ -123,11 +107,6 @@ class Open3DMap(SceneMap):
         """Of the blocks in use; Open3D's hash map holds up to twice as many ready."""
         a_voxel = sum(dtype.byte_size() * channels for dtype, channels in ATTRIBUTES.values())
         return self.voxel_count * a_voxel
-
-    @property
-    def instance_count(self) -> int:
-        """Without the condition on vertices, which takes a mesh."""
-        return int(self._counts().sum())
 
     @property
     def _min_weight(self) -> float:
@@ -228,7 +207,6 @@ class Open3DMap(SceneMap):
         return voxels.numpy().ravel()[inside[near]], ids[near]
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Makes instance `dropped` a part of `kept`, in the table and in every voxel."""
         self.table.merge(kept, dropped)
         instance = self._flat("instance")
         instance[instance == dropped] = kept
@@ -253,6 +231,14 @@ class Open3DMap(SceneMap):
         x, y, z = (nearest - r * blocks).T
         voxels = numbers.astype(np.int64) * r**3 + (z * r + y) * r + x  # x runs fastest
         return np.where(known, self._flat("instance")[np.where(known, voxels, 0)], 0).astype(np.int32)
+
+    def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
+        v, u = np.nonzero(frame.depth[::stride, ::stride])
+        pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
+        points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])
+        instance_ids = np.zeros(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
+        instance_ids[v, u] = self.instances_at(np.asarray(transform(T_world_camera, points_camera), np.float32))
+        return instance_ids
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         surface = self._surface(camera, T_world_camera)
@@ -358,18 +344,12 @@ class Open3DMap(SceneMap):
                 return _in_order(mesh.vertex.positions.numpy(), mesh.triangle.indices.numpy(), colors)
         return np.zeros((0, 3), np.float32), np.zeros((0, 3), np.int32), np.zeros((0, 3), np.uint8)
 
-    def _counts(self) -> Bool:
-        return instances_that_count(self.table, self.settings.min_observations, self.settings.min_confidence)
-
     def _class_of_ids(self) -> Int32:
         """(ids + 1,) the most likely class of each instance; -1 for none."""
         class_ids = np.full(self.table.last_id + 1, -1, np.int32)
         for record in self.table.records.values():
             class_ids[record.id] = record.class_evidence.argmax()
         return class_ids
-
-    def instances(self) -> Mapping[int, Instance]:
-        return list_instances(self.mesh(), self.table)
 
     def save(self, path: Path) -> None:
         """Not with Open3D's own `save`, which ends the process on a full disk."""

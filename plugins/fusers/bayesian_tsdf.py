@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import PointClusters
-from framework.mapping.instance_fuser import FrameEvidence, InstanceFuser
+from framework.data import Float32, Float64, PointClusters
+from framework.mapping.evidence_fuser import EvidenceFuser
+from framework.mapping.instance_fuser import floored_log
 from framework.parameters import check_bounds
 
 
 @dataclass
-class BayesianTsdf(InstanceFuser):
+class BayesianTsdf(EvidenceFuser):
     """Two independent Bayesian recursions a voxel, eqs. [7] and [8] of the paper, as sums of log-likelihoods.
 
     An instance's class distribution is the product of the distributions of all its detections.
@@ -26,12 +27,12 @@ class BayesianTsdf(InstanceFuser):
         super().__post_init__()
         check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence=(1e-6, 1.0))
 
-    def evidence(self, clusters: PointClusters) -> FrameEvidence:
-        p = clusters.class_probabilities.astype(np.float64)
+    def instance_evidence(self, clusters: PointClusters) -> Float32:
         scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
-        return FrameEvidence(
-            instances=np.log(scores / self.instance_floor).astype(np.float32),
-            # no zero may kill a class for good
-            classes=np.log((1 - self.class_floor) * p + self.class_floor / max(p.shape[1], 1)),
-            absence=float(np.log(self.absence)),
-        )
+        return np.asarray(np.log(scores / self.instance_floor), np.float32)
+
+    def absence_evidence(self) -> float:
+        return float(np.log(self.absence))
+
+    def class_evidence(self, clusters: PointClusters) -> Float64:
+        return floored_log(clusters.class_probabilities, self.class_floor)

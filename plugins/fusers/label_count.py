@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import PointClusters
+from framework.data import Float32, Float64, PointClusters
 from framework.mapping.evidence import Combine
-from framework.mapping.instance_fuser import FrameEvidence, InstanceFuser, only_best
+from framework.mapping.evidence_fuser import EvidenceFuser, only_best
 
 
 @dataclass
-class LabelCount(InstanceFuser):
+class LabelCount(EvidenceFuser):
     """Every detection counts as one for its instance and its best class, whatever its score (Grinvald et al. 2019).
 
     The label with the highest count wins; nothing counts against one.
@@ -22,5 +22,8 @@ class LabelCount(InstanceFuser):
     logarithmic = False
     units = 1
 
-    def evidence(self, clusters: PointClusters) -> FrameEvidence:
-        return FrameEvidence(np.ones(len(clusters), np.float32), only_best(clusters, np.ones(len(clusters))))
+    def instance_evidence(self, clusters: PointClusters) -> Float32:
+        return np.ones(len(clusters), np.float32)
+
+    def class_evidence(self, clusters: PointClusters) -> Float64:
+        return only_best(clusters, self.instance_evidence(clusters))

@@ -6,19 +6,21 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import PointClusters
+from framework.data import Float32, Float64, PointClusters
 from framework.mapping.evidence import Combine
-from framework.mapping.instance_fuser import FrameEvidence, InstanceFuser, only_best
+from framework.mapping.evidence_fuser import EvidenceFuser, only_best
 
 
 @dataclass
-class MaxConfidence(InstanceFuser):
+class MaxConfidence(EvidenceFuser):
     """A voxel has the instance and best class of the detection with the highest score over it, of the whole video."""
 
     combine = Combine.LARGEST
     logarithmic = False
     units = 1 << 14  # scores are at most 1
 
-    def evidence(self, clusters: PointClusters) -> FrameEvidence:
-        scores = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 would be no evidence at all
-        return FrameEvidence(scores, only_best(clusters, scores))
+    def instance_evidence(self, clusters: PointClusters) -> Float32:
+        return np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 would be no evidence at all
+
+    def class_evidence(self, clusters: PointClusters) -> Float64:
+        return only_best(clusters, self.instance_evidence(clusters))

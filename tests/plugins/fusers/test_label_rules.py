@@ -7,7 +7,7 @@ import pytest
 
 from framework.data import Detections, Pose
 from framework.geometry import lift
-from framework.mapping.instance_fuser import InstanceFuser
+from framework.mapping.evidence_fuser import EvidenceFuser
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.label_count import LabelCount
 from plugins.fusers.last_write import LastWrite
@@ -32,7 +32,7 @@ def product() -> np.ndarray:
         (MaxConfidence, [0.5 / 1.4, 0, 0.9 / 1.4]),  # the best score of each class
     ],
 )
-def test_each_rule_has_its_own_opinion(fuser_class: type[InstanceFuser], expected: np.ndarray) -> None:
+def test_each_rule_has_its_own_opinion(fuser_class: type[EvidenceFuser], expected: np.ndarray) -> None:
     fuser = fuser_class(voxel_size=0.02, max_depth=4.0)
     for k, (T, (score, probabilities)) in enumerate(zip(walk(3), SEEN, strict=True)):
         frame = room().frame(T, k)
