@@ -7,11 +7,12 @@ import pytest
 
 from framework.data import Detections, Pose
 from framework.geometry import lift
-from framework.mapping.evidence_fuser import EvidenceFuser
+from framework.mapping.instance_fuser import InstanceFuser
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.label_count import LabelCount
 from plugins.fusers.last_write import LastWrite
 from plugins.fusers.max_confidence import MaxConfidence
+from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.analytic_scene import CAMERA, room, walk
 
 SEEN = [(0.5, [0.6, 0.3, 0.1]), (0.9, [0.2, 0.1, 0.7]), (0.4, [0.6, 0.4, 0.0])]
@@ -30,9 +31,10 @@ def product() -> np.ndarray:
         (LabelCount, [2 / 3, 0, 1 / 3]),
         (LastWrite, [1, 0, 0]),
         (MaxConfidence, [0.5 / 1.4, 0, 0.9 / 1.4]),  # the best score of each class
+        (Open3DVoxelBlockGrid, product()),
     ],
 )
-def test_each_rule_has_its_own_opinion(fuser_class: type[EvidenceFuser], expected: np.ndarray) -> None:
+def test_each_rule_has_its_own_opinion(fuser_class: type[InstanceFuser], expected: np.ndarray) -> None:
     fuser = fuser_class(voxel_size=0.02, max_depth=4.0)
     for k, (T, (score, probabilities)) in enumerate(zip(walk(3), SEEN, strict=True)):
         frame = room().frame(T, k)

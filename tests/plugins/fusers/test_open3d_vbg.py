@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.data import Camera, Detections, Frame, Pose
+from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError, MapFullError
-from framework.geometry import lift
 from framework.mapping.open3d_map import BlockGridSettings, Open3DMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.analytic_scene import CAMERA, Scene, pose, room, walk
+from tests.true_masks import CLASSES, fuse_masks, masks_of
 
-CLASSES = ("chair", "bed")
 SETTINGS = BlockGridSettings(
     voxel_size=0.02,
     block_resolution=8,
@@ -27,25 +26,6 @@ SETTINGS = BlockGridSettings(
     min_confidence=0.05,
     min_vertices=30,
 )
-
-
-def masks_of(frame: Frame) -> list[np.ndarray]:
-    assert frame.truth is not None
-    return [frame.truth.instance_ids == i for i in frame.truth.class_names]
-
-
-def fused(fuser: Open3DVoxelBlockGrid, frame: Frame, masks: list[np.ndarray], scores: list[float]) -> None:
-    assert frame.T_world_camera is not None
-    n = len(masks)
-    detections = Detections(
-        masks=np.array(masks, np.bool_).reshape(n, *frame.depth.shape),
-        boxes=np.zeros((n, 4), np.float32),
-        scores=np.array(scores, np.float32),
-        class_probabilities=np.tile(np.float32([0.7, 0.3]), (n, 1)),
-        classes=CLASSES,
-    )
-    at = Pose(frame.T_world_camera)
-    fuser.fuse(frame, at, lift(detections, frame, at))
 
 
 def new_fuser(**parameters: float) -> Open3DVoxelBlockGrid:
@@ -62,7 +42,7 @@ def mapped(frames: list[Frame]) -> Open3DMap:
     """The room with its three spheres, from six frames."""
     fuser = new_fuser()
     for frame in frames:
-        fused(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
+        fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
     return fuser.scene
 
 
@@ -144,7 +124,7 @@ def test_the_better_detection_gets_the_pixels_that_two_share(
     v = np.arange(CAMERA.height)[:, None]
     shared = first & (v > np.quantile(np.nonzero(first)[0], 0.7))
     fuser = new_fuser()
-    fused(fuser, frames[0], [first, second | shared], scores)
+    fuse_masks(fuser, frames[0], [first, second | shared], scores)
     ids = fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids
     assert (ids[shared] == winner).mean() > 0.8
     assert (ids[first & ~shared] == 1).mean() > 0.8
@@ -238,7 +218,7 @@ def test_ids_stay_with_their_objects_and_are_those_of_the_other_fuser(frames: li
     for k, frame in enumerate(frames):
         order = np.roll(np.arange(3), k)
         for fuser in (ours, theirs):
-            fused(fuser, frame, [masks_of(frame)[i] for i in order], [0.9] * 3)  # type: ignore[arg-type]
+            fuse_masks(fuser, frame, [masks_of(frame)[i] for i in order], [0.9] * 3)
     histories = [
         {
             k: (r.observations, r.visible, r.detections, r.class_evidence.tolist())
@@ -270,10 +250,10 @@ def test_merging_moves_every_voxel(frames: list[Frame]) -> None:
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
     left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
-    fused(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
+    fuse_masks(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
     assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1, 2}
     for k in (1, 2):
-        fused(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
     assert set(fuser.scene.table.records) == {1}
     assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1}
 
@@ -281,7 +261,7 @@ def test_merging_moves_every_voxel(frames: list[Frame]) -> None:
 def test_an_instance_with_few_vertices_or_frames_does_not_count(frames: list[Frame]) -> None:
     fuser = new_fuser(min_vertices=100_000)
     for frame in frames[:3]:
-        fused(fuser, frame, masks_of(frame)[:1], [0.9])
+        fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
     assert not fuser.scene.instances()
     assert (fuser.scene.mesh().class_ids == -1).all()
     assert fuser.scene.render(CAMERA, frames[0].T_world_camera).instance_ids.any(), "it is tentative, not gone"
@@ -296,7 +276,7 @@ def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch
         monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", first)
         fuser = new_fuser()
         for frame in frames[:3]:
-            fused(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
+            fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
         maps.append(fuser.scene)
     small, large = maps
     assert small.block_count == large.block_count > 16
@@ -307,17 +287,17 @@ def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch
 def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", 16)
     first = new_fuser()
-    fused(first, frames[0], [], [])
+    fuse_masks(first, frames[0], [], [])
     budget = first.scene.block_count
     fuser = new_fuser(max_blocks=budget)
-    fused(fuser, frames[0], [], [])
+    fuse_masks(fuser, frames[0], [], [])
     before = fuser.scene.mesh()
     with pytest.raises(MapFullError, match=f"{budget} blocks of 8"):
-        fused(fuser, dataclasses.replace(frames[0], T_world_camera=pose(0.3)), [], [])
+        fuse_masks(fuser, dataclasses.replace(frames[0], T_world_camera=pose(0.3)), [], [])
     assert fuser.scene.voxel_count == budget * 512
     assert fuser.scene.grid.hashmap().capacity() <= budget
     assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
-    fused(fuser, frames[0], [], [])  # what is there can still be seen again
+    fuse_masks(fuser, frames[0], [], [])  # what is there can still be seen again
 
 
 def test_bytes_are_those_of_the_blocks_in_use(mapped: Open3DMap) -> None:
@@ -342,7 +322,7 @@ def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open
     assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), "Open3D's order differs between runs"
 
 
-def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path) -> None:
+def test_a_damaged_or_foreign_file_is_refuse_masks(mapped: Open3DMap, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     mapped.save(path)
     whole = path.read_bytes()
@@ -364,7 +344,7 @@ def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path)
 
 def test_an_empty_map_is_saved_and_an_empty_scene_changes_nothing(tmp_path: Path) -> None:
     fuser = new_fuser()
-    fused(fuser, Scene().frame(np.eye(4)), [np.ones(CAMERA.shape, np.bool_)], [0.9])
+    fuse_masks(fuser, Scene().frame(np.eye(4)), [np.ones(CAMERA.shape, np.bool_)], [0.9])
     assert (fuser.scene.voxel_count, len(fuser.scene.table.records)) == (0, 0)
     fuser.scene.save(tmp_path / "map.npz")
     assert Open3DMap.load(tmp_path / "map.npz").voxel_count == 0
@@ -375,19 +355,11 @@ def test_a_single_reading_is_mapped(frames: list[Frame]) -> None:
     depth = np.zeros_like(frames[0].depth)
     depth[61, 83] = 1.5
     fuser = new_fuser()
-    fused(fuser, dataclasses.replace(frames[0], depth=depth), [np.ones(CAMERA.shape, np.bool_)], [0.9])
+    fuse_masks(fuser, dataclasses.replace(frames[0], depth=depth), [np.ones(CAMERA.shape, np.bool_)], [0.9])
     assert fuser.scene.voxel_count > 0
 
 
-def test_another_label_space_is_an_error(frames: list[Frame]) -> None:
-    fuser = new_fuser()
-    fused(fuser, frames[0], [], [])
-    clusters = lift(Detections.none(CAMERA.shape, ("cup",)), frames[1], Pose(np.eye(4)))
-    with pytest.raises(DataError, match="label space"):
-        fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
-
-
 def test_parameters_are_checked() -> None:
-    for wrong in ({"voxel_size": 0.0}, {"max_depth": 0.1}, {"label_band": 9.0}, {"min_weight": float("nan")}):
+    for wrong in ({"block_resolution": 1}, {"class_floor": 1.0}, {"min_weight": float("nan")}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             Open3DVoxelBlockGrid(**wrong)  # type: ignore[arg-type]

@@ -1,0 +1,216 @@
+"""Association and the table of instances, over every kind of map, on spheres whose masks are known exactly."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, Frame, Pose
+from framework.errors import ConfigError, DataError
+from framework.geometry import lift
+from framework.mapping.association import OverlapRule
+from framework.mapping.instance_fuser import InstanceFuser, floored_log
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
+from tests.analytic_scene import CAMERA, Scene, room, walk
+from tests.true_masks import fuse_masks, masks_of
+
+NewFuser = Callable[..., InstanceFuser]
+
+
+@pytest.fixture(params=[BayesianTsdf, Open3DVoxelBlockGrid], ids=["our voxels", "Open3D's voxels"])
+def new_fuser(request: pytest.FixtureRequest) -> NewFuser:
+    return lambda **parameters: request.param(**{"voxel_size": 0.02, "max_depth": 4.0} | parameters)
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return [room().frame(T, k) for k, T in enumerate(walk(10))]
+
+
+def test_ids_stay_with_their_objects_whatever_the_order_of_detections(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    for k, frame in enumerate(frames):
+        order = np.roll(np.arange(3), k)
+        fuse_masks(fuser, frame, [masks_of(frame)[i] for i in order], [0.9] * 3)
+    assert len(fuser.scene.table.records) == 3
+    assert {record.observations for record in fuser.scene.table.records.values()} == {10}
+
+
+def test_a_weak_detection_updates_but_does_not_create(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    first, second, _ = masks_of(frames[0])
+    fuse_masks(fuser, frames[0], [first, second], [0.9, 0.2])
+    assert len(fuser.scene.table.records) == 1
+    fuse_masks(fuser, frames[1], masks_of(frames[1])[:2], [0.2, 0.2])
+    [record] = fuser.scene.table.records.values()
+    assert record.observations == 2
+    assert record.score_sum == pytest.approx(1.1)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "updates"),
+    [
+        ({}, True),
+        ({"overlap_rule": OverlapRule.IOU}, False),  # a part shares little of all that is covered
+        ({"class_gate": 0.9}, True),
+        ({"class_gate": 1.0}, False),  # the floor alone keeps distributions from agreeing wholly
+    ],
+)
+def test_what_must_overlap_and_agree_is_a_parameter(
+    new_fuser: NewFuser, frames: list[Frame], parameters: dict[str, Any], updates: bool
+) -> None:
+    fuser = new_fuser(**parameters)
+    whole = masks_of(frames[0])[0]
+    u = np.nonzero(whole)[1]
+    part = whole & (np.arange(CAMERA.width) < np.quantile(u, 0.3))
+    fuse_masks(fuser, frames[0], [whole], [0.9])
+    fuse_masks(fuser, frames[0], [part], [0.9])
+    assert (len(fuser.scene.table.records) == 1) == updates
+
+
+def test_the_same_object_detected_twice_is_created_once(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    mask = masks_of(frames[0])[0]
+    fuse_masks(fuser, frames[0], [mask, mask], [0.9, 0.8])
+    assert len(fuser.scene.table.records) == 1
+
+
+def test_two_halves_become_one_when_they_are_seen_as_one(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    """A detector splits an object at first and finds it whole afterwards."""
+    fuser = new_fuser()
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
+    for k in range(4):
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [left, whole & ~left], [0.9, 0.9])
+    assert len(fuser.scene.instances()) == 2
+    for k in range(4, 12):
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.5])
+    [instance] = fuser.scene.instances().values()
+    assert instance.observations == 12, "a frame that saw both halves counts once"
+    assert set(np.unique(fuser.scene.mesh().instance_ids)) == {0, instance.id}
+
+
+@pytest.mark.parametrize(
+    ("fuser_class", "merge_frames"),
+    [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # where a vote is a vote, the other half is soon outvoted
+)
+def test_two_instances_that_keep_lying_under_one_cluster_are_merged(
+    fuser_class: type[InstanceFuser], merge_frames: int, frames: list[Frame]
+) -> None:
+    """Weak detections of the whole, which would take long to outvote the voxels of the other half."""
+    fuser = fuser_class(voxel_size=0.02, max_depth=4.0, merge_frames=merge_frames)
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
+    fuse_masks(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
+    for k in range(1, 1 + merge_frames):
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
+    assert len(fuser.scene.table.records) == 2, "once apart and so often together is not yet so much more"
+    last = 1 + merge_frames
+    fuse_masks(fuser, dataclasses.replace(frames[0], index=last), [whole], [0.1])
+    [record] = fuser.scene.table.records.values()
+    assert record.id == 1
+    assert record.observations == 1 + last
+    assert record.visible == 1 + last, "a frame that had both in view counts once"
+    assert record.detections == 2 + last
+    assert record.score_sum == pytest.approx(0.9 + 0.8 + last * 0.1)
+    odds = (0.68 / 0.32) ** record.detections
+    assert fuser.scene.table.class_probabilities(record)[0] == pytest.approx(odds / (1 + odds), abs=1e-4)
+    assert set(np.unique(fuser.scene.instances_seen(frames[0], frames[0].T_world_camera, 1))) == {0, 1}
+    fuse_masks(fuser, dataclasses.replace(frames[0], index=last + 1), [whole], [0.9])
+    assert record.observations == 2 + last
+
+
+def test_two_objects_seen_apart_stay_two_under_a_mask_that_covers_both(
+    new_fuser: NewFuser, frames: list[Frame]
+) -> None:
+    fuser = new_fuser()
+    first, second, _ = masks_of(frames[0])
+    for _ in range(5):
+        fuse_masks(fuser, frames[0], [first, second], [0.9, 0.9])
+    for _ in range(4):
+        fuse_masks(fuser, frames[0], [first | second], [0.9])
+    assert len(fuser.scene.table.records) == 2
+    view = fuser.scene.render(CAMERA, frames[0].T_world_camera)
+    ids = [np.bincount(view.instance_ids[mask & (view.depth > 0)]).argmax() for mask in (first, second)]
+    assert ids[0] != ids[1]
+    assert 0 not in ids
+
+
+def test_confidence_falls_with_frames_that_see_but_do_not_detect(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    for k, frame in enumerate(frames):
+        fuse_masks(fuser, frame, masks_of(frame)[:1] if k % 2 == 0 else [], [0.8] if k % 2 == 0 else [])
+    [record] = fuser.scene.table.records.values()
+    assert record.observations == 5
+    assert record.visible == 10
+    assert record.confidence == pytest.approx(0.4)
+
+
+def test_a_class_posterior_is_the_product_of_the_measurements(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser(class_floor=1e-6)
+    for frame in frames[:3]:
+        fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
+    [instance] = fuser.scene.instances().values()
+    assert instance.class_probabilities[0] == pytest.approx(0.7**3 / (0.7**3 + 0.3**3), abs=1e-4)
+
+
+def test_another_label_space_is_an_error(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    fuse_masks(fuser, frames[0], [], [])
+    clusters = dataclasses.replace(
+        lift(Detections.none(CAMERA.shape, ("cup",)), frames[1], Pose(np.eye(4))), classes=("cup",)
+    )
+    with pytest.raises(DataError, match="label space"):
+        fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
+
+
+def test_nothing_changes_where_the_scene_is_empty(new_fuser: NewFuser) -> None:
+    fuser = new_fuser()
+    frame = Scene().frame(np.eye(4))
+    fuse_masks(fuser, frame, [np.ones(CAMERA.shape, np.bool_)], [0.9])
+    assert fuser.scene.voxel_count == 0
+    assert len(fuser.scene.table.records) == 0
+
+
+def test_an_instance_of_which_a_few_pixels_show_is_not_in_view(new_fuser: NewFuser, frames: list[Frame]) -> None:
+    """Else its confidence would fall in every frame at whose border or behind whose objects a bit of it shows."""
+    fuser = new_fuser(create_points=50)
+    mask = masks_of(frames[0])[0]
+    fuse_masks(fuser, frames[0], [mask], [0.9])
+    [record] = fuser.scene.table.records.values()
+    v, u = np.nonzero(mask)
+    middle = (abs(v - int(np.median(v))) <= 2) & (abs(u - int(np.median(u))) <= 2)
+    for rows, visible in (((v[middle], u[middle]), 1), ((v, u), 2)):
+        depth = np.zeros_like(frames[0].depth)
+        depth[rows] = frames[0].depth[rows]
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=1, depth=depth), [], [])
+        assert record.visible == visible
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"voxel_size": 0.0},
+        {"max_depth": 0.1},
+        {"label_band": 9.0},
+        {"overlap": 1.5},
+        {"class_gate": -0.1},
+        {"merge_frames": 0},
+        {"min_confidence": float("nan")},
+    ],
+)
+def test_the_parameters_that_all_share_are_checked(new_fuser: NewFuser, wrong: dict[str, float]) -> None:
+    [name] = wrong
+    with pytest.raises(ConfigError, match=name):
+        new_fuser(**wrong)
+
+
+def test_a_floored_distribution_has_no_zero_and_still_sums_to_one() -> None:
+    p = np.exp(floored_log(np.float32([[1, 0, 0, 0], [0.25, 0.25, 0.25, 0.25]]), 0.2))
+    assert np.allclose(p, [[0.85, 0.05, 0.05, 0.05], [0.25, 0.25, 0.25, 0.25]])
+    assert floored_log(np.zeros((0, 0), np.float32), 0.2).shape == (0, 0)
