@@ -24,6 +24,7 @@ from framework.mapping.association import (
     list_points_by_pixel,
     match_one_to_one,
 )
+from framework.mapping.instance_list import Confirmation
 from framework.mapping.labeled_map import LabeledMap
 from framework.parameters import check_bounds
 
@@ -60,7 +61,7 @@ class InstanceFuser(MapFuser):
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
     min_observations: int = 3  # frames, >= 1: before that an instance is tentative
     min_confidence: float = 0.05  # in [0, 1]: likewise
-    min_vertices: int = 30  # mesh vertices, >= 1: of an instance that counts
+    min_area: float = 0.003  # m^2 of its surface in the mesh, >= 0: likewise; voxel_size^2 for each vertex, 4 at least
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -79,10 +80,15 @@ class InstanceFuser(MapFuser):
             merge_frames=(1, 2**31),
             min_observations=(1, 2**31),
             min_confidence=(0.0, 1.0),
-            min_vertices=(1, 2**31),
+            min_area=(0.0, 1000.0),
         )
         self.scene: LabeledMap  # which a subclass makes
         self._together: Counter[tuple[int, int]] = Counter()  # frames that see two instances as one, less those as two
+
+    @property
+    def confirmation(self) -> Confirmation:
+        """When an instance counts, for a subclass to make its map with."""
+        return Confirmation(self.min_observations, self.min_confidence, self.min_area)
 
     @abstractmethod
     def class_evidence(self, clusters: PointClusters) -> Float64:

@@ -1,8 +1,9 @@
-"""The instances of a labelled mesh, with boxes around their vertices."""
+"""Which instances of a labelled mesh count, and these, with boxes around their vertices."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 import open3d as o3d
@@ -10,13 +11,37 @@ import open3d as o3d
 from framework.data import Bool, Box, Float32, Instance, InstanceMesh, Int32
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 
+LEAST_VERTICES = 4  # that span a box
 
-def instances_that_count(table: InstanceTable, min_observations: int, min_confidence: float) -> Bool:
-    """(ids + 1,) whether an instance has been observed often enough and is trusted enough, by id."""
-    counts = np.zeros(table.last_id + 1, np.bool_)
-    for record in table.records.values():
-        counts[record.id] = record.observations >= min_observations and record.confidence >= min_confidence
-    return counts
+
+@dataclass(frozen=True)
+class Confirmation:
+    """What makes an instance count, in a map's `mesh` and `instances`. Before, it is tentative."""
+
+    min_observations: int  # frames in which it was detected
+    min_confidence: float  # InstanceRecord.confidence
+    min_area: float  # m^2 of its surface in the mesh
+
+    def counts(self, table: InstanceTable) -> Bool:
+        """(ids + 1,) whether an instance has been observed often enough and is trusted enough, by id."""
+        counts = np.zeros(table.last_id + 1, np.bool_)
+        for record in table.records.values():
+            counts[record.id] = (
+                record.observations >= self.min_observations and record.confidence >= self.min_confidence
+            )
+        return counts
+
+    def min_vertices(self, voxel_size: float) -> int:
+        """The vertices that an instance of `min_area` has.
+
+        One stands for voxel_size^2 where the surface lies along the grid. The mesh has one for each voxel that the
+        surface passes through, so a surface askew has up to sqrt(3) times as many.
+        """
+        return max(LEAST_VERTICES, round(self.min_area / voxel_size**2))
+
+    def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
+        """(V,) the vertices of an instance that has less than `min_area`, by the ids (V,) of all vertices."""
+        return np.asarray((np.bincount(instance_ids) < self.min_vertices(voxel_size))[instance_ids])
 
 
 def list_instances(mesh: InstanceMesh, table: InstanceTable) -> Mapping[int, Instance]:

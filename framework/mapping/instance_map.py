@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import numpy.typing as npt
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
 from framework.mapping.association import look_up_instances
 from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.labeled_map import LabeledMap
 from framework.mapping.map_file import plain_table, read_map, table_of, write_map
@@ -21,7 +23,7 @@ from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.vertex_labels import vertex_labels
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
-FORMAT = 3  # of the saved file; a change of meaning counts it up
+FORMAT = 4  # of the saved file; a change of meaning counts it up
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)
 ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
@@ -35,14 +37,12 @@ class InstanceMap(LabeledMap):
         voxel_size: float,
         sensor: Sensor,
         max_blocks: int,
-        min_observations: int,
-        min_confidence: float,
-        min_vertices: int,
+        confirmation: Confirmation,
         combine: Combine = Combine.SUM,
         logarithmic: bool = True,
         storage: Storage = Storage.COMPACT,
     ) -> None:
-        super().__init__(InstanceTable(combine, logarithmic), min_observations, min_confidence, min_vertices)
+        super().__init__(InstanceTable(combine, logarithmic), confirmation)
         self.sensor = sensor
         self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
         self.labels = EvidenceRows(self.voxels, combine, storage)
@@ -107,12 +107,11 @@ class InstanceMap(LabeledMap):
     @cached_property
     def _mesh(self) -> InstanceMesh:
         surface = self._surface.extract()
-        counts = self._counts()
+        counts = self.confirmation.counts(self.table)
         colors, instance_ids, class_ids = vertex_labels(self.voxels.grid, self.labels.evidence, counts, surface)
-        too_small = np.bincount(instance_ids, minlength=len(counts)) < self.min_vertices
-        dropped = too_small[instance_ids]
-        instance_ids[dropped] = 0
-        class_ids[dropped] = -1
+        too_small = self.confirmation.too_small(instance_ids, self.voxel_size)
+        instance_ids[too_small] = 0
+        class_ids[too_small] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def save(self, path: Path) -> None:
@@ -123,9 +122,7 @@ class InstanceMap(LabeledMap):
             "voxel_size": self.voxel_size,
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
             "max_blocks": self.voxels.max_blocks,
-            "min_observations": self.min_observations,
-            "min_confidence": self.min_confidence,
-            "min_vertices": self.min_vertices,
+            "confirmation": asdict(self.confirmation),
             "storage": self.labels.storage.name,
             "classes": self.classes,
             "evicted": self.labels.evicted,
@@ -145,9 +142,7 @@ class InstanceMap(LabeledMap):
             header["voxel_size"],
             Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()}),
             header["max_blocks"],
-            header["min_observations"],
-            header["min_confidence"],
-            header["min_vertices"],
+            Confirmation(**header["confirmation"]),
             table.combine,
             table.logarithmic,
             Storage[header["storage"]],

@@ -5,26 +5,23 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Mapping
 
-from framework.data import Bool, Float64, Frame, Instance, Int32
+from framework.data import Float64, Frame, Instance, Int32
 from framework.interfaces import SceneMap
-from framework.mapping.instance_list import instances_that_count, list_instances
+from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 
 
 class LabeledMap(SceneMap):
     """A map whose voxels know the instance that they belong to, and a table of these instances.
 
-    An instance counts, in `mesh` and `instances`, once it has been observed `min_observations` times, its confidence
-    is `min_confidence` and it has `min_vertices` vertices; before, it is tentative: `render` shows it, as association
-    needs it.
+    `mesh` and `instances` have the instances that count; `render` shows the tentative ones too, as association needs
+    them.
     """
 
-    def __init__(self, table: InstanceTable, min_observations: int, min_confidence: float, min_vertices: int) -> None:
+    def __init__(self, table: InstanceTable, confirmation: Confirmation) -> None:
         self.classes: tuple[str, ...] = ()
         self.table = table
-        self.min_observations = min_observations
-        self.min_confidence = min_confidence
-        self.min_vertices = min_vertices
+        self.confirmation = confirmation
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Takes the first frame's label space for the map's."""
@@ -44,11 +41,8 @@ class LabeledMap(SceneMap):
 
     @property
     def instance_count(self) -> int:
-        """Without the condition on vertices, which takes a mesh."""
-        return int(self._counts().sum())
+        """Without the condition on their area, which takes a mesh."""
+        return int(self.confirmation.counts(self.table).sum())
 
     def instances(self) -> Mapping[int, Instance]:
         return list_instances(self.mesh(), self.table)
-
-    def _counts(self) -> Bool:
-        return instances_that_count(self.table, self.min_observations, self.min_confidence)

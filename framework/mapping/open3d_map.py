@@ -20,11 +20,12 @@ from open3d.core import Tensor
 from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, UInt8, View
 from framework.errors import MapFullError
 from framework.geometry import back_project, inverse, transform
+from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.labeled_map import LabeledMap
 from framework.mapping.map_file import plain_table, read_map, table_of, write_map
 
-FORMAT = "open3d_vbg 1"  # of the saved file; a change of meaning counts it up
+FORMAT = "open3d_vbg 2"  # of the saved file; a change of meaning counts it up
 ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three as Open3D's `integrate` wants them
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
     "weight": (o3d.core.float32, 1),  # frames
@@ -53,9 +54,6 @@ class BlockGridSettings:
     max_depth: float  # m
     max_blocks: int
     min_weight: float  # frames that must have seen a voxel for it to be surface
-    min_observations: int  # frames
-    min_confidence: float
-    min_vertices: int
 
 
 class Open3DMap(LabeledMap):
@@ -64,8 +62,8 @@ class Open3DMap(LabeledMap):
     An instance's class is that of the table, the same for all its voxels.
     """
 
-    def __init__(self, settings: BlockGridSettings) -> None:
-        super().__init__(InstanceTable(), settings.min_observations, settings.min_confidence, settings.min_vertices)
+    def __init__(self, settings: BlockGridSettings, confirmation: Confirmation) -> None:
+        super().__init__(InstanceTable(), confirmation)
         self.settings = settings
         self.frames = 0  # integrated
         self._new_grid()
@@ -328,10 +326,9 @@ class Open3DMap(LabeledMap):
     @cached_property
     def _mesh(self) -> InstanceMesh:
         vertices, triangles, colors = self._extract()
-        counts = self._counts()
         ids = self.instances_at(vertices)
-        ids[~counts[ids]] = 0
-        ids[(np.bincount(ids, minlength=len(counts)) < self.settings.min_vertices)[ids]] = 0
+        ids[~self.confirmation.counts(self.table)[ids]] = 0
+        ids[self.confirmation.too_small(ids, self.settings.voxel_size)] = 0
         return InstanceMesh(vertices, triangles, colors, ids, self._class_of_ids()[ids], self.classes)
 
     def _extract(self) -> tuple[Float32, Int32, UInt8]:
@@ -356,6 +353,7 @@ class Open3DMap(LabeledMap):
         header = {
             "format": FORMAT,
             "settings": asdict(self.settings),
+            "confirmation": asdict(self.confirmation),
             "classes": self.classes,
             "frames": self.frames,
             "table": plain_table(self.table),
@@ -369,7 +367,7 @@ class Open3DMap(LabeledMap):
     @classmethod
     def load(cls, path: Path) -> Open3DMap:
         header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
-        scene = cls(BlockGridSettings(**header["settings"]))
+        scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
         scene.classes = tuple(header["classes"])
         scene.frames = header["frames"]
         scene.table = table_of(header["table"])

@@ -39,11 +39,8 @@ class Open3DVoxelBlockGrid(InstanceFuser):
             max_depth=self.max_depth,
             max_blocks=self.max_blocks,
             min_weight=self.min_weight,
-            min_observations=self.min_observations,
-            min_confidence=self.min_confidence,
-            min_vertices=self.min_vertices,
         )
-        self.scene: Open3DMap = Open3DMap(settings)
+        self.scene: Open3DMap = Open3DMap(settings, self.confirmation)
 
     def class_evidence(self, clusters: PointClusters) -> Float64:
         return floored_log(clusters.class_probabilities, self.class_floor)

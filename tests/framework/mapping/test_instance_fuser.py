@@ -192,6 +192,21 @@ def test_an_instance_of_which_a_few_pixels_show_is_not_in_view(new_fuser: NewFus
         assert record.visible == visible
 
 
+@pytest.mark.parametrize("voxel_size", [0.01, 0.02, 0.04])
+def test_the_least_area_of_an_instance_does_not_depend_on_the_voxels(new_fuser: NewFuser, voxel_size: float) -> None:
+    """A poster on a wall, of which the area is known."""
+    depth, poster = 1.5, np.zeros(CAMERA.shape, np.bool_)
+    poster[30:90, 40:120] = True
+    area = poster.sum() * depth**2 / (CAMERA.fx * CAMERA.fy)
+    wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -depth)])
+    for share, count in ((0.9, 1), (1.1, 0)):
+        fuser = new_fuser(voxel_size=voxel_size, min_area=share * area)
+        for k in range(3):
+            fuse_masks(fuser, wall.frame(np.eye(4), k), [poster], [0.9])
+        assert len(fuser.scene.instances()) == count
+        assert fuser.scene.instance_count == 1, "which does not look at the mesh"
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -202,6 +217,7 @@ def test_an_instance_of_which_a_few_pixels_show_is_not_in_view(new_fuser: NewFus
         {"class_gate": -0.1},
         {"merge_frames": 0},
         {"min_confidence": float("nan")},
+        {"min_area": -0.001},
     ],
 )
 def test_the_parameters_that_all_share_are_checked(new_fuser: NewFuser, wrong: dict[str, float]) -> None:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -148,15 +149,14 @@ def test_a_file_of_another_format_is_refused(other: int, tmp_path: Path) -> None
         InstanceMap.load(path)
 
 
-@pytest.mark.parametrize("threshold", [{"min_observations": 13}, {"min_confidence": 0.95}, {"min_vertices": 10_000}])
+@pytest.mark.parametrize("threshold", [{"min_observations": 13}, {"min_confidence": 0.95}, {"min_area": 4.0}])
 def test_what_is_below_a_threshold_does_not_count(
     scene_map: InstanceMap, tmp_path: Path, threshold: dict[str, float]
 ) -> None:
     scene_map.save(tmp_path / "map.npz")
     loaded = InstanceMap.load(tmp_path / "map.npz")
     assert len(loaded.instances()) == 3
-    for name, value in threshold.items():
-        setattr(loaded, name, value)
+    loaded.confirmation = replace(loaded.confirmation, **threshold)  # type: ignore[arg-type]
     loaded.changed()
     assert not loaded.instances()
     assert not loaded.mesh().instance_ids.any()

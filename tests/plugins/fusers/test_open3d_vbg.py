@@ -8,6 +8,7 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError, MapFullError
+from framework.mapping.instance_list import Confirmation
 from framework.mapping.open3d_map import BlockGridSettings, Open3DMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
@@ -22,10 +23,8 @@ SETTINGS = BlockGridSettings(
     max_depth=4.0,
     max_blocks=10_000,
     min_weight=3.0,
-    min_observations=3,
-    min_confidence=0.05,
-    min_vertices=30,
 )
+CONFIRMATION = Confirmation(min_observations=3, min_confidence=0.05, min_area=0.003)
 
 
 def new_fuser(**parameters: float) -> Open3DVoxelBlockGrid:
@@ -49,7 +48,7 @@ def mapped(frames: list[Frame]) -> Open3DMap:
 def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
     """A wall seen once."""
     frame = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)]).frame(np.eye(4))
-    scene = Open3DMap(dataclasses.replace(SETTINGS, **changes))  # type: ignore[arg-type]
+    scene = Open3DMap(dataclasses.replace(SETTINGS, **changes), CONFIRMATION)  # type: ignore[arg-type]
     scene.integrate(frame, np.eye(4))
     return scene, frame
 
@@ -98,7 +97,7 @@ def voxel_centres(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
 def test_the_voxels_in_the_band_under_a_mask_vote_and_no_others(frames: list[Frame]) -> None:
     frame = frames[3]
     T = frame.T_world_camera
-    scene = Open3DMap(SETTINGS)
+    scene = Open3DMap(SETTINGS, CONFIRMATION)
     scene.integrate(frame, T)
     mask = masks_of(frame)[0]
     scene.vote(frame, T, np.where(mask, 7, 0).astype(np.int32), band=2.0)
@@ -136,7 +135,7 @@ def test_the_better_detection_gets_the_pixels_that_two_share(
 @pytest.mark.parametrize("rotvec", [(0.0, 0.0, 0.0), (0.1, 0.5, 0.0), (-0.2, -0.4, 0.3)])
 def test_views_show_the_surface_where_it_is(rotvec: tuple[float, float, float]) -> None:
     """Open3D's own rays end 12 mm too far, and its depth look-up is off by half a pixel; neither is left."""
-    scene, T = Open3DMap(SETTINGS), pose(rotvec=rotvec)
+    scene, T = Open3DMap(SETTINGS, CONFIRMATION), pose(rotvec=rotvec)
     walls = Scene(planes=[(np.array([-0.3, 0.1, -1.0]) / np.sqrt(1.1), -1.777)], spheres=room().spheres)
     for _ in range(3):
         scene.integrate(walls.frame(T), T)
@@ -164,7 +163,7 @@ def test_the_mesh_lies_on_the_surface_and_is_the_same_in_every_run(mapped: Open3
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
     towards = np.einsum("ij,ij->i", np.cross(b - a, c - a), -a)  # the camera stayed near the origin
     assert (towards > 0).mean() > 0.98
-    again = Open3DMap(mapped.settings)
+    again = Open3DMap(mapped.settings, CONFIRMATION)
     for frame in frames:
         again.integrate(frame, frame.T_world_camera)
     twin = again.mesh()
@@ -189,7 +188,7 @@ def test_the_first_frame_alone_is_a_surface_and_later_ones_need_more() -> None:
 def test_a_coarse_image_leaves_no_holes() -> None:
     """Open3D touches blocks at every 4th pixel only: here 12 cm apart, for blocks of 8 cm."""
     coarse = Camera(48, 36, 40.0, 40.0, 23.5, 17.5)
-    scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01))
+    scene = Open3DMap(dataclasses.replace(SETTINGS, voxel_size=0.01), CONFIRMATION)
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.2)])
     for _ in range(3):
         scene.integrate(wall.frame(np.eye(4), camera=coarse), np.eye(4))
@@ -198,7 +197,7 @@ def test_a_coarse_image_leaves_no_holes() -> None:
 
 def test_a_close_view_of_a_large_map_is_whole_and_silent(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
     """Open3D sizes its map of ranges by the first view, prints a warning in a later one and leaves holes there."""
-    scene = Open3DMap(mapped.settings)
+    scene = Open3DMap(mapped.settings, CONFIRMATION)
     for T in walk(3):
         scene.integrate(room().frame(T), T)
     small = Camera(8, 6, 6.5, 6.5, 3.5, 2.5)
@@ -258,8 +257,8 @@ def test_merging_moves_every_voxel(frames: list[Frame]) -> None:
     assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1}
 
 
-def test_an_instance_with_few_vertices_or_frames_does_not_count(frames: list[Frame]) -> None:
-    fuser = new_fuser(min_vertices=100_000)
+def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
+    fuser = new_fuser(min_area=40.0)
     for frame in frames[:3]:
         fuse_masks(fuser, frame, masks_of(frame)[:1], [0.9])
     assert not fuser.scene.instances()
@@ -309,6 +308,7 @@ def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open
     mapped.save(tmp_path / "map.npz")
     loaded = Open3DMap.load(tmp_path / "map.npz")
     assert (loaded.settings, loaded.classes, loaded.frames) == (mapped.settings, CLASSES, 6)
+    assert loaded.confirmation == mapped.confirmation
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
         assert np.array_equal(getattr(mapped.mesh(), name), getattr(loaded.mesh(), name)), name
     assert {k: vars(r).keys() for k, r in loaded.table.records.items()} == {
@@ -333,7 +333,7 @@ def test_a_damaged_or_foreign_file_is_refuse_masks(mapped: Open3DMap, tmp_path: 
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match="map format 3, this version reads open3d_vbg"):
+    with pytest.raises(DataError, match="map format 4, this version reads open3d_vbg"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")
