@@ -9,7 +9,8 @@ import pytest
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError, MapFullError
 from framework.mapping.instance_list import Confirmation
-from framework.mapping.open3d_map import BlockGridSettings, Open3DMap
+from framework.mapping.open3d_grid import BlockGridSettings
+from framework.mapping.open3d_map import Open3DMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.analytic_scene import CAMERA, Scene, pose, room, walk
@@ -74,17 +75,17 @@ def test_a_voxel_counts_as_boyer_and_moore_do(votes: list[int]) -> None:
     scene, frame = one_view()
     for vote in votes:
         scene.vote(frame, np.eye(4), np.full(frame.depth.shape, vote, np.int32), band=2.0)
-    counted = scene._flat("instance") > 0
+    counted = scene.grid.flat("instance") > 0
     candidate, count = majority(votes)
     assert counted.sum() > 1000
-    assert set(scene._flat("instance")[counted]) == {candidate}
-    assert set(scene._flat("votes")[counted]) == {count}
+    assert set(scene.grid.flat("instance")[counted]) == {candidate}
+    assert set(scene.grid.flat("votes")[counted]) == {count}
 
 
 def voxel_centres(scene: Open3DMap) -> tuple[np.ndarray, np.ndarray]:
     """Flat numbers and places (m) of all voxels, the slow and obvious way."""
-    r, size = scene.settings.block_resolution, scene.settings.voxel_size
-    hashmap = scene.grid.hashmap()
+    r, size = scene.grid.settings.block_resolution, scene.grid.settings.voxel_size
+    hashmap = scene.grid.blocks.hashmap()
     z, y, x = np.mgrid[:r, :r, :r].reshape(3, -1)
     numbers, places = [], []
     for block in hashmap.active_buf_indices().numpy():
@@ -109,10 +110,10 @@ def test_the_voxels_in_the_band_under_a_mask_vote_and_no_others(frames: list[Fra
     expected = np.zeros(len(numbers), bool)
     at = (v[inside].astype(int), u[inside].astype(int))
     expected[inside] = mask[at] & (np.abs(frame.depth[at] - z[inside]) <= 2.0 * 0.02)
-    found = scene._flat("instance")[numbers] == 7
+    found = scene.grid.flat("instance")[numbers] == 7
     assert expected.sum() > 500
     assert (found != expected).mean() < 1e-4, "rounding at the border alone"
-    assert (scene._flat("instance") == 7).sum() == found.sum(), "a voxel in no block has voted"
+    assert (scene.grid.flat("instance") == 7).sum() == found.sum(), "a voxel in no block has voted"
 
 
 @pytest.mark.parametrize(("scores", "winner"), [([0.9, 0.6], 1), ([0.6, 0.9], 2)])
@@ -163,7 +164,7 @@ def test_the_mesh_lies_on_the_surface_and_is_the_same_in_every_run(mapped: Open3
     a, b, c = (mesh.vertices[mesh.triangles[:, i]].astype(np.float64) for i in range(3))
     towards = np.einsum("ij,ij->i", np.cross(b - a, c - a), -a)  # the camera stayed near the origin
     assert (towards > 0).mean() > 0.98
-    again = Open3DMap(mapped.settings, CONFIRMATION)
+    again = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for frame in frames:
         again.integrate(frame, frame.T_world_camera)
     twin = again.mesh()
@@ -197,7 +198,7 @@ def test_a_coarse_image_leaves_no_holes() -> None:
 
 def test_a_close_view_of_a_large_map_is_whole_and_silent(mapped: Open3DMap, capfd: pytest.CaptureFixture[str]) -> None:
     """Open3D sizes its map of ranges by the first view, prints a warning in a later one and leaves holes there."""
-    scene = Open3DMap(mapped.settings, CONFIRMATION)
+    scene = Open3DMap(mapped.grid.settings, CONFIRMATION)
     for T in walk(3):
         scene.integrate(room().frame(T), T)
     small = Camera(8, 6, 6.5, 6.5, 3.5, 2.5)
@@ -250,11 +251,11 @@ def test_merging_moves_every_voxel(frames: list[Frame]) -> None:
     u = np.flatnonzero(whole.any(axis=0))
     left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
     fuse_masks(fuser, frames[0], [left, whole & ~left], [0.9, 0.8])
-    assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1, 2}
+    assert set(np.unique(fuser.scene.grid.flat("instance"))) == {0, 1, 2}
     for k in (1, 2):
         fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1])
     assert set(fuser.scene.table.records) == {1}
-    assert set(np.unique(fuser.scene._flat("instance"))) == {0, 1}
+    assert set(np.unique(fuser.scene.grid.flat("instance"))) == {0, 1}
 
 
 def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
@@ -272,42 +273,42 @@ def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
 def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     maps = []
     for first in (16, 5000):
-        monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", first)
+        monkeypatch.setattr("framework.mapping.open3d_grid.FIRST_BLOCKS", first)
         fuser = new_fuser()
         for frame in frames[:3]:
             fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
         maps.append(fuser.scene)
     small, large = maps
-    assert small.block_count == large.block_count > 16
+    assert small.grid.block_count == large.grid.block_count > 16
     for name in ("vertices", "colors", "instance_ids"):
         assert np.array_equal(getattr(small.mesh(), name), getattr(large.mesh(), name))
 
 
 def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.mapping.open3d_map.FIRST_BLOCKS", 16)
+    monkeypatch.setattr("framework.mapping.open3d_grid.FIRST_BLOCKS", 16)
     first = new_fuser()
     fuse_masks(first, frames[0], [], [])
-    budget = first.scene.block_count
+    budget = first.scene.grid.block_count
     fuser = new_fuser(max_blocks=budget)
     fuse_masks(fuser, frames[0], [], [])
     before = fuser.scene.mesh()
     with pytest.raises(MapFullError, match=f"{budget} blocks of 8"):
         fuse_masks(fuser, dataclasses.replace(frames[0], T_world_camera=pose(0.3)), [], [])
     assert fuser.scene.voxel_count == budget * 512
-    assert fuser.scene.grid.hashmap().capacity() <= budget
+    assert fuser.scene.grid.blocks.hashmap().capacity() <= budget
     assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
     fuse_masks(fuser, frames[0], [], [])  # what is there can still be seen again
 
 
 def test_bytes_are_those_of_the_blocks_in_use(mapped: Open3DMap) -> None:
     assert mapped.byte_count == mapped.voxel_count * 4 * (1 + 1 + 3 + 1 + 1)
-    assert mapped.voxel_count == mapped.block_count * 512
+    assert mapped.voxel_count == mapped.grid.block_count * 512
 
 
 def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open3DMap, tmp_path: Path) -> None:
     mapped.save(tmp_path / "map.npz")
     loaded = Open3DMap.load(tmp_path / "map.npz")
-    assert (loaded.settings, loaded.classes, loaded.frames) == (mapped.settings, CLASSES, 6)
+    assert (loaded.grid.settings, loaded.classes, loaded.grid.frames) == (mapped.grid.settings, CLASSES, 6)
     assert loaded.confirmation == mapped.confirmation
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
         assert np.array_equal(getattr(mapped.mesh(), name), getattr(loaded.mesh(), name)), name
