@@ -170,6 +170,7 @@ class PointClusters:
     scores: Float32  # (N,) in [0, 1]
     classes: tuple[str, ...]  # names of the C columns
     exact: bool = False  # as in Detections
+    structure: Bool | None = None  # (H, W) pixels on floors and walls, which are of no object; None = nobody looked
 
     def __post_init__(self) -> None:
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)
@@ -183,6 +184,8 @@ class PointClusters:
             raise DataError(
                 f"PointClusters.cluster must be in [-1, {n}), found {self.cluster.min()} to {self.cluster.max()}"
             )
+        if self.structure is not None:
+            _check("PointClusters.structure", self.structure, (None, None), np.bool_)
 
     def __len__(self) -> int:
         return len(self.scores)

@@ -1,8 +1,9 @@
 """Data association: which instance of the map is each cluster of the frame?
 
-A cluster's pixels vote for the instances that the map holds at the surface measured there. One cluster gets at most
-one instance and the reverse, best overlap first; the overlap is counted over the smaller of the two, so that a part of
-an object still finds the whole.
+A cluster's pixels vote for the instances that the map holds at the surface measured there. Which pairs may match is
+said by their overlap over the smaller of the two, so that a part of an object still finds the whole; among those, one
+cluster gets at most one instance and the reverse, best IoU first, so that a table does not get the book that lies on
+it.
 """
 
 from __future__ import annotations
@@ -162,15 +163,15 @@ def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.flo
     return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 
-def match_one_to_one(overlap: npt.NDArray[np.float64], threshold: float) -> Int32:
-    """(N,) the column that each row is matched with, -1 = none: best overlap (N, M) first, above `threshold`.
+def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
+    """(N,) the column that each row is matched with, -1 = none: of the `allowed` pairs (N, M) the most preferred first.
 
     Ties go to the smaller column, then to the smaller row.
     """
-    match = np.full(len(overlap), -1, np.int32)
-    rows, columns = np.nonzero(overlap > threshold)
-    taken = np.zeros(overlap.shape[1], np.bool_)
-    for i in np.lexsort((rows, columns, -overlap[rows, columns])):
+    match = np.full(len(allowed), -1, np.int32)
+    rows, columns = np.nonzero(allowed)
+    taken = np.zeros(allowed.shape[1], np.bool_)
+    for i in np.lexsort((rows, columns, -preference[rows, columns])):
         row, column = rows[i], columns[i]
         if match[row] < 0 and not taken[column]:
             match[row] = column

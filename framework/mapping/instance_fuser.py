@@ -11,7 +11,7 @@ from itertools import combinations
 
 import numpy as np
 
-from framework.data import Float32, Float64, Frame, Int32, PointClusters, Pose
+from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
 from framework.interfaces import MapFuser
 from framework.mapping.association import (
@@ -57,6 +57,7 @@ class InstanceFuser(MapFuser):
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
     duplicate_overlap: float = 0.6  # in (0, 1]: a cluster that shares this with a better one creates nothing
+    split: bool = True  # whether two clusters on one instance split it: the better one keeps it, the other is new
     merge_overlap: float = 0.5  # in (0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
     min_observations: int = 3  # frames, >= 1: before that an instance is tentative
@@ -129,21 +130,28 @@ class InstanceFuser(MapFuser):
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame: Frame) -> Int32:
         """(N,) the instance of each cluster, an old or a new one; 0 = none."""
-        overlap = overlaps.by(self.overlap_rule, self.create_points)
-        if self.class_gate > 0 and overlap.size:
-            table = self.scene.table
-            known = np.stack([table.class_probabilities(table.records[int(k)]) for k in overlaps.instance_ids])
-            overlap[class_agreement(clusters.class_probabilities, known) < self.class_gate] = 0
-        match = match_one_to_one(overlap, self.overlap)
+        overlapping = overlaps.by(self.overlap_rule, self.create_points) > self.overlap
+        allowed = overlapping & self._agree(clusters, overlaps.instance_ids)
+        match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (
             (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         )
+        if not self.split:
+            may_create &= ~overlapping.any(axis=1)
         if may_create.any():
             may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
         for k in np.flatnonzero(may_create):
             instance_ids[k] = self.scene.table.create(len(clusters.classes), frame.index).id
         return instance_ids
+
+    def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
+        """(N, M) whether a cluster may be the same thing as an instance, by their classes."""
+        if self.class_gate == 0 or not len(instance_ids):
+            return np.ones((len(clusters), len(instance_ids)), np.bool_)
+        table = self.scene.table
+        known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
+        return class_agreement(clusters.class_probabilities, known) >= self.class_gate
 
     def _observe(self, overlaps: Overlaps, clusters: PointClusters, instance_ids: Int32, frame: Frame) -> None:
         """Brings the table of instances up to date with what this frame saw."""

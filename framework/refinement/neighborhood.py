@@ -75,18 +75,20 @@ def neighborhoods(
 
     A ring holds the pixels that have a depth reading, are not in the cluster themselves and lie within
     `ring_fraction` * sqrt(points in the cluster) px of it, bounded to [`min_ring`, `max_ring`] px. Pixels of other
-    clusters belong to it like any other. `max_ring` is at most MAX_RING_WIDTH.
+    clusters belong to it like any other; those of known structure are as if they had no reading: they need not be told
+    from the object any more, and are no border to it. `max_ring` is at most MAX_RING_WIDTH.
     """
     camera, pixels = frame.camera, clusters.pixels
+    depth = frame.depth if clusters.structure is None else np.where(clusters.structure, np.float32(0), frame.depth)
     order, firsts = grouped(clusters.cluster, len(clusters))
     areas = np.diff(firsts)
     widths = np.clip(np.rint(ring_fraction * np.sqrt(areas)), min_ring, max_ring).astype(np.int64)
     windows = _windows(pixels, order, firsts, widths, *camera.shape)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])
-    outside, inside, ring_counts = _distances(pixels, order, firsts, widths, windows, cells, frame.depth)
+    outside, inside, ring_counts = _distances(pixels, order, firsts, widths, windows, cells, depth)
     starts = np.concatenate([[0], np.cumsum(areas + ring_counts)])
     points, depth_in_mask, source, radii = _gather(
-        pixels, order, firsts, widths, windows, cells, outside, inside, frame.depth, starts, pinhole(camera)
+        pixels, order, firsts, widths, windows, cells, outside, inside, depth, starts, pinhole(camera)
     )
     return Neighborhoods(points, depth_in_mask, source, starts, areas, widths, radii)
 

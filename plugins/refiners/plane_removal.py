@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit
@@ -22,7 +22,8 @@ class PlaneRemoval(ClusterRefiner):
     known. One counts as structure when it is large (`min_area`, `min_share`) and the frame shows nearly nothing behind
     it (`max_behind`): below a table top, behind a screen there is a room, below a floor there is none. A cluster
     loses such a plane only if it holds at most `max_own` of the plane's points in the frame: the top of a table that
-    fills the image is the table's. A dropped point leaves the arrays, clusters keep their index.
+    fills the image is the table's. A dropped point leaves the arrays, clusters keep their index. The refined clusters
+    know the planes as `structure`, where a mask's border needs no further doubt.
     """
 
     distance: float = 0.01  # m, from 0, from the plane; three standard deviations of the plane's own noise come on top
@@ -52,8 +53,10 @@ class PlaneRemoval(ClusterRefiner):
         if len(planes) == 0:
             return clusters
         on_plane = plane_image(frame, planes, self.distance)
-        kept = _off_planes(clusters.cluster, clusters.pixels, on_plane, len(clusters), len(planes), self.max_own)
-        return keep_points(clusters, kept)
+        kept, structure = _off_planes(
+            clusters.cluster, clusters.pixels, on_plane, len(clusters), len(planes), self.max_own
+        )
+        return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
         """The frame's planes that bound the scene."""
@@ -63,16 +66,23 @@ class PlaneRemoval(ClusterRefiner):
 
 
 @njit(cache=True, nogil=True)
-def _off_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float) -> Bool:
-    """(P,) which points stay. A pixel is in a cluster once, so its points on a plane are a part of the plane's."""
+def _off_planes(
+    cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float
+) -> tuple[Bool, Bool]:
+    """(P,) which points stay, (H, W) which pixels are on a plane and in no cluster to which it belongs.
+
+    A pixel is in a cluster once, so its points on a plane are a part of the plane's.
+    """
     totals, own = np.zeros(planes + 1, np.int64), np.zeros((clusters, planes + 1), np.int64)
     for label in on_plane.ravel():
         totals[label] += 1
     for i in range(len(cluster)):
         if cluster[i] >= 0:
             own[cluster[i], on_plane[pixels[i, 1], pixels[i, 0]]] += 1
-    kept = np.ones(len(cluster), np.bool_)
+    kept, structure = np.ones(len(cluster), np.bool_), on_plane > 0
     for i in range(len(cluster)):
         label = on_plane[pixels[i, 1], pixels[i, 0]]
-        kept[i] = cluster[i] < 0 or label == 0 or own[cluster[i], label] > max_own * totals[label]
-    return kept
+        if cluster[i] >= 0 and label > 0:
+            kept[i] = own[cluster[i], label] > max_own * totals[label]
+            structure[pixels[i, 1], pixels[i, 0]] &= not kept[i]
+    return kept, structure
