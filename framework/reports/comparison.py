@@ -106,7 +106,7 @@ class Row:
 
 
 def rows_of(records: Sequence[Record], over: Sequence[str], order: Sequence[str] = ()) -> list[Row]:
-    """The rows that `records` make: those named in `order`, which may have no run yet, then the others by name.
+    """The rows that `records` make: those named in `order` first, the others by name.
 
     A row is what an experiment calls `row`, else what was chosen: the stages' options and the parameters in which the
     records differ, other than the keys `over` and what follows them, as dataset.seed follows seed.
@@ -117,7 +117,7 @@ def rows_of(records: Sequence[Record], over: Sequence[str], order: Sequence[str]
     stages = _differing([(one.row, one.choices) for one in told])
     of_stages = [((one.row, *map(one.choices.get, stages)), one.parameters) for one in told]
     parameters = [key for key in _differing(of_stages) if key not in own]
-    rows: dict[str, dict[Run, Record]] = {name: {} for name in order}
+    rows: dict[str, dict[Run, Record]] = {}
     for one in told:
         shown = [f"{key}={one.choices[key]}" for key in stages if key in one.choices]
         shown += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters]

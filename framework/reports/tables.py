@@ -7,10 +7,9 @@ import hashlib
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from framework.atomic_files import written_whole
 from framework.build import STAGES
@@ -46,9 +45,10 @@ class Comparison:
 
     title: str
     choice: TableChoice
-    rows: list[Row]  # in their order; some may have no run yet
-    overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name
+    rows: list[Row]  # in their order, each with a run or more
+    overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
     incomplete: list[Incomplete]
+    superseded: int  # records of runs that have a later one
     root: Path  # what the names of runs are relative to
 
     @classmethod
@@ -67,13 +67,17 @@ class Comparison:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
             raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
         rows = rows_of(records, choice.over, list(overrides))
-        return cls(directory.resolve().name, choice, rows, overrides, incomplete, directory)
+        superseded = len(records) - sum(len(row.records) for row in rows)
+        return cls(directory.resolve().name, choice, rows, overrides, incomplete, superseded, directory)
 
     @property
     def base(self) -> Row | None:
         """The row that the others are compared with; None while it has no run."""
-        named = [row for row in self.rows if self.choice.base in (None, row.name)][:1]
-        return next((row for row in named if row.records), None)
+        return next((row for row in self.rows if row.name == self._base_name), None)
+
+    @property
+    def _base_name(self) -> str:
+        return self.choice.base or next(iter(self.overrides), self.rows[0].name)
 
     @property
     def records(self) -> list[Record]:
@@ -83,19 +87,19 @@ class Comparison:
         """Each row's mean and deviation."""
         columns = [_Column(key, [row.mean(key) for row in self.rows]) for key in self.choice.columns]
         body = [
-            [row.name, *(c.cell(k, c.means[k].deviation, len(row.records)) for c in columns), row.pose_source]
+            [
+                *(row.name, str(len(row.records))),
+                *(column.cell(k, column.means[k].deviation, len(row.records)) for column in columns),
+                row.pose_source,
+            ]
             for k, row in enumerate(self.rows)
         ]
-        counts = [[str(len(row.records))] for row in self.rows]
-        return Grid(
-            heads=["row", "runs", *(c.head for c in columns), "poses"],
-            body=[[name, *count, *cells] for (name, *cells), count in zip(body, counts, strict=True)],
-        )
+        return Grid(heads=["row", "runs", *(column.head for column in columns), "poses"], body=body)
 
     def differences(self) -> Grid | None:
         """Each row's mean difference to the base with its standard error; None without a base or another row."""
         base = self.base
-        others = [row for row in self.rows if row is not base and row.records]
+        others = [row for row in self.rows if row is not base]
         if base is None or not others:
             return None
         columns = [_Column(key, [row.difference(base, key) for row in others]) for key in self.choice.columns]
@@ -116,20 +120,31 @@ class Comparison:
                 f"* where the {CONFIDENCE:.0%} interval of Student's t is without 0."
             )
         else:
-            yield f"No differences: {self.choice.base or self.rows[0].name} has no complete run."
-        yield from (f"{name}: {' '.join(self.overrides[name]) or 'nothing changed'}." for name in self.overrides)
+            yield f"No differences: {self._base_name} has no complete run."
+        if self.overrides:
+            changes = (f"{name}: {' '.join(changes) or 'nothing'}" for name, changes in self.overrides.items())
+            yield f"What each row changes: {'; '.join(changes)}."
         if fixed := _same(self.records):
             yield f"In all: {fixed}."
         yield f"Code: {_counted(record.commit for record in self.records)}."
         yield f"Machine: {_counted(_machine(record) for record in self.records)}."
         yield f"Config: config.yaml beside each run; SHA-256 of all their hashes: {digest(self.records)}."
-        runs = {run for row in self.rows for run in row.records}
-        for row in self.rows:
-            if missing := sorted(runs - set(row.records)):
-                told = "; ".join(" ".join(map("{}={}".format, self.choice.over, run)) for run in missing)
-                yield f"Without a complete run: {row.name}: {told}."
+        yield from self._missing()
+        if self.superseded:
+            yield f"Left out, older records of the same runs: {self.superseded}."
         for one in self.incomplete:
-            yield f"Not complete: {one.directory.relative_to(self.root)}: {one.reason}."
+            yield f"Not complete: {one.directory.relative_to(self.root)}: {one.reason.rstrip('.')}."
+
+    def _missing(self) -> Iterator[str]:
+        """The rows, and the runs that only other rows have, of which there is no record."""
+        begun = {record.config.get("row") for record in self.records}
+        if absent := [name for name in self.overrides if name not in begun]:
+            yield f"Without a complete run: {', '.join(absent)}."
+        runs = dict.fromkeys(run for row in self.rows for run in row.records)
+        for row in self.rows:
+            if missing := [run for run in runs if run not in row.records]:
+                told = "; ".join(" ".join(map("{}={}".format, self.choice.over, run)) for run in missing)
+                yield f"Missing in {row.name}: {told}."
 
 
 @dataclass(frozen=True)
@@ -266,18 +281,18 @@ def digest(records: Sequence[Record]) -> str:
 
 def _same(records: Sequence[Record]) -> str:
     """What all runs have chosen, stage by stage."""
-    told: list[str] = []
-    for stage in STAGES:
-        chosen = {record.metrics.get(f"{CHOICE}{stage}") for record in records}
-        if len(chosen) == 1:
-            told.append(f"{stage}={chosen.pop()}")
-    return ", ".join(told)
+    chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
+    return ", ".join(
+        f"{stage}={names.pop()}" for stage, names in chosen.items() if len(names) == 1 and None not in names
+    )
 
 
 def _machine(record: Record) -> str:
     return f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
 
 
-def _counted(words: Any) -> str:
-    counts = Counter(words)
-    return ", ".join(f"{word} ({count} runs)" if len(counts) > 1 else word for word, count in counts.most_common())
+def _counted(words: Iterable[str]) -> str:
+    counts = Counter(words).most_common()
+    if len(counts) == 1:
+        return counts[0][0]
+    return ", ".join(f"{word} ({count} run{'s' * (count > 1)})" for word, count in counts)
