@@ -132,6 +132,8 @@ def _read_json(path: Path) -> dict[str, Any]:
         raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold an object, found {type(content).__name__}")
+    if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
+        raise DataError(f"{path} must be flat, found more below {nested[0]!r}")
     return content
 
 

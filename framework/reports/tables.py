@@ -114,13 +114,13 @@ class Comparison:
         """What a reader must know to trust the figures."""
         over = ", ".join(self.choice.over)
         yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
-        if self.base is not None:
+        if self.base is None:
+            yield f"No differences: {self._base_name} has no complete run."
+        elif len(self.rows) > 1:
             yield (
                 f"Differences are paired by {over}: mean ± standard error; "
                 f"* where the {CONFIDENCE:.0%} interval of Student's t is without 0."
             )
-        else:
-            yield f"No differences: {self._base_name} has no complete run."
         if self.overrides:
             changes = (f"{name}: {' '.join(changes) or 'nothing'}" for name, changes in self.overrides.items())
             yield f"What each row changes: {'; '.join(changes)}."
@@ -137,7 +137,7 @@ class Comparison:
 
     def _missing(self) -> Iterator[str]:
         """The rows, and the runs that only other rows have, of which there is no record."""
-        begun = {record.config.get("row") for record in self.records}
+        begun = {str(record.config.get("row")) for record in self.records}
         if absent := [name for name in self.overrides if name not in begun]:
             yield f"Without a complete run: {', '.join(absent)}."
         runs = dict.fromkeys(run for row in self.rows for run in row.records)
@@ -282,9 +282,8 @@ def digest(records: Sequence[Record]) -> str:
 def _same(records: Sequence[Record]) -> str:
     """What all runs have chosen, stage by stage."""
     chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
-    return ", ".join(
-        f"{stage}={names.pop()}" for stage, names in chosen.items() if len(names) == 1 and None not in names
-    )
+    agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
+    return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
 
 def _machine(record: Record) -> str:

@@ -52,6 +52,7 @@ def test_the_config_comes_back_with_the_hash_that_it_was_written_with(directory:
         ("metrics.json", "[" * 100_000, "metrics.json cannot be read"),
         ("metrics.json", "\xff", "metrics.json cannot be read"),
         ("metrics.json", "[1, 2]", "metrics.json must hold an object, found list"),
+        ("metrics.json", '{"fps": [1]}', "metrics.json must be flat, found more below 'fps'"),
         ("metrics.json", "{}", "is not of the config beside it"),
         ("config.yaml", "seed: 4", "is not of the config beside it"),
         ("config.yaml", "", "is not of the config beside it"),
