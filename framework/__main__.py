@@ -1,4 +1,4 @@
-"""`python -m framework`: one run, or with -m a sweep of runs."""
+"""`python -m framework`: one run, or with -m or an experiment a sweep of runs."""
 
 from __future__ import annotations
 
@@ -10,6 +10,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
 from framework.command_line import CONF, EXIT_FAILED, Jobs, one_line_errors
+from framework.experiment import with_row
+from framework.reports.records import is_recorded
 
 jobs = Jobs()
 
@@ -18,10 +20,14 @@ jobs = Jobs()
 @jobs.reported
 def job(config: DictConfig) -> None:
     """One run: builds the stages that the config names, maps the sequence, leaves the record in Hydra's directory."""
+    hydra_config = HydraConfig.get()
+    directory = Path(hydra_config.runtime.output_dir)
+    config, choices = with_row(config, hydra_config)
+    if config.get("resume") and is_recorded(directory, config):
+        return
     from framework.run import run  # here, so that a misspelt name is answered before the heavy libraries load
 
-    hydra_config = HydraConfig.get()
-    run(config, Path(hydra_config.runtime.output_dir), dict(hydra_config.runtime.choices))
+    run(config, directory, choices)
 
 
 def main() -> None:

@@ -38,7 +38,7 @@ from framework.detection.fingerprint import fingerprint
 class RGBDSequence(ABC):
     """A recorded or rendered RGB-D video, read frame by frame.
 
-    Every dataset has the parameters `start`, `stop` and `stride`, which choose from the frames that there are.
+    Every dataset has the parameters `start`, `stop`, `stride` and `share`, which choose from the frames that there are.
     """
 
     camera: Camera

@@ -39,7 +39,7 @@ def test_every_parameter_is_in_the_yaml_with_a_comment(stage: str, name: str) ->
 
 @pytest.mark.parametrize("name", registered.names("dataset"))
 def test_every_dataset_can_be_cut(name: str) -> None:
-    assert {"start", "stop", "stride"} <= set(registered.composed("dataset", name).dataset)
+    assert {"start", "stop", "stride", "share"} <= set(registered.composed("dataset", name).dataset)
 
 
 def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_win() -> None:

@@ -49,11 +49,13 @@ class RgbdFolder(RGBDSequence):
     start: int = 0  # first frame
     stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
     stride: int = 1  # take every stride-th frame
+    share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
+    seed: int = 0  # of the share
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
     truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
 
     def __post_init__(self) -> None:
-        check_selection(self.start, self.stop, self.stride)
+        check_selection(self.start, self.stop, self.stride, self.share)
         if not (math.isfinite(self.max_depth) and self.max_depth >= 0):
             raise ConfigError(f"dataset.max_depth must be 0 (keep all) or positive metres, found {self.max_depth}")
         if not self.truth_voxel > 0:
@@ -69,7 +71,7 @@ class RgbdFolder(RGBDSequence):
         _check_same_frames(self._color, self._depth)
         self._poses = _read_poses(self.folder / "poses.txt", len(self._numbers))
         self._class_names, self._instance = self._read_instances()
-        self._chosen = choose_frames(len(self._numbers), self.start, self.stop, self.stride)
+        self._chosen = choose_frames(len(self._numbers), self.start, self.stop, self.stride, self.share, self.seed)
         self._check_first_image()
 
     def __len__(self) -> int:

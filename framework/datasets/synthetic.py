@@ -40,10 +40,11 @@ class Synthetic(RGBDSequence):
     start: int = 0  # first frame
     stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
     stride: int = 1  # take every stride-th frame
+    share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
     truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
 
     def __post_init__(self) -> None:
-        check_selection(self.start, self.stop, self.stride)
+        check_selection(self.start, self.stop, self.stride, self.share)
         for name, value, lowest in (("frames", self.frames, 1), ("width", self.width, 16), ("height", self.height, 16)):
             if value < lowest:
                 raise ConfigError(f"dataset.{name} must be at least {lowest}, found {value}")
@@ -55,7 +56,7 @@ class Synthetic(RGBDSequence):
             raise ConfigError(f"dataset.max_depth must be positive metres, found {self.max_depth}")
         if not self.truth_voxel > 0:
             raise ConfigError(f"dataset.truth_voxel must be positive metres, found {self.truth_voxel}")
-        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride)
+        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.share, self.seed)
         self.name = self.scene
         focal = FOCAL_LENGTH * self.width
         self.camera = Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)

@@ -27,12 +27,10 @@ from framework.reports.mesh_file import write_mesh
 from framework.reports.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
 from framework.reports.overview import write_overview
 from framework.reports.provenance import code_version, config_hash, environment
+from framework.reports.records import CONFIG, METRICS, PARTIAL_METRICS
 from framework.trajectory_file import write_tum
 
 log = logging.getLogger(__name__)
-
-METRICS = "metrics.json"  # there exactly when the run completed
-PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
 
 
 @dataclass(frozen=True)
@@ -51,7 +49,7 @@ class RunRecord:
         directory.mkdir(parents=True, exist_ok=True)
         for name in (METRICS, PARTIAL_METRICS):
             (directory / name).unlink(missing_ok=True)
-        with written_whole(directory / "config.yaml") as temporary:
+        with written_whole(directory / CONFIG) as temporary:
             OmegaConf.save(OmegaConf.create(resolved), temporary)
         _reset_peak_memory()
         return cls(directory, {str(key): value for key, value in resolved.items()}, choices)

@@ -73,6 +73,21 @@ def test_a_frame_holds_exactly_what_the_files_hold(folder):
     assert set(np.unique(frame.truth.instance_ids)) == {0, 7, 300}
 
 
+def test_a_share_keeps_order_index_and_what_belongs_together(folder):
+    sequence = RgbdFolder(folder, share=0.5, seed=1)
+    indices = [frame.index for frame in sequence]
+    assert len(indices) == 2
+    assert indices == sorted(indices)
+    for frame in sequence:
+        assert frame.timestamp == pytest.approx(frame.index / 10)
+        np.testing.assert_array_equal(frame.color, picture(frame.index))
+    assert {tuple(frame.index for frame in RgbdFolder(folder, share=0.5, seed=seed)) for seed in range(9)} > {
+        tuple(indices)
+    }
+    with pytest.raises(ConfigError, match=r"dataset.share"):
+        RgbdFolder(folder, share=1.5)
+
+
 def test_start_stop_stride_choose_and_the_index_counts_before_them(folder):
     sequence = RgbdFolder(folder, start=1, stop=4, stride=2)
     assert [frame.index for frame in (sequence[0], sequence[1])] == [1, 3]

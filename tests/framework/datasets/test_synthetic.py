@@ -61,6 +61,15 @@ def test_frames_do_not_depend_on_order_or_threads(bedroom):
     assert one_by_one == at_once
 
 
+def test_a_share_leaves_frames_out_and_the_others_as_they_are(bedroom):
+    share = Synthetic(seed=1, share=0.1, **SMALL)
+    assert len(share) == 24
+    indices = [share[k].index for k in (0, 9, 23)]
+    assert indices == sorted(indices)
+    assert digest(share[9]) == digest(bedroom[indices[1]])
+    assert len(share.scene_truth().points_world) > 0
+
+
 def test_another_process_with_one_thread_renders_the_same_bytes(bedroom):
     program = (
         "from tests_digest import digest, Synthetic, SMALL\nprint(digest(Synthetic(seed=1, start=70, **SMALL)[7]))"
@@ -172,6 +181,7 @@ def test_scene_truth_lies_on_the_exact_surface(exact):
         ({"seed": -1}, "seed"),
         ({"start": 240}, "dataset.start"),
         ({"stride": 0}, "dataset.stride"),
+        ({"share": 0.0}, "dataset.share"),
     ],
 )
 def test_parameters_are_checked_before_any_work(values, name):

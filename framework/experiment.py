@@ -1,0 +1,59 @@
+"""Experiments: sweeps over named rows, each of which is several overrides at once, that end with a table.
+
+Hydra's own sweeper varies one key at a time and makes products of them. An experiment therefore sweeps over the key
+`row`, and a job adds its row's overrides, which the experiment lists under `rows`, to its own.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hydra import compose
+from hydra.conf import HydraConf
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from framework.errors import ConfigError, InstanceMapError
+
+log = logging.getLogger(__name__)
+
+Choices = Mapping[str, str | None]
+
+OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(by_name), replace=True)
+"""`${all_of:${rows}}`: the names of all rows, as a choice for Hydra's sweeper."""
+
+
+def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, Choices]:
+    """A job's config and choices by group, with the overrides of the experiment's row that the job is for.
+
+    Raises ConfigError for a row that the experiment does not have.
+    """
+    choices: Choices = dict(hydra_config.runtime.choices)
+    rows = config.get("rows")
+    if not rows:
+        return config, choices
+    if config.row not in rows:
+        raise ConfigError(f"there is no row={config.row}; the experiment has {', '.join(map(str, rows))}")
+    overrides = [*hydra_config.overrides.task, *rows[config.row]]
+    composed = compose(hydra_config.job.config_name, overrides, return_hydra_config=True)
+    choices = dict(composed.hydra.runtime.choices)
+    with open_dict(composed):
+        del composed["hydra"]
+    return composed, choices
+
+
+class WriteTables(Callback):
+    """Makes the tables when the sweep has ended, from all records in its place."""
+
+    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
+        from framework.reports.tables import (
+            write_tables,  # here: every job makes a callback, none but the sweep calls it
+        )
+
+        try:
+            print(write_tables(Path(config.hydra.sweep.dir)))
+        except InstanceMapError as error:  # Hydra would make a warning of many lines of it
+            log.error("no table: %s", error)
