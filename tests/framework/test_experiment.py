@@ -106,10 +106,7 @@ def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) 
     paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if experiment.endswith("_replica") else []
     with initialize_config_dir(str(CONF), version_base="1.3"):
         rows = compose("config", overrides=[f"experiment={experiment}"]).rows
-        links = compose("config", overrides=["refiner=chain"]).refiner.links
     for row in list(rows)[:2] if experiment.endswith("_replica") else rows:  # the others are those of the parent
-        if row == "chain_without_plane_removal" and "plane_removal" not in links:
-            continue  # the chain is about to get it
         config, choices = composed([f"experiment={experiment}", f"row={row}", "seed=1", *paths])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)

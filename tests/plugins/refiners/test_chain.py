@@ -11,6 +11,7 @@ from plugins.refiners.chain import Chain
 from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
+from plugins.refiners.plane_removal import PlaneRemoval
 from tests import registered
 
 
@@ -42,14 +43,18 @@ def test_each_link_refines_what_the_one_before_it_left() -> None:
 @pytest.mark.parametrize(
     ("overrides", "links"),
     [
-        (["refiner.links.gmm_em.std_floor=0.02"], {"gmm_em": GmmEm, "largest_component": LargestComponent}),
-        (["refiner.links.gmm_em=null"], {"largest_component": LargestComponent}),
-        (["refiner@refiner.links.gmm_em=kmeans"], {"gmm_em": KMeans, "largest_component": LargestComponent}),
+        (["refiner.links.gmm_em.std_floor=0.02"], {"plane_removal": PlaneRemoval, "gmm_em": GmmEm}),
+        (["refiner.links.gmm_em=null"], {"plane_removal": PlaneRemoval}),
+        (["refiner@refiner.links.gmm_em=kmeans"], {"plane_removal": PlaneRemoval, "gmm_em": KMeans}),
+        (
+            ["+refiner@refiner.links.last=largest_component"],
+            {"plane_removal": PlaneRemoval, "gmm_em": GmmEm, "last": LargestComponent},
+        ),
     ],
 )
-def test_links_are_set_left_out_and_swapped(overrides: list[str], links: dict[str, type]) -> None:
+def test_links_are_set_left_out_swapped_and_added(overrides: list[str], links: dict[str, type]) -> None:
     chain = registered.built("refiner", "chain", *overrides)
-    found = {name: type(link) for name, link in chain.links.items() if name in ("gmm_em", "largest_component")}
+    found = {name: type(link) for name, link in chain.links.items()}
     assert found == links
     assert list(found) == list(links), "in their order"
     if "std_floor" in overrides[0]:
