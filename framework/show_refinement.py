@@ -70,8 +70,8 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
     if position is not None:
         if isinstance(position, bool) or not isinstance(position, int) or not 0 <= position < len(sequence):
             raise ConfigError(
-                f"frame must be a whole number in [0, {len(sequence) - 1}], a position among the {len(sequence)} frames "
-                f"of {sequence.name} that dataset.start, stop and stride choose; found {position!r}"
+                f"frame must be in [0, {len(sequence) - 1}], a position among the frames of {sequence.name} that "
+                f"dataset.start, stop and stride choose; found {position!r}"
             )
         frame = sequence[position]
         return position, frame, detector.detect(frame)

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from scipy.sparse import csr_array
 
-from framework.data import Detections, Float64, Frame, Int32, PointClusters, Pose
+from framework.data import Bool, Detections, Float64, Frame, FrameTruth, Int32, PointClusters, Pose
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
 
@@ -75,14 +75,37 @@ class Refinement:
         return sums.astype(np.int32)
 
     @cached_property
-    def iou_before(self) -> Float64:
-        """(N,) as `true_overlap`."""
-        return true_overlap(self.before, self.frame)
+    def fit_before(self) -> TrueFit | None:
+        """Of the N clusters; None where the true instances are not known."""
+        return None if self.frame.truth is None else true_fit(self.before, self.frame, self.frame.truth)
 
     @cached_property
-    def iou_after(self) -> Float64:
-        """(M,) as `true_overlap`."""
-        return true_overlap(self.after, self.frame)
+    def fit_after(self) -> TrueFit | None:
+        """Of the M clusters; None where the true instances are not known."""
+        return None if self.frame.truth is None else true_fit(self.after, self.frame, self.frame.truth)
+
+    @cached_property
+    def judged_before(self) -> Bool:
+        """(N,) clusters that count: not those on an object of unknown class, nor any where no truth is known."""
+        fit = self.fit_before
+        return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
+
+    @cached_property
+    def judged_after(self) -> Bool:
+        """(M,) clusters that come from one that counts, so that the same are compared."""
+        fit = self.fit_after
+        if fit is None:
+            return np.zeros(len(self.after), np.bool_)
+        return np.where(self.origin >= 0, np.append(self.judged_before, False)[self.origin], ~fit.unknown)
+
+
+@dataclass(frozen=True)
+class TrueFit:
+    """How well each of N clusters fits the true object of known class that it fits best, as seen in the frame."""
+
+    iou: Float64  # (N,) intersection over union with that object; 0 for an empty cluster
+    points_inside: Int32  # (N,) of the cluster's points, those on that object
+    unknown: Bool  # (N,) an object of unknown class fits better: not to be evaluated
 
 
 def point_counts(clusters: PointClusters) -> Int32:
@@ -102,18 +125,19 @@ def membership(clusters: PointClusters, frame: Frame) -> csr_array:
     return csr_array((np.ones(held.sum(), np.int32), places), (len(clusters), frame.depth.size))
 
 
-def true_overlap(clusters: PointClusters, frame: Frame) -> Float64:
-    """(N,) intersection over union of each cluster with the true object that it fits best; NaN where none is known.
-
-    Over the pixels with a depth reading, as clusters hold no others. Objects of unknown class count too: it is their
-    outline that is compared. An empty cluster has 0.
-    """
-    if frame.truth is None:
-        return np.full(len(clusters), np.nan)
-    ids = np.where(frame.depth > 0, frame.truth.instance_ids, 0).ravel()
+def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
+    """Compares clusters with the true objects, over the pixels with a depth reading, as clusters hold no others."""
+    ids = np.where(frame.depth > 0, truth.instance_ids, 0).ravel()
     objects, of_pixel, areas = np.unique(ids, return_inverse=True, return_counts=True)
-    held = clusters.cluster >= 0
+    n, held = len(clusters), clusters.cluster >= 0
     pairs = clusters.cluster[held].astype(np.int64) * len(objects) + of_pixel[pixel_index(clusters, frame)[held]]
-    both = np.bincount(pairs, minlength=len(clusters) * len(objects)).reshape(len(clusters), len(objects))
+    both = np.bincount(pairs, minlength=n * len(objects)).reshape(n, len(objects))
     iou = both / np.maximum(both.sum(axis=1, keepdims=True) + areas - both, 1)
-    return np.asarray(iou[:, objects > 0].max(axis=1, initial=0.0), np.float64)
+    known = np.array([truth.class_names.get(key) is not None for key in objects.tolist()], np.bool_) & (objects != 0)
+    others = iou[:, ~known & (objects != 0)].max(axis=1, initial=0.0)
+    if not known.any():
+        return TrueFit(np.zeros(n), np.zeros(n, np.int32), others > 0)
+    best = iou[:, known].argmax(axis=1)[:, None]
+    best_iou = np.take_along_axis(iou[:, known], best, axis=1)[:, 0]
+    inside = np.take_along_axis(both[:, known], best, axis=1)[:, 0]
+    return TrueFit(best_iou, inside.astype(np.int32), others > best_iou)

@@ -87,4 +87,3 @@ def orthographic(
     center = np.array(shape[::-1]) / 2 - 0.5
     pixels = (seen[:, :2] - (low + high) / 2) * scale + center
     return np.asarray(pixels, np.float32), np.ascontiguousarray(seen[:, 2]), scale
-

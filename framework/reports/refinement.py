@@ -35,7 +35,9 @@ SIDE_MARGIN = 0.09  # share of the picture around the clusters
 LEAST_EXTENT_M = 0.4  # a single point is not enlarged without end
 LEVEL_STEP_PX = 4  # of the coarse surface in which the floor is looked for
 DROPPED = (214, 28, 44)
+WHITE, SOME_COLOR = (255, 255, 255), (150, 150, 150)
 STRIPE_PX = 5  # of the hatching
+LEAST_OUTLINE_PX = 12  # of the image, length around a piece or a hole that is outlined
 BETTER, WORSE = (24, 128, 72), (190, 40, 40)
 SCALE_BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 
@@ -100,7 +102,7 @@ class _Column:
         owner = _owner(after, frame, sizes)
         added = _painted(after, frame, sizes, new, False)
         was = _owner(before, frame, refinement.points_before) >= 0
-        return cls("after", after, _colors_after(refinement), owner, was & (owner < 0), added)
+        return cls("after", after, _colors_after(refinement), owner, was & (owner < 0), np.asarray(added, np.bool_))
 
     def mask(self, k: int) -> Bool:
         """(H, W) of cluster k."""
@@ -115,12 +117,9 @@ class _Column:
         order = np.argsort(-sizes, kind="stable")
         return [k for k in order.tolist() if sizes[k]]
 
-    def name(self, k: int) -> str:
-        """Class and score of cluster k."""
-        return _name(self.clusters, k)
-
 
 def _name(clusters: PointClusters, k: int) -> str:
+    """Class and score of cluster k."""
     probabilities = clusters.class_probabilities[k]
     label = clusters.classes[int(probabilities.argmax())] if len(probabilities) else "object"
     return f"{label} {clusters.scores[k]:.2f}"
@@ -131,7 +130,7 @@ def _colors(count: int) -> UInt8:
 
     The first of the palette is a red; it is left out, because red marks what was dropped.
     """
-    return instance_colors(np.zeros((count + 1, 3)))[1:]
+    return np.asarray(instance_colors(np.zeros((count + 1, 3)))[1:], np.uint8)
 
 
 def _colors_after(refinement: Refinement) -> UInt8:
@@ -141,7 +140,7 @@ def _colors_after(refinement: Refinement) -> UInt8:
     known = np.flatnonzero(refinement.main_part >= 0)
     place[refinement.main_part[known]] = known
     place[place < 0] = n + np.arange((place < 0).sum())
-    return _colors(n + m)[place]
+    return np.asarray(_colors(n + m)[place])
 
 
 def _owner(clusters: PointClusters, frame: Frame, sizes: Int32) -> Int32:
@@ -169,23 +168,21 @@ def _image_panel(frame: Frame, column: _Column) -> UInt8:
     enlarges = fine[0] > height
     color = cv2.resize(frame.color, fine[::-1], interpolation=cv2.INTER_CUBIC if enlarges else cv2.INTER_AREA)
     gray = color.mean(axis=2, keepdims=True, dtype=np.float32)
-    drawn = 0.5 * color + 0.3 * gray + 44.0  # pale, so that the clusters stand out
+    drawn = 0.55 * color + 0.28 * gray + 38.0  # pale, so that the clusters stand out
 
     masks = {k: _enlarged(_filled(column.mask(k), frame.depth), fine) for k in column.by_size()}
     for k, mask in masks.items():
         drawn[mask] = (0.42 * gray[mask] + 0.30 * color[mask]) * 0.72 + 0.5 * column.colors[k]
     drawn = np.clip(drawn, 0, 255)
-    _hatch(drawn, _enlarged(column.added, fine), np.array((255, 255, 255)), 0.75, falling=True)
-    _hatch(drawn, _enlarged(column.dropped, fine), np.array(DROPPED), 0.9, falling=False)
+    _hatch(drawn, _enlarged(column.added, fine), WHITE, 0.75, falling=True)
+    _hatch(drawn, _enlarged(column.dropped, fine), DROPPED, 0.9, falling=False)
     canvas = drawn.astype(np.uint8)
-    for k, mask in masks.items():
-        border, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        cv2.polylines(canvas, border, True, (255, 255, 255), 3 * SUPERSAMPLING, cv2.LINE_AA)
-    for k, mask in masks.items():
-        border, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
-        dark = (0.62 * column.colors[k]).astype(int).tolist()
-        cv2.polylines(canvas, border, True, dark, round(1.6 * SUPERSAMPLING), cv2.LINE_AA)
-    picture = Image.fromarray(cv2.resize(canvas, size[::-1], interpolation=cv2.INTER_AREA))
+    borders = {k: _border(mask, LEAST_OUTLINE_PX * fine[0] / height) for k, mask in masks.items()}
+    for border in borders.values():
+        cv2.polylines(canvas, border, True, WHITE, 3 * SUPERSAMPLING, cv2.LINE_AA)
+    for k, border in borders.items():
+        cv2.polylines(canvas, border, True, _rgb(0.62 * column.colors[k]), round(1.6 * SUPERSAMPLING), cv2.LINE_AA)
+    picture = Image.fromarray(_developed(canvas, size))
     panel = Image.new("RGB", (PANEL_WIDTH, size[0]), PAPER)
     left = (PANEL_WIDTH - size[1]) // 2
     _tag_clusters(picture, column)
@@ -206,37 +203,47 @@ def _enlarged(mask: Bool, shape: tuple[int, int]) -> Bool:
     return np.asarray(cv2.resize(mask.astype(np.float32), shape[::-1], interpolation=cv2.INTER_LINEAR) > 0.5)
 
 
-def _hatch(drawn: Float32, mask: Bool, color: Array, strength: float, falling: bool) -> None:
+def _developed(drawn: Array, size: tuple[int, int]) -> UInt8:
+    """What was drawn too large, (h, w, 3), at its height and width in the picture."""
+    return np.asarray(cv2.resize(drawn, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+
+
+def _border(mask: Bool, least: float) -> list[Array]:
+    """The closed lines around a mask and its holes, those of at least that length, px."""
+    lines, _ = cv2.findContours(mask.astype(np.uint8), cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    return [line for line in lines if len(line) >= least]
+
+
+def _hatch(drawn: Float32, mask: Bool, color: tuple[int, int, int], strength: float, falling: bool) -> None:
     """Draws oblique stripes on (H, W, 3) where the mask is."""
     v, u = np.nonzero(mask)
     stripe = (u - v if falling else u + v) // (STRIPE_PX * SUPERSAMPLING) % 2 == 0
     u, v = u[stripe], v[stripe]
-    drawn[v, u] = (1 - strength) * drawn[v, u] + strength * color
+    drawn[v, u] = (1 - strength) * drawn[v, u] + strength * np.array(color, np.float32)
 
 
 def _tag_clusters(picture: Image.Image, column: _Column) -> None:
     """Names each cluster where it shows, the large ones first; a tag moves aside for those already there."""
     canvas, font = ImageDraw.Draw(picture), _font(TAG_PX)
-    height, width = column.owner.shape
-    scale = picture.width / width
+    scale = picture.width / column.owner.shape[1]
     taken = [(0.0, 0.0, 110.0, 40.0), (0.0, picture.height - 40.0, 230.0, float(picture.height))]  # heading and key
     for k in column.by_size():
         v, u = np.nonzero(column.owner == k)
         if len(u) == 0:
             continue
+        name = _name(column.clusters, k)
+        size = canvas.textlength(name, font) + 12, TAG_PX + 7.0
         middle = np.hypot(u - u.mean(), v - v.mean()).argmin()
-        box = _free_place(
-            (u[middle] * scale, v[middle] * scale),
-            (canvas.textlength(column.name(k), font) + 12, TAG_PX + 7),
-            picture.size,
-            taken,
-        )
+        at = u[middle] * scale, v[middle] * scale
+        if len(u) * scale**2 < 4 * size[0] * size[1]:  # it would be hidden: the tag goes above
+            at = u.mean() * scale, v.min() * scale - size[1] / 2 - 5
+        box = _free_place(at, size, picture.size, taken)
         if box is None:
             continue
         taken.append(box)
         rgb = column.colors[k].astype(float)
         canvas.rounded_rectangle(box, 4, fill=_rgb(0.35 * rgb + 0.65 * 255), outline=_rgb(0.62 * rgb))
-        canvas.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), column.name(k), INK, font, anchor="mm")
+        canvas.text(((box[0] + box[2]) / 2, (box[1] + box[3]) / 2), name, INK, font, anchor="mm")
 
 
 def _free_place(
@@ -265,22 +272,19 @@ def _heading(panel: Image.Image, text: str, left: int = 0) -> None:
 
 def _key(panel: Image.Image, column: _Column, left: int) -> None:
     """What the hatchings mean, in the lower left corner; only those that there are."""
-    marks = [(mark.any(), text, color, falling) for mark, text, color, falling in (
-        (column.dropped, "dropped", DROPPED, False), (column.added, "added", (120, 120, 120), True))]  # fmt: skip
-    shown = [(text, color, falling) for there, text, color, falling in marks if there]
+    shown = [("dropped", PAPER, DROPPED, False)] if column.dropped.any() else []
+    shown += [("added", SOME_COLOR, WHITE, True)] if column.added.any() else []
     if not shown:
         return
     canvas, font = ImageDraw.Draw(panel), _font(TAG_PX)
-    widths = [canvas.textlength(text, font) + 44 for text, _, _ in shown]
+    widths = [canvas.textlength(text, font) + 44 for text, *_ in shown]
     bottom = panel.height - 8
     canvas.rounded_rectangle((left + 8, bottom - 28, left + 8 + sum(widths) + 6, bottom), 4, fill=PAPER)
-    x = left + 18
-    for (text, color, falling), width in zip(shown, widths, strict=True):
-        swatch = np.full((16, 22, 3), PAPER, np.float32)
-        fine = np.repeat(np.repeat(swatch, SUPERSAMPLING, 0), SUPERSAMPLING, 1)
-        _hatch(fine, np.ones(fine.shape[:2], np.bool_), np.array(color), 1.0, falling)
-        panel.paste(Image.fromarray(cv2.resize(fine, (22, 16), interpolation=cv2.INTER_AREA).astype(np.uint8)),
-                    (round(x), bottom - 22))  # fmt: skip
+    x = left + 18.0
+    for (text, ground, color, falling), width in zip(shown, widths, strict=True):
+        swatch = np.tile(np.array(ground, np.float32), (16 * SUPERSAMPLING, 22 * SUPERSAMPLING, 1))
+        _hatch(swatch, np.ones(swatch.shape[:2], np.bool_), color, 1.0, falling)
+        panel.paste(Image.fromarray(_developed(swatch, (16, 22))), (round(x), bottom - 22))
         canvas.text((x + 28, bottom - 14), text, INK, font, anchor="lm")
         x += width
 
@@ -368,18 +372,17 @@ def _side_panel(frame: Frame, column: _Column, side: _Side | None) -> UInt8:
     shape = SIDE_HEIGHT * SUPERSAMPLING, PANEL_WIDTH * SUPERSAMPLING
     drawn = np.tile(np.array(NOTHING, np.float32), (*shape, 1))
     background, clusters = (owner < 0) & ~dropped, (owner >= 0) | dropped
-    color = 0.16 * gray + 180.0 + np.zeros(3, np.float32)
+    color = 0.12 * gray + 196.0 + np.zeros(3, np.float32)
     color[owner >= 0] = column.colors[owner[owner >= 0]] * (0.80 + 0.20 * gray[owner >= 0] / 140)
     color[added] = 0.55 * color[added] + 0.45 * 255
     color[dropped] = DROPPED
-    for layer in (background, clusters):  # the clusters last: what stands before them must not hide them
+    # the clusters last: what stands before them must not hide them, nor draw the eye by its shading
+    for layer, contrast in ((background, 0.4), (clusters, 1.0)):
         nearest, buffer = side.seen(layer)
-        lit = shading(buffer)
+        lit = shading(buffer) ** contrast
         there = nearest >= 0
         drawn[there] = np.clip(color[nearest[there]] * lit[there, None], 0, 255)
-    panel = Image.fromarray(
-        cv2.resize(drawn, (PANEL_WIDTH, SIDE_HEIGHT), interpolation=cv2.INTER_AREA).astype(np.uint8)
-    )
+    panel = Image.fromarray(_developed(drawn, (SIDE_HEIGHT, PANEL_WIDTH)))
     _heading(panel, f"{column.heading}, from the side")
     _scale_bar(panel, side)
     return np.asarray(panel)
@@ -392,18 +395,17 @@ def _scale_bar(panel: Image.Image, side: _Side) -> None:
     length = min(SCALE_BARS_M, key=lambda m: abs(math.log(m * scale / 110)))
     right, y = PANEL_WIDTH - 18, SIDE_HEIGHT - 20
     left = right - length * scale
-    text = f"{length:g} m"
-    canvas.rounded_rectangle((left - 200, y - 14, right + 10, y + 12), 4, fill=PAPER)
+    canvas.rounded_rectangle((left - 236, y - 14, right + 10, y + 12), 4, fill=PAPER)
     canvas.line((left, y, right, y), INK, 2)
     for x in (left, right):
         canvas.line((x, y - 5, x, y + 5), INK, 2)
-    canvas.text((left - 10, y), text, INK, font, anchor="rm")
+    canvas.text((left - 10, y), f"{length:g} m", INK, font, anchor="rm")
     towards = 1 if side.forward[0] > 0 else -1
-    x = left - 74
+    x = left - 104.0
     canvas.line((x - 14, y, x + 14, y), INK, 2)
     tip = x + 16 * towards
     canvas.polygon([(tip, y), (tip - 9 * towards, y - 5), (tip - 9 * towards, y + 5)], fill=INK)
-    canvas.text((x - 24, y), "camera", INK, font, anchor="rm")
+    canvas.text((x - 24, y), "camera looks", INK, font, anchor="rm")
 
 
 # Words and figures
@@ -411,29 +413,38 @@ def _scale_bar(panel: Image.Image, side: _Side) -> None:
 
 def _figures(refinement: Refinement, refiner: str) -> UInt8:
     """The line below the panels."""
-    n = len(refinement.before)
+    n, m = len(refinement.before), len(refinement.after)
     before, after = int(refinement.points_before.sum()), int(point_counts(refinement.after).sum())
-    parts = [f"{n} clusters" if n != 1 else "1 cluster"] if n else ["nothing was detected in this frame"]
-    if n and len(refinement.after) != n:
-        parts[0] = f"{n} → {len(refinement.after)} clusters"
+    was, now = refinement.fit_before, refinement.fit_after
+    parts = ["nothing was detected"]
     if n:
-        parts.append(f"{before:,} → {after:,} points{_percent(before, after)}")
-        if refinement.frame.truth is not None:
-            iou = refinement.iou_before.mean(), refinement.iou_after.mean() if len(refinement.after) else 0.0
-            parts.append(f"mean IoU with the true masks {iou[0]:.2f} → {iou[1]:.2f}")
+        parts = ["1 cluster" if n == m == 1 else f"{n} clusters" if n == m else f"{n} → {m} clusters"]
+        parts.append(f"{before:,} → {after:,} points{_change(before, after)}")
+    judged = refinement.judged_before, refinement.judged_after
+    if was is not None and now is not None and judged[0].any() and judged[1].any():
+        iou = was.iou[judged[0]].mean(), now.iou[judged[1]].mean()
+        parts.append(f"mean IoU with the true masks {iou[0]:.2f} → {iou[1]:.2f}")
+        inside = (
+            _share(was.points_inside[judged[0]], refinement.points_before[judged[0]]),
+            _share(now.points_inside[judged[1]], point_counts(refinement.after)[judged[1]]),
+        )
+        parts.append(f"points on the true object {inside[0]} → {inside[1]}")
     parts.append(f"{refinement.milliseconds:.1f} ms")
     image = Image.new("RGB", (WIDTH, FIGURES_HEIGHT), PAPER)
     canvas, bold, font = ImageDraw.Draw(image), _font(TEXT_PX, bold=True), _font(TEXT_PX)
-    y = FIGURES_HEIGHT / 2
     text = "   ·   ".join(parts)
     room = WIDTH - 2 * MARGIN - canvas.textlength(text, font) - 30
-    called = _shortened(refiner, canvas, bold, room)
-    canvas.text((MARGIN, y), called, INK, bold, anchor="lm")
-    canvas.text((MARGIN + canvas.textlength(called, bold) + 30, y), text, INK, font, anchor="lm")
+    y = FIGURES_HEIGHT / 2
+    canvas.text((MARGIN, y), _shortened(refiner, canvas, bold, room), INK, bold, anchor="lm")
+    canvas.text((WIDTH - MARGIN, y), text, INK, font, anchor="rm")
     return np.asarray(image)
 
 
-def _percent(before: int, after: int) -> str:
+def _share(points: Int32, of: Int32) -> str:
+    return f"{100 * points.sum() / of.sum():.0f} %" if of.any() else "none"
+
+
+def _change(before: int, after: int) -> str:
     """By how much a number of points has changed, in brackets."""
     if before == 0:
         return ""
@@ -447,32 +458,37 @@ def _table(refinement: Refinement, column: _Column) -> UInt8:
     n, places = len(refinement.before), TABLE_COLUMNS * TABLE_ROWS_MAX
     told = n if n <= places else places - 1
     rows = -(-min(n, places) // TABLE_COLUMNS)
-    image = Image.new("RGB", (WIDTH, ROW_HEIGHT * rows), PAPER)
-    canvas, font = ImageDraw.Draw(image), _font(TEXT_PX)
+    image = Image.new("RGB", (WIDTH, ROW_HEIGHT * (rows + 1 if rows else 0)), PAPER)
+    canvas, font, small = ImageDraw.Draw(image), _font(TEXT_PX), _font(TAG_PX)
     step = (WIDTH - 2 * MARGIN) / TABLE_COLUMNS
+    name_at, points_at, iou_at = 24, 184, step - 24  # px in a column; the last one is where it ends
+    was, now = refinement.fit_before, refinement.fit_after
     for k in range(told):
-        x, y = MARGIN + step * (k // rows), ROW_HEIGHT * (k % rows + 0.5)
+        x, y = MARGIN + step * (k // rows), ROW_HEIGHT * (k % rows + 1.5)
+        if k % rows == 0:
+            canvas.text((x + points_at, ROW_HEIGHT / 2), "points", FAINT_INK, small, anchor="lm")
+            if was is not None:
+                canvas.text((x + iou_at, ROW_HEIGHT / 2), "IoU with the true mask", FAINT_INK, small, anchor="rm")
         canvas.rounded_rectangle((x, y - 8, x + 16, y + 8), 4, fill=_rgb(column.colors[k]))
-        canvas.text((x + 24, y), _shortened(column.name(k), canvas, font, 150), INK, font, anchor="lm")
+        name = _shortened(_name(column.clusters, k), canvas, font, points_at - name_at - 8)
+        canvas.text((x + name_at, y), name, INK, font, anchor="lm")
         before, after = int(refinement.points_before[k]), int(refinement.points_after[k])
-        parts = int(np.count_nonzero(refinement.origin == k))
+        parts = np.count_nonzero(refinement.origin == k)
         split = f" in {parts}" if parts > 1 else ""
-        text = f"{before:,} → {after:,}{split}{_percent(before, after)}"
-        canvas.text((x + 180, y), text, FAINT_INK, font, anchor="lm")
-        if refinement.frame.truth is not None:
-            iou = refinement.iou_before[k], _iou_after(refinement, k)
-            ink = INK if round(iou[0], 2) == round(iou[1], 2) else BETTER if iou[1] > iou[0] else WORSE
-            canvas.text((x + step - 16, y), f"{iou[0]:.2f} → {iou[1]:.2f}", ink, font, anchor="rm")
+        text = f"{before:,} → {after:,}{split}{_change(before, after)}"
+        canvas.text((x + points_at, y), text, FAINT_INK, small, anchor="lm")
+        if was is not None and now is not None:
+            text, ink = "not known", FAINT_INK
+            if refinement.judged_before[k]:
+                part = refinement.main_part[k]
+                iou = round(float(was.iou[k]), 2), round(float(now.iou[part]), 2) if part >= 0 else 0.0
+                text = f"{iou[0]:.2f} → {iou[1]:.2f}"
+                ink = INK if iou[0] == iou[1] else BETTER if iou[1] > iou[0] else WORSE
+            canvas.text((x + iou_at, y), text, ink, font if ink != FAINT_INK else small, anchor="rm")
     if told < n:
-        x, y = MARGIN + step * (TABLE_COLUMNS - 1), ROW_HEIGHT * (rows - 0.5)
+        x, y = MARGIN + step * (TABLE_COLUMNS - 1), ROW_HEIGHT * (rows + 0.5)
         canvas.text((x, y), f"and {n - told} more", FAINT_INK, font, anchor="lm")
     return np.asarray(image)
-
-
-def _iou_after(refinement: Refinement, k: int) -> float:
-    """Of the largest part that is left of cluster k."""
-    part = int(refinement.main_part[k])
-    return float(refinement.iou_after[part]) if part >= 0 else 0.0
 
 
 def _title(text: str) -> UInt8:
