@@ -33,6 +33,8 @@ FREE = 0.09  # share of the picture around the clusters
 LEAST_EXTENT_M = 0.4  # a single point is not enlarged without end
 POINT_SIZE = 0.6  # radius of a point, in distances between readings
 LEVEL_CELLS = 120  # across the coarse surface in which the floor is looked for
+LEVEL_RAD = np.deg2rad(6)  # how oblique a floor may be
+PITCHES_RAD = np.deg2rad([0, 30])  # how far down the camera is taken to look when its floor is looked for
 LEVEL_JUMP = 0.1  # of depth, between readings that are not one surface
 SCALE_BARS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 SCALE_BAR_PX = 110  # about
@@ -92,7 +94,22 @@ def _up(frame: Frame) -> Float64:
     triangles = np.stack([corner, corner + width, corner + 1], axis=1).astype(np.int32)  # their front to the camera
     z = depth.ravel()[triangles]
     whole = (z.min(axis=1) > 0) & (np.ptp(z, axis=1) < LEVEL_JUMP * z[:, 0])
-    return upward(np.eye(4)[None], Surface(vertices, triangles[whole]))
+    surface = Surface(vertices, triangles[whole])
+    found = [upward(_pitched(angle)[None], surface) for angle in PITCHES_RAD]
+    return max(found, key=lambda up: _level_area(surface, up))
+
+
+def _pitched(angle: float) -> Float64:
+    """(4, 4) a level camera, as seen from one that looks down by `angle`."""
+    T = np.eye(4)
+    T[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    return T
+
+
+def _level_area(surface: Surface, up: Float64) -> float:
+    """m^2 of the surface that faces upwards."""
+    areas = np.linalg.norm(surface.face_normals, axis=1)
+    return float(areas[surface.face_normals @ up > np.cos(LEVEL_RAD) * areas].sum() / 2)
 
 
 def _turned(up: Float64, azimuth: float) -> Float64:

@@ -153,7 +153,7 @@ def test_from_the_side_distances_in_depth_show() -> None:
     assert np.median(u_red) - np.median(u_kept) == pytest.approx(expected, rel=0.25)
 
 
-@pytest.mark.parametrize("tilt", [-0.6, -0.3, 0.0])
+@pytest.mark.parametrize("tilt", [-0.8, -0.5, -0.2, 0.0])
 def test_the_floor_says_what_is_up(tilt: float) -> None:
     room = CornerRoom()[0]
     camera, T = room.camera, exp_se3(np.array([0, 0, 0, tilt, 0, 0.1]))
@@ -215,7 +215,7 @@ def test_clusters_may_be_none_come_and_go(before: int, after: int) -> None:
 
 def test_many_clusters_and_parts_fit_on_the_picture() -> None:
     frame = two_walls()
-    stripes = [box(frame, k, k + 1, 4, 20) for k in range(48)]
+    stripes = [box(frame, k, k + 1, 4, 20) for k in range(30)]
     few = refinement_picture(refined(frame, stripes[:24], stripes[:24]), "all", "refiner=identity")
     many = refinement_picture(refined(frame, stripes, [*stripes, *stripes[:3]]), "all", "refiner=split")
     assert many.shape == few.shape, "the table has an end"
