@@ -1,0 +1,143 @@
+"""What a refiner did to the clusters of one frame: their points, and how well they fit the true masks."""
+
+from __future__ import annotations
+
+import statistics
+import time
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from framework.data import Bool, Detections, Float64, Frame, FrameTruth, Int32, PointClusters, Pose
+from framework.geometry import lift
+from framework.interfaces import ClusterRefiner
+
+TIMED = 5  # calls, of which the median counts; the one before them may have to compile
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """The N clusters of one frame before, and the M clusters after its refiner; N and M differ where one was split."""
+
+    frame: Frame
+    before: PointClusters
+    after: PointClusters
+    milliseconds: float  # that the refiner took
+
+    @classmethod
+    def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
+        """Lifts the detections at the frame's true pose, or else in the camera's own frame, and refines them."""
+        pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
+        before = lift(detections, frame, pose)
+        after = refiner.refine(before, frame)
+        times = []
+        for _ in range(TIMED):
+            started = time.perf_counter()
+            refiner.refine(before, frame)
+            times.append(1e3 * (time.perf_counter() - started))
+        return cls(frame, before, after, statistics.median(times))
+
+    @cached_property
+    def origin(self) -> Int32:
+        """(M,) the cluster before that each cluster after comes from, -1 = none.
+
+        Refiners that keep the number of clusters keep their index. Where it has changed, a cluster comes from the one
+        that it shares most pixels with, the first of equals.
+        """
+        n, m = len(self.before), len(self.after)
+        if n == m or n == 0:
+            return np.arange(m, dtype=np.int32) if n == m else np.full(m, -1, np.int32)
+        shared = (membership(self.before, self.frame) @ membership(self.after, self.frame).T).toarray()
+        return np.where(shared.any(axis=0), shared.argmax(axis=0), -1).astype(np.int32)
+
+    @cached_property
+    def main_part(self) -> Int32:
+        """(N,) the largest of the clusters after that come from each cluster before, -1 = there is none."""
+        sizes = point_counts(self.after)
+        largest_last = np.argsort(sizes, kind="stable")
+        main = np.full(len(self.before), -1, np.int32)
+        of_some = largest_last[self.origin[largest_last] >= 0]
+        main[self.origin[of_some]] = of_some
+        return main
+
+    @cached_property
+    def points_before(self) -> Int32:
+        """(N,) points of each cluster."""
+        return point_counts(self.before)
+
+    @cached_property
+    def points_after(self) -> Int32:
+        """(N,) points of all that is left of each cluster."""
+        known = self.origin >= 0
+        sums = np.bincount(self.origin[known], point_counts(self.after)[known], minlength=len(self.before))
+        return sums.astype(np.int32)
+
+    @cached_property
+    def fit_before(self) -> TrueFit | None:
+        """Of the N clusters; None where the true instances are not known."""
+        return None if self.frame.truth is None else true_fit(self.before, self.frame, self.frame.truth)
+
+    @cached_property
+    def fit_after(self) -> TrueFit | None:
+        """Of the M clusters; None where the true instances are not known."""
+        return None if self.frame.truth is None else true_fit(self.after, self.frame, self.frame.truth)
+
+    @cached_property
+    def judged_before(self) -> Bool:
+        """(N,) clusters that count: not those on an object of unknown class, nor any where no truth is known."""
+        fit = self.fit_before
+        return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
+
+    @cached_property
+    def judged_after(self) -> Bool:
+        """(M,) clusters that come from one that counts, so that the same are compared."""
+        fit = self.fit_after
+        if fit is None:
+            return np.zeros(len(self.after), np.bool_)
+        return np.where(self.origin >= 0, np.append(self.judged_before, False)[self.origin], ~fit.unknown)
+
+
+@dataclass(frozen=True)
+class TrueFit:
+    """How well each of N clusters fits the true object of known class that it fits best, as seen in the frame."""
+
+    iou: Float64  # (N,) intersection over union with that object; 0 for an empty cluster
+    points_inside: Int32  # (N,) of the cluster's points, those on that object
+    unknown: Bool  # (N,) an object of unknown class fits better: not to be evaluated
+
+
+def point_counts(clusters: PointClusters) -> Int32:
+    """(N,) points of each cluster."""
+    return np.bincount(clusters.cluster[clusters.cluster >= 0], minlength=len(clusters)).astype(np.int32)
+
+
+def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
+    """(P,) where each point was seen, as an index into the image's pixels in rows."""
+    return clusters.pixels[:, 1] * frame.camera.width + clusters.pixels[:, 0]
+
+
+def membership(clusters: PointClusters, frame: Frame) -> csr_array:
+    """(N, H * W) 1 where a cluster has a point at the pixel."""
+    held = clusters.cluster >= 0
+    places = clusters.cluster[held], pixel_index(clusters, frame)[held]
+    return csr_array((np.ones(held.sum(), np.int32), places), (len(clusters), frame.depth.size))
+
+
+def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
+    """Compares clusters with the true objects, over the pixels with a depth reading, as clusters hold no others."""
+    ids = np.where(frame.depth > 0, truth.instance_ids, 0).ravel()
+    objects, of_pixel, areas = np.unique(ids, return_inverse=True, return_counts=True)
+    n, held = len(clusters), clusters.cluster >= 0
+    pairs = clusters.cluster[held].astype(np.int64) * len(objects) + of_pixel[pixel_index(clusters, frame)[held]]
+    both = np.bincount(pairs, minlength=n * len(objects)).reshape(n, len(objects))
+    iou = both / np.maximum(both.sum(axis=1, keepdims=True) + areas - both, 1)
+    known = np.array([truth.class_names.get(key) is not None for key in objects.tolist()], np.bool_) & (objects != 0)
+    others = iou[:, ~known & (objects != 0)].max(axis=1, initial=0.0)
+    if not known.any():
+        return TrueFit(np.zeros(n), np.zeros(n, np.int32), others > 0)
+    best = iou[:, known].argmax(axis=1)[:, None]
+    best_iou = np.take_along_axis(iou[:, known], best, axis=1)[:, 0]
+    inside = np.take_along_axis(both[:, known], best, axis=1)[:, 0]
+    return TrueFit(best_iou, inside.astype(np.int32), others > best_iou)
