@@ -39,6 +39,7 @@ Integers = npt.NDArray[Any]  # of int16 or int64
 
 INSTANCE_SLOTS, CLASS_SLOTS = 4, 12  # labels that a voxel can tell apart in compact storage
 NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
+ALL_NAMED = (1 << NEW_CLASSES) - 1
 NO_CLASS = 255  # in a free slot
 MOST_UNITS = 32_000  # of class evidence in compact storage: where more speaks for a class, it is certain
 
@@ -83,12 +84,14 @@ class Measurement(NamedTuple):
     matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
     class_gain: Int64  # (N, C) units, for each class, over those that the cluster does not name
     named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
+    named_bit: UInt8  # (N, NO_CLASS) bit m of a cluster's m-th named class, 0 of the classes that it does not name
     combine: int  # Combine
     most_units: int  # that a class may have
 
 
-def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8]:
-    """What clusters say of classes, evidence (N, C), as a Measurement has it: (class_gain (N, C), named_classes).
+def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
+    """What clusters say of classes, evidence (N, C), as a Measurement has it: (class_gain (N, C), named_classes,
+    named_bit).
 
     Of log-likelihoods a cluster names its NEW_CLASSES best classes, and the others share the mean of what is left;
     otherwise it names its best one, and for those that it does not name it says nothing.
@@ -101,8 +104,10 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8]
         rest = np.exp(evidence)
         np.put_along_axis(rest, named, 0, axis=1)
         gains = evidence - np.log(np.maximum(rest.sum(axis=1, keepdims=True) / max(c - NEW_CLASSES, 1), 1e-6))
+    bits = np.zeros((len(evidence), NO_CLASS), np.uint8)
+    np.put_along_axis(bits, named, np.uint8(1) << np.arange(names, dtype=np.uint8)[None], axis=1)
     again = np.repeat(named[:, :1], NEW_CLASSES - names, axis=1)  # names the first one again, which changes nothing
-    return gains, np.concatenate([named, again], axis=1).astype(np.uint8)
+    return gains, np.concatenate([named, again], axis=1).astype(np.uint8), bits
 
 
 @device
@@ -212,18 +217,18 @@ def update_voxel(evidence, row, n, measurement, point):
         evicted += add_evidence(
             ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
         )
+        known = 0  # bits of the named classes that have a slot
         for s in range(len(classes) if combine == SUM else 0):
-            if classes[s] != NO_CLASS:
-                value = class_values[s] + measurement.class_gain[k, classes[s]]
-                class_values[s] = min(max(value, -measurement.most_units), measurement.most_units)
-        for m in range(NEW_CLASSES):
+            if classes[s] == NO_CLASS:
+                break  # slots are filled from the front
+            value = class_values[s] + measurement.class_gain[k, classes[s]]
+            class_values[s] = min(max(value, -measurement.most_units), measurement.most_units)
+            known |= measurement.named_bit[k, classes[s]]
+        for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
             label = measurement.named_classes[k, m]
             if m > 0 and label == measurement.named_classes[k, 0]:
                 break
-            known = False
-            for s in range(len(classes) if combine == SUM else 0):
-                known = known or classes[s] == label
-            if not known:
+            if not (known >> m) & 1:
                 gain = measurement.class_gain[k, label]
                 evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
     _best_first(ids, id_values, 0)

@@ -89,7 +89,7 @@ class EvidenceFuser(InstanceFuser):
         """What the clusters say, as the voxels take it."""
         matched = np.zeros(self.scene.table.last_id + 1, np.bool_)
         matched[instance_ids] = True
-        class_gain, named = named_classes(self.class_evidence(clusters), self.logarithmic)
+        class_gain, named, bits = named_classes(self.class_evidence(clusters), self.logarithmic)
         compact = self.storage is Storage.COMPACT
         units = self.units if compact else self.units << EXACT_BITS
         return Measurement(
@@ -102,6 +102,7 @@ class EvidenceFuser(InstanceFuser):
             matched=matched,
             class_gain=np.rint(class_gain * units).astype(np.int64),
             named_classes=named,
+            named_bit=bits,
             combine=int(self.combine),
             most_units=MOST_UNITS if compact else 1 << 62,
         )

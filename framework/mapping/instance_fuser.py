@@ -61,8 +61,8 @@ class InstanceFuser(MapFuser):
     merge_overlap: float = 0.5  # in (0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
     min_observations: int = 3  # frames, >= 1: before that an instance is tentative
-    min_confidence: float = 0.05  # in [0, 1]: likewise
-    min_area: float = 0.003  # m^2 of its surface in the mesh, >= 0: likewise; voxel_size^2 for each vertex, 4 at least
+    min_confidence: float = 0.1  # in [0, 1]: likewise
+    min_area: float = 0.01  # m^2 of its surface in the mesh, >= 0: likewise; voxel_size^2 for each vertex, 4 at least
 
     def __post_init__(self) -> None:
         check_bounds(

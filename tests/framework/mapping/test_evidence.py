@@ -51,7 +51,7 @@ def measured(
     first, following = np.zeros((1, 1), np.int32), np.append(np.arange(1, n), -1).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
-    gains, named = named_classes(np.log(distributions), logarithmic=True)
+    gains, named, bits = named_classes(np.log(distributions), logarithmic=True)
     return Measurement(
         first,
         following,
@@ -62,6 +62,7 @@ def measured(
         matched,
         np.rint(gains * UNITS).astype(np.int64),
         named,
+        bits,
         int(Combine.SUM),
         1 << 62,
     )
@@ -71,12 +72,13 @@ def voted(ids: list[int], weights: list[float], classes: list[int], combine: Com
     """Clusters over the one pixel, each for an instance and one class, by a rule that is not Bayes'."""
     evidence = np.zeros((len(ids), number))
     evidence[np.arange(len(ids)), classes] = weights
-    gains, named = named_classes(evidence, logarithmic=False)
+    gains, named, bits = named_classes(evidence, logarithmic=False)
     every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
     return every._replace(
         instance_gain=np.array(weights, np.float32),
         class_gain=np.rint(gains * 100).astype(np.int64),
         named_classes=named,
+        named_bit=bits,
         combine=int(combine),
     )
 
@@ -172,8 +174,10 @@ def test_a_cluster_without_instance_says_nothing() -> None:
 
 def test_class_gains_are_relative_to_the_classes_not_named() -> None:
     p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
-    gains, named = named_classes(np.log(p), logarithmic=True)
+    gains, named, bits = named_classes(np.log(p), logarithmic=True)
     assert named.tolist() == [list(range(NEW_CLASSES))]
+    assert bits[0, :NEW_CLASSES].tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
+    assert not bits[0, NEW_CLASSES:].any()
     rest = p[0, NEW_CLASSES:].mean()
     assert np.allclose(gains, np.log(p / rest), atol=1e-5)
 

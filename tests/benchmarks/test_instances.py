@@ -1,0 +1,62 @@
+"""What instances cost in a frame: ten masks in 640x480, a map at 1 cm that knows them already.
+
+Run with `python -m pytest tests/benchmarks/test_instances.py`; refining is measured in test_refiners.py.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from framework.data import Frame, PointClusters, Pose
+from framework.label_spaces import COCO
+from framework.mapping.association import list_points_by_pixel
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from tests.benchmarks.test_refiners import MASKS, ten_masks
+
+
+@pytest.fixture(scope="module")
+def mapped() -> tuple[BayesianTsdf, Frame, Pose, PointClusters]:
+    """The fuser after five frames, the frame, and clusters of 80 classes that no refiner took points from."""
+    clusters, frame = ten_masks()
+    probabilities = np.random.default_rng(0).dirichlet(np.full(len(COCO), 0.1), MASKS).astype(np.float32)
+    clusters = dataclasses.replace(clusters, class_probabilities=probabilities, classes=COCO)
+    pose, fuser = Pose(np.eye(4)), BayesianTsdf()
+    for _ in range(5):
+        fuser.fuse(frame, pose, clusters)
+    assert len(fuser.scene.table.records) == MASKS
+    return fuser, frame, pose, clusters
+
+
+def test_associate_ten_masks(benchmark, mapped) -> None:
+    fuser, frame, pose, clusters = mapped
+
+    def associate() -> None:
+        points = list_points_by_pixel(clusters, frame.depth.shape)
+        overlaps = fuser._look_up(frame, pose, clusters)
+        instance_ids = fuser._associate(overlaps, clusters, points, frame)
+        fuser._merge_instances(overlaps, instance_ids)
+
+    benchmark(associate)
+    assert len(fuser.scene.table.records) == MASKS
+
+
+def test_write_the_labels_of_ten_masks(benchmark, mapped) -> None:
+    fuser, frame, pose, clusters = mapped
+    points = list_points_by_pixel(clusters, frame.depth.shape)
+    overlaps = fuser._look_up(frame, pose, clusters)
+    instance_ids = fuser._associate(overlaps, clusters, points, frame)
+    seen = fuser._integrator.integrate(frame, pose.T_world_camera, fuser.label_band * fuser.voxel_size)
+
+    def write_labels() -> None:
+        fuser.scene.labels.update(seen, fuser._measurement(clusters, points, instance_ids))
+        fuser._observe(overlaps, clusters, instance_ids, frame)
+
+    benchmark(write_labels)
+
+
+def test_fuse_ten_masks(benchmark, mapped) -> None:
+    fuser, frame, pose, clusters = mapped
+    benchmark(fuser.fuse, frame, pose, clusters)
