@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit, prange
 
 from framework.data import Float32
-from framework.refinement.neighborhood import Neighborhoods
+from framework.refinement.neighborhood import Int64, Neighborhoods
 
 
 def mask_log_odds(around: Neighborhoods, largest: float, expected_bleed: float) -> Float32:
@@ -15,5 +16,22 @@ def mask_log_odds(around: Neighborhoods, largest: float, expected_bleed: float) 
     mask too thin for the whole ramp gets a shorter one, so that its innermost points always speak for the object.
     """
     reach = np.maximum(np.minimum(around.ring_widths, around.mask_radii), 1).astype(np.float32)
-    ramp = (around.depth_in_mask / reach[around.owner] - expected_bleed) / (1 - expected_bleed)
-    return np.asarray(largest * np.clip(ramp, -1, 1), np.float32)
+    log_odds = np.empty(len(around.depth_in_mask), np.float32)
+    _ramps(
+        around.depth_in_mask, around.starts, reach, np.float32(largest), np.float32(expected_bleed),
+        np.float32(1 - expected_bleed), log_odds,
+    )  # fmt: skip
+    return log_odds
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _ramps(
+    depth_in_mask: Float32, starts: Int64, reach: Float32, largest: np.float32, zero: np.float32, rest: np.float32,
+    log_odds: Float32,
+) -> None:  # fmt: skip
+    one = np.float32(1)
+    for k in prange(len(reach)):
+        for i in range(starts[k], starts[k + 1]):
+            ramp = (depth_in_mask[i] / reach[k] - zero) / rest
+            ramp = ramp if ramp < one else one
+            log_odds[i] = largest * (ramp if ramp > -one else -one)
