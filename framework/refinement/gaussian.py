@@ -10,7 +10,8 @@ from numba import njit
 from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
-JACOBI_SWEEPS = 6  # of a 3x3 matrix: converges quadratically, 4 suffice for double precision
+JACOBI_SWEEPS = 6  # of a 3x3 matrix, at most: converges quadratically, 4 suffice for double precision
+NEGLIGIBLE = 1e-28  # of the squared trace: off-diagonal elements that change an eigenvalue in the 14th digit
 ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are
 FACTORS = 64  # with up to 10^4 components their product stays below 1e256
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
@@ -19,7 +20,8 @@ SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vect
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
     """out[i] = log(pi_k N(x_i | mu_k, Sigma_k))."""
-    c, mx, my, mz, w00, w10, w11, w20, w21, w22 = row
+    c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array itself takes longer than the loop
+    w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
     for i in range(len(x)):
         dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
@@ -30,7 +32,8 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
     """values = max(values, log_densities)."""
-    c, mx, my, mz, w00, w10, w11, w20, w21, w22 = row
+    c, mx, my, mz = row[0], row[1], row[2], row[3]
+    w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
     for i in range(len(x)):
         dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
@@ -167,6 +170,8 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
     """Raises the eigenvalues of a symmetric (3, 3) matrix to at least `floor`, in place (cyclic Jacobi)."""
     A, V = Sigma.copy(), np.eye(3)
     for _ in range(JACOBI_SWEEPS):
+        if A[0, 1] * A[0, 1] + A[0, 2] * A[0, 2] + A[1, 2] * A[1, 2] < NEGLIGIBLE * (A[0, 0] + A[1, 1] + A[2, 2]) ** 2:
+            break
         for p in range(2):
             for q in range(p + 1, 3):
                 if A[p, q] == 0.0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from framework.data import Float32
 from framework.refinement.neighborhood import Int64, Neighborhoods
@@ -24,13 +24,13 @@ def mask_log_odds(around: Neighborhoods, largest: float, expected_bleed: float) 
     return log_odds
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def _ramps(
     depth_in_mask: Float32, starts: Int64, reach: Float32, largest: np.float32, zero: np.float32, rest: np.float32,
     log_odds: Float32,
 ) -> None:  # fmt: skip
     one = np.float32(1)
-    for k in prange(len(reach)):
+    for k in range(len(reach)):
         for i in range(starts[k], starts[k + 1]):
             ramp = (depth_in_mask[i] / reach[k] - zero) / rest
             ramp = ramp if ramp < one else one

@@ -56,17 +56,10 @@ class Neighborhoods:
 
     def thinned(self, max_points: int) -> Neighborhoods:
         """Every n-th point of each neighborhood, n chosen so that at most `max_points` are left of it."""
-        counts = np.diff(self.starts)
-        chosen, starts, mask_counts = _every_nth(self.starts, self.mask_counts, -(-counts // max_points))
-        return Neighborhoods(
-            self.points_camera[chosen],
-            self.depth_in_mask[chosen],
-            self.source[chosen],
-            starts,
-            mask_counts,
-            self.ring_widths,
-            self.mask_radii,
+        thin = _every_nth(
+            self.points_camera, self.depth_in_mask, self.source, self.starts, self.mask_counts, max_points
         )
+        return Neighborhoods(*thin, self.ring_widths, self.mask_radii)
 
 
 def neighborhoods(
@@ -156,18 +149,25 @@ def _kept(good: Bool, judged: Bool, starts: Int64, mask_counts: Int64, source: I
 
 
 @njit(cache=True, nogil=True)
-def _every_nth(starts: Int64, mask_counts: Int64, steps: Int64) -> tuple[Int64, Int64, Int64]:
-    n = len(steps)
-    thin_starts, thin_mask_counts = np.zeros(n + 1, np.int64), np.zeros(n, np.int64)
+def _every_nth(
+    points: Float32, depth_in_mask: Float32, source: Int32, starts: Int64, mask_counts: Int64, max_points: int
+) -> tuple[Float32, Float32, Int32, Int64, Int64]:
+    n = len(mask_counts)
+    thin_starts, thin_mask_counts, steps = np.zeros(n + 1, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64)
     for k in range(n):
-        step = max(steps[k], 1)
-        thin_starts[k + 1] = thin_starts[k] + (starts[k + 1] - starts[k] + step - 1) // step
-        thin_mask_counts[k] = (mask_counts[k] + step - 1) // step
-    chosen = np.empty(thin_starts[n], np.int64)
+        count = starts[k + 1] - starts[k]
+        steps[k] = max((count + max_points - 1) // max_points, 1)
+        thin_starts[k + 1] = thin_starts[k] + (count + steps[k] - 1) // steps[k]
+        thin_mask_counts[k] = (mask_counts[k] + steps[k] - 1) // steps[k]
+    thin_points, thin_depth = np.empty((thin_starts[n], 3), np.float32), np.empty(thin_starts[n], np.float32)
+    thin_source = np.empty(thin_starts[n], np.int32)
     for k in range(n):
         for j in range(thin_starts[k + 1] - thin_starts[k]):
-            chosen[thin_starts[k] + j] = starts[k] + j * max(steps[k], 1)
-    return chosen, thin_starts, thin_mask_counts
+            s, i = thin_starts[k] + j, starts[k] + j * steps[k]
+            for a in range(3):
+                thin_points[s, a] = points[i, a]
+            thin_depth[s], thin_source[s] = depth_in_mask[i], source[i]
+    return thin_points, thin_depth, thin_source, thin_starts, thin_mask_counts
 
 
 @njit(cache=True, nogil=True, parallel=True)

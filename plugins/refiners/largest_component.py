@@ -85,19 +85,25 @@ def _keep_largest_of(
     parents = np.arange(len(members) + 1).astype(np.int32)
     count = _find_runs(readings[:cells], gap, gap_per_depth, runs, sizes)
     _unite_near(readings, runs, cells, stride, gap, gap_per_depth, parents)
-    for run in range(count):
-        parents[run] = root(parents, run)
+    _name_by_roots(parents[:count])
     for cell in range(cells):
         runs[cell] = parents[runs[cell]]
     for dv in range(reach + 1):  # the half-plane behind: each pair of neighbors is met once
         for du in range(-reach if dv > 0 else 2, reach + 1):
             _unite_near(readings, runs, cells, dv * stride + du, gap, gap_per_depth, parents)
-    for run in range(1, count):
-        sizes[root(parents, run)] += sizes[run] if root(parents, run) != run else 0
-    largest = np.argmax(sizes[:count])
+    _name_by_roots(parents[:count])
+    pieces = np.zeros(count, np.int32)
+    for run in range(count):
+        pieces[parents[run]] += sizes[run]
+    in_largest = parents[:count] == np.argmax(pieces)
     for i in members:
-        run = runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]
-        kept[i] = root(parents, run) == largest
+        kept[i] = in_largest[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
+
+
+@njit(cache=True, nogil=True)
+def _name_by_roots(parents: Int32) -> None:
+    for run in range(len(parents)):
+        parents[run] = root(parents, run)
 
 
 @njit(cache=True, nogil=True)
