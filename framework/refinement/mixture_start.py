@@ -1,20 +1,18 @@
-"""Where expectation maximization starts: from the mask and the ring around it, each cut into groups that lie together."""
+"""Where expectation maximization starts: from the mask and the ring around it, each cut into groups by place."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Int32
+from framework.data import Bool, Float32, Float64, Int32
 from framework.refinement.lloyd import depth_groups_of, lloyd, nearest
 from framework.refinement.neighborhood import Int64, Neighborhoods
 
 START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
 
 
-def start_labels(
-    around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int
-) -> Int32:
+def start_labels(around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int) -> Int32:
     """(S,) the component that each point starts in: the object's come first, then the background's.
 
     Points of the mask whose `log_odds` (S,) do not speak against the object start in the nearest of the object's
@@ -52,11 +50,11 @@ def _start_one(
 
 
 @njit(cache=True, nogil=True)
-def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels: Int32) -> Float32:
+def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels: Int32) -> Float64:
     """Sets the labels of the chosen points; their groups' centers."""
     members = np.nonzero(chosen)[0]
     own, own_labels = points[members], np.full(len(members), -1, np.int32)
-    centers = depth_groups_of(own, groups)
+    centers: Float64 = depth_groups_of(own, groups)
     lloyd(own, centers, START_ITERATIONS, own_labels)
     for j, i in enumerate(members):
         labels[i] = first_label + own_labels[j]

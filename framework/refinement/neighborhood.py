@@ -42,10 +42,9 @@ class Neighborhoods:
         """(N,) points in each ring; 0 where nothing around the mask has a depth reading."""
         return np.asarray(np.diff(self.starts) - self.mask_counts)
 
-    @property
-    def owner(self) -> Int64:
-        """(S,) the neighborhood that each point is in."""
-        return np.repeat(np.arange(len(self)), np.diff(self.starts))
+    def of_at_least(self, min_points: int) -> Bool:
+        """(N,) which clusters have at least `min_points` points, and as many in their ring."""
+        return np.asarray((self.mask_counts >= min_points) & (self.ring_counts >= min_points))
 
     def kept(self, good: Bool, judged: Bool, points: int) -> Bool:
         """(`points`,) which points of the PointClusters stay: the `good` (S,) ones of clusters that were `judged` (N,).
@@ -56,10 +55,21 @@ class Neighborhoods:
 
     def thinned(self, max_points: int) -> Neighborhoods:
         """Every n-th point of each neighborhood, n chosen so that at most `max_points` are left of it."""
-        thin = _every_nth(
+        points, depth_in_mask, source, starts, mask_counts = _every_nth(
             self.points_camera, self.depth_in_mask, self.source, self.starts, self.mask_counts, max_points
         )
-        return Neighborhoods(*thin, self.ring_widths, self.mask_radii)
+        return Neighborhoods(points, depth_in_mask, source, starts, mask_counts, self.ring_widths, self.mask_radii)
+
+
+def ring_bounds(min_ring: int) -> dict[str, tuple[float, float]]:
+    """For `check_bounds`: what the parameters may be by which a plugin chooses rings and what it looks at of them."""
+    return {
+        "ring_fraction": (0.0, 10.0),
+        "min_ring": (1, MAX_RING_WIDTH),
+        "max_ring": (min_ring, MAX_RING_WIDTH),
+        "max_points": (100, 10**9),
+        "min_points": (10, 10**9),
+    }
 
 
 def neighborhoods(
@@ -118,7 +128,8 @@ def thread_shares(costs: Int64) -> tuple[Int64, Int64]:
     costliest goes first, to the thread that has least to do (Graham 1969). Clusters do not know of each other, so that
     results do not depend on it.
     """
-    return _longest_first(costs, numba.get_num_threads())
+    order, starts = _longest_first(costs, numba.get_num_threads())
+    return order, starts
 
 
 @njit(cache=True, nogil=True)
@@ -241,16 +252,14 @@ def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _sign(
-    in_mask: Bool, to_mask: Float32, to_rest: Float32, depth: Float32, ring: np.float32, steps: Float32
-) -> int:
+def _sign(in_mask: Bool, to_mask: Float32, to_rest: Float32, depth: Float32, ring: np.float32, steps: Float32) -> int:
     """Puts one row of the two distances together; the number of its readings in the ring."""
     count = 0
     for c in range(len(steps)):
         in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
         outside = -to_mask[c] if in_ring else np.float32(0)
         steps[c] = to_rest[c] if in_mask[c] else outside
-        count += np.int32(in_ring)
+        count += bool(in_ring)
     return count
 
 

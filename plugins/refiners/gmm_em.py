@@ -12,7 +12,7 @@ from framework.parameters import check_bounds
 from framework.refinement import mixture
 from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.mixture_start import start_labels
-from framework.refinement.neighborhood import MAX_RING_WIDTH, neighborhoods
+from framework.refinement.neighborhood import neighborhoods, ring_bounds
 from framework.refinement.selection import keep_points
 
 
@@ -55,11 +55,7 @@ class GmmEm(ClusterRefiner):
             min_posterior=(1e-6, 1 - 1e-6),
             mask_log_odds=(0.0, 20.0),
             expected_bleed=(0.0, 0.99),
-            ring_fraction=(0.0, 10.0),
-            min_ring=(1, MAX_RING_WIDTH),
-            max_ring=(self.min_ring, MAX_RING_WIDTH),
-            max_points=(100, 10**9),
-            min_points=(10, 10**9),
+            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -81,7 +77,7 @@ class GmmEm(ClusterRefiner):
             own_components=self.object_components,
         )
         begins = around.starts[:-1]
-        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        judged = around.of_at_least(self.min_points)
         claimed = mixture.likely_members(
             around.points_camera,
             begins,

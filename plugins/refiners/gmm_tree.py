@@ -12,7 +12,7 @@ from framework.parameters import check_bounds
 from framework.refinement import mixture_tree
 from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.mixture_tree import MixtureTree, own_shares
-from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, grouped, neighborhoods
+from framework.refinement.neighborhood import Int64, Neighborhoods, grouped, neighborhoods, ring_bounds
 from framework.refinement.selection import keep_points
 
 
@@ -66,11 +66,7 @@ class GmmTree(ClusterRefiner):
             min_posterior=(1e-6, 1 - 1e-6),
             mask_log_odds=(0.0, 20.0),
             expected_bleed=(0.0, 0.99),
-            ring_fraction=(0.0, 10.0),
-            min_ring=(1, MAX_RING_WIDTH),
-            max_ring=(self.min_ring, MAX_RING_WIDTH),
-            max_points=(100, 10**9),
-            min_points=(10, 10**9),
+            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -91,7 +87,7 @@ class GmmTree(ClusterRefiner):
             min_points=self.min_node,
         )
         shares = self._object_shares(tree, sample)
-        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        judged = around.of_at_least(self.min_points)
         judged &= np.diff(tree.levels[0].firsts) > 0  # nothing is known against a mask whose tree has no node
         return keep_points(clusters, around.kept(self._claimed(tree, shares, around), judged, len(clusters.cluster)))
 

@@ -10,7 +10,7 @@ from framework.data import Float64, Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement import lloyd
-from framework.refinement.neighborhood import MAX_RING_WIDTH, Neighborhoods, neighborhoods
+from framework.refinement.neighborhood import Neighborhoods, neighborhoods, ring_bounds
 from framework.refinement.selection import keep_points
 
 
@@ -39,11 +39,7 @@ class KMeans(ClusterRefiner):
             object_centers=(1, 64),
             background_centers=(1, 64),
             max_iterations=(1, 1000),
-            ring_fraction=(0.0, 10.0),
-            min_ring=(1, MAX_RING_WIDTH),
-            max_ring=(self.min_ring, MAX_RING_WIDTH),
-            max_points=(100, 10**9),
-            min_points=(10, 10**9),
+            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
@@ -53,7 +49,7 @@ class KMeans(ClusterRefiner):
         sample = around.thinned(self.max_points)
         _, centers = lloyd.cluster(sample.points_camera, sample.starts, self._start(sample), self.max_iterations)
         begins = around.starts[:-1]
-        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        judged = around.of_at_least(self.min_points)
         ends = begins + np.where(judged, around.mask_counts, 0)
         labels = lloyd.nearest_centers(around.points_camera, begins, ends, centers)
         return keep_points(clusters, around.kept(labels < self.object_centers, judged, len(clusters.cluster)))

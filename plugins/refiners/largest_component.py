@@ -113,7 +113,7 @@ def _find_runs(readings: Float32, gap: np.float32, gap_per_depth: np.float32, ru
     before = np.float32(np.nan)
     for cell in range(len(readings)):
         z = readings[cell]
-        if z == z:  # noqa: PLR0124
+        if z == z:
             if not _near(z, before, gap, gap_per_depth):
                 run, begin = run + 1, cell
             runs[cell] = run

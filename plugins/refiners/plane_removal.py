@@ -93,5 +93,5 @@ def _count(labels: UInt8, label: int) -> int:
         some = np.uint8(0)
         for found in labels[first : first + 128]:
             some += np.uint8(found == wanted)
-        count += some
+        count += int(some)
     return count

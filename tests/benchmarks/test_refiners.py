@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 
+import numba
 import numpy as np
 import pytest
 from sklearn.mixture import GaussianMixture
@@ -16,6 +17,7 @@ from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
 from framework.refinement import mixture, mixture_tree
 from framework.refinement.neighborhood import neighborhoods
+from plugins.refiners.chain import Chain
 from plugins.refiners.dbscan import Dbscan
 from plugins.refiners.geometric import Geometric
 from plugins.refiners.gmm_em import GmmEm
@@ -49,9 +51,15 @@ def ten_masks() -> tuple[PointClusters, Frame]:
     return lift(detections, frame, Pose(np.eye(4))), frame
 
 
+def default_chain() -> Chain:
+    """The links of conf/refiner/chain.yaml, which all three together are to take at most 10 ms on 2 cores."""
+    return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm(), "largest_component": LargestComponent()})
+
+
 @pytest.mark.parametrize(
     "refiner",
     [
+        default_chain(),
         Identity(),
         GmmEm(),
         GmmTree(),
@@ -70,6 +78,8 @@ def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
     refined = benchmark(refiner.refine, clusters, frame)
     assert len(refined) == MASKS
     benchmark.extra_info["points"] = len(clusters.cluster)
+    benchmark.extra_info["points left"] = len(refined.cluster)
+    benchmark.extra_info["threads"] = numba.get_num_threads()
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

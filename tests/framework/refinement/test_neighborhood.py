@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import cv2
+import numba
 import numpy as np
+import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import back_project, lift
-from framework.refinement.neighborhood import grouped, neighborhoods
+from framework.refinement.neighborhood import grouped, neighborhoods, thread_shares
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
 
@@ -34,12 +36,39 @@ def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
     return masks.astype(bool), frame_of(depth)
 
 
-def test_grouped_is_a_stable_sort():
-    cluster = np.random.default_rng(0).integers(-1, 4, 200).astype(np.int32)
+@pytest.mark.parametrize("make", [np.asarray, np.sort, lambda cluster: cluster[:0]])
+def test_grouped_is_a_stable_sort(make):
+    cluster = make(np.random.default_rng(0).integers(-1, 4, 200).astype(np.int32))
     order, firsts = grouped(cluster, 5)
     expected = np.argsort(cluster, kind="stable")[(cluster < 0).sum() :]
     np.testing.assert_array_equal(order, expected)
     np.testing.assert_array_equal(firsts, np.searchsorted(cluster[expected], np.arange(6)))
+
+
+def test_threads_share_the_clusters_evenly():
+    threads = numba.get_num_threads()
+    for costs in ([5, 1, 9, 4, 3, 2], [7], [0, 0, 0], []):
+        order, starts = thread_shares(np.array(costs, np.int64))
+        assert sorted(order) == list(range(len(costs)))
+        assert len(starts) == threads + 1
+        assert (starts[0], starts[-1]) == (0, len(costs))
+        loads = [sum(costs[k] for k in order[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+        assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
+
+
+def test_depth_in_mask_is_the_chamfer_distance():
+    """To the nearest reading outside of the cluster inside of it, to the cluster around it; exactly."""
+    for seed in range(5):
+        masks, frame = random_scene(seed)
+        around = neighborhoods(clusters_of(masks, frame), frame, ring_fraction=0.25, min_ring=6, max_ring=8)
+        for k in range(5):
+            own, seen = masks[k] & (frame.depth > 0), frame.depth > 0
+            outside, inside = _chamfer_reference(own), _chamfer_reference(~own & seen)
+            ring = ~own & seen & (outside <= 3 * around.ring_widths[k])
+            expected = np.concatenate([inside[own], -outside[ring]]) / 3
+            found = around.depth_in_mask[around.starts[k] : around.starts[k + 1]]
+            np.testing.assert_allclose(found, expected, rtol=1e-6)
+            assert around.mask_radii[k] == found.max(initial=0)
 
 
 def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transform():

@@ -1,0 +1,62 @@
+"""Where EM starts, beside numpy and scikit-learn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from sklearn.cluster import KMeans
+
+from framework.refinement.mixture_start import START_ITERATIONS, start_labels
+from framework.refinement.neighborhood import Neighborhoods
+
+
+def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
+    """Sets of (mask, ring) points in four blobs, and log-odds that are negative for a third of the mask."""
+    rng = np.random.default_rng(0)
+    masks, rings = np.transpose(counts)
+    starts = np.concatenate([[0], np.cumsum(masks + rings)])
+    points = (
+        rng.normal(0, 0.1, (starts[-1], 3))
+        + rng.uniform([-1, -1, 1], [1, 1, 3], (4, 3))[rng.integers(0, 4, starts[-1])]
+    )
+    of_ring = np.concatenate([np.repeat([False, True], pair) for pair in counts])
+    source = np.where(of_ring, -1, np.arange(starts[-1])).astype(np.int32)
+    log_odds = np.where(of_ring | (rng.random(starts[-1]) < 0.3), -1, 1).astype(np.float32)
+    n = len(counts)
+    sets = Neighborhoods(
+        points.astype(np.float32), np.zeros(starts[-1], np.float32), source, starts, masks, np.ones(n, np.int64),
+        np.ones(n, np.float32),
+    )  # fmt: skip
+    return sets, log_odds
+
+
+def groups_of(points: np.ndarray, groups: int) -> KMeans:
+    """Lloyd's algorithm from the means of equal parts by depth."""
+    by_depth = points[np.argsort(points[:, 2], kind="stable")]
+    cuts = np.arange(groups + 1) * len(points) // groups
+    means = np.array([by_depth[a:b].mean(axis=0) for a, b in zip(cuts[:-1], cuts[1:], strict=True)])
+    return KMeans(groups, init=means, n_init=1, max_iter=START_ITERATIONS, tol=0, algorithm="lloyd").fit(points)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring():
+    sets, log_odds = around([(400, 300), (150, 600)])
+    labels = start_labels(sets, log_odds, 2, 5)
+    for k in range(2):
+        own = slice(sets.starts[k], sets.starts[k + 1])
+        points, found = sets.points_camera[own].astype(np.float64), labels[own]
+        ring = sets.source[own] < 0
+        core = ~ring & (log_odds[own] >= 0)
+        background = groups_of(points[ring], 5)
+        assert (found[core] == groups_of(points[core], 2).labels_).mean() > 0.995, "but for what one more step moves"
+        assert (found[ring] == 2 + background.labels_).mean() > 0.995
+        border = ~ring & ~core
+        assert border.any()
+        assert (found[border] == 2 + background.predict(points[border])).mean() > 0.99
+
+
+def test_sets_without_mask_ring_or_anything():
+    sets, log_odds = around([(0, 50), (50, 0), (0, 0), (1, 1)])
+    labels = start_labels(sets, log_odds, 2, 6)
+    assert ((labels >= 0) & (labels < 8)).all()
+    assert (labels[:50] >= 2).all()
