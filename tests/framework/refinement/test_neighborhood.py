@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numba
 import numpy as np
@@ -52,7 +54,7 @@ def test_threads_share_the_clusters_evenly():
         assert sorted(order) == list(range(len(costs)))
         assert len(starts) == threads + 1
         assert (starts[0], starts[-1]) == (0, len(costs))
-        loads = [sum(costs[k] for k in order[a:b]) for a, b in zip(starts[:-1], starts[1:], strict=True)]
+        loads = [sum(costs[k] for k in order[a:b]) for a, b in pairwise(starts)]
         assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
 
 
