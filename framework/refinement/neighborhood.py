@@ -11,19 +11,21 @@ from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Frame, Int32, PointClusters
 
+Int16 = npt.NDArray[np.int16]
 Int64 = npt.NDArray[np.int64]
 
-# 3-4 chamfer distance (Borgefors 1986), at most 8 % from the Euclidean one; floats of whole numbers are exact
-CHAMFER_STEP, CHAMFER_DIAGONAL = np.float32(3), np.float32(4)
-FAR = np.float32(1e6)  # beyond every image
+# 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, at most 8 % from the Euclidean one
+CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
+FAR = np.int16(30000)  # 10 000 px; two steps more still fit
+PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
 MAX_RING_WIDTH = 80  # px; wider rings tell nothing about the object
 
 
 @dataclass(frozen=True)
 class Neighborhoods:
-    """For each of N clusters its own points, then those of the ring around its mask, in one flat array.
+    """Points of N masks, each followed by those of the ring around it, in one flat array.
 
-    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`; its first `mask_counts[k]` points are the cluster's own.
+    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`; its first `mask_counts[k]` points are the mask's own.
     """
 
     points_camera: Float32  # (S, 3) m
@@ -32,32 +34,66 @@ class Neighborhoods:
     starts: Int64  # (N + 1,)
     mask_counts: Int64  # (N,)
     ring_widths: Int64  # (N,) px
-    mask_radii: Float32  # (N,) px, depth in the mask of its innermost point; 0 for an empty cluster
+    mask_radii: Float32  # (N,) px, depth in the mask of its innermost pixel; 0 for an empty cluster
 
     def __len__(self) -> int:
         return len(self.mask_counts)
 
     @property
     def ring_counts(self) -> Int64:
-        """(N,) points in each ring; 0 where nothing around the mask has a depth reading."""
+        """(N,) points of each ring."""
         return np.asarray(np.diff(self.starts) - self.mask_counts)
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The clusters of one frame and where their rings are: what points can be gathered from."""
+
+    pixels: Int32  # (P, 2) (u, v) of the clusters' points
+    order: Int64  # (M,) the points of cluster k are order[firsts[k]:firsts[k + 1]]
+    firsts: Int64  # (N + 1,)
+    frame: Frame
+    windows: Int64  # (N, 4) v0 u0 v1 u1 (half open), each cluster's bounding box grown by its ring
+    cells: Int64  # (N + 1,) where each window's cells begin among all
+    steps: Int16  # (cells,) thirds of a pixel: depth in the mask, below 0 in the ring, 0 in neither
+    ring_counts: Int64  # (N,) readings in each ring
+    ring_widths: Int64  # (N,) px
+    mask_radii: Float32  # (N,) px
+
+    @property
+    def mask_counts(self) -> Int64:
+        """(N,) points of each cluster."""
+        return np.diff(self.firsts)
 
     def of_at_least(self, min_points: int) -> Bool:
         """(N,) which clusters have at least `min_points` points, and as many in their ring."""
         return np.asarray((self.mask_counts >= min_points) & (self.ring_counts >= min_points))
 
-    def kept(self, good: Bool, judged: Bool, points: int) -> Bool:
-        """(`points`,) which points of the PointClusters stay: the `good` (S,) ones of clusters that were `judged` (N,).
+    def sampled(self, max_points: int) -> Neighborhoods:
+        """Every n-th point of each neighborhood, n chosen so that at most `max_points` are left of it."""
+        counts = self.mask_counts + self.ring_counts
+        nth = np.maximum(-(-counts // max_points), 1)
+        return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
+
+    def own(self) -> Neighborhoods:
+        """All points of the clusters in the order of `order`, without the rings."""
+        return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
+
+    def kept(self, good: Bool, judged: Bool) -> Bool:
+        """(P,) which points of the PointClusters stay: of clusters that were `judged` (N,) the `good` ones of `own`.
 
         Points of clusters that were not judged stay, and so do those of no cluster.
         """
-        return np.asarray(_kept(good, judged, self.starts, self.mask_counts, self.source, points), np.bool_)
+        return np.asarray(_kept(good, judged, self.firsts, self.order, len(self.pixels)), np.bool_)
 
-    def thinned(self, max_points: int) -> Neighborhoods:
-        """Every n-th point of each neighborhood, n chosen so that at most `max_points` are left of it."""
-        points, depth_in_mask, source, starts, mask_counts = _every_nth(
-            self.points_camera, self.depth_in_mask, self.source, self.starts, self.mask_counts, max_points
-        )
+    def _gathered(self, counts: Int64, mask_counts: Int64, nth: Int64) -> Neighborhoods:
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        points, depth_in_mask = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
+        source = np.empty(starts[-1], np.int32)
+        _gather(
+            self.pixels, self.order, self.firsts, self.windows, self.cells, self.steps, self.frame.depth,
+            pinhole(self.frame.camera), starts, mask_counts, nth, *thread_shares(counts), points, depth_in_mask, source,
+        )  # fmt: skip
         return Neighborhoods(points, depth_in_mask, source, starts, mask_counts, self.ring_widths, self.mask_radii)
 
 
@@ -72,29 +108,25 @@ def ring_bounds(min_ring: int) -> dict[str, tuple[float, float]]:
     }
 
 
-def neighborhoods(
+def surroundings(
     clusters: PointClusters, frame: Frame, ring_fraction: float, min_ring: int, max_ring: int
-) -> Neighborhoods:
-    """The N clusters of one frame with their rings, in camera coordinates.
+) -> Surroundings:
+    """The N clusters of one frame with their rings.
 
     A ring holds the pixels that have a depth reading, are not in the cluster themselves and lie within
     `ring_fraction` * sqrt(points in the cluster) px of it, bounded to [`min_ring`, `max_ring`] px. Pixels of other
     clusters belong to it like any other. `max_ring` is at most MAX_RING_WIDTH.
     """
-    camera, pixels = frame.camera, clusters.pixels
+    pixels = clusters.pixels
     order, firsts = grouped(clusters.cluster, len(clusters))
     areas = np.diff(firsts)
     widths = np.clip(np.rint(ring_fraction * np.sqrt(areas)), min_ring, max_ring).astype(np.int64)
     shares = thread_shares(areas)
     windows = np.zeros((len(clusters), 4), np.int64)
-    _bound(pixels, order, firsts, widths, *shares, *camera.shape, windows)
+    _bound(pixels, order, firsts, widths, *shares, *frame.camera.shape, windows)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])
-    steps, ring_counts = _signed_distances(pixels, order, firsts, widths, windows, cells, frame.depth, *shares)
-    starts = np.concatenate([[0], np.cumsum(areas + ring_counts)])
-    points, depth_in_mask, source, radii = _gather(
-        pixels, order, firsts, windows, cells, steps, frame.depth, starts, pinhole(camera), *shares
-    )
-    return Neighborhoods(points, depth_in_mask, source, starts, areas, widths, radii)
+    steps, ring_counts, radii = _signed_distances(pixels, order, firsts, widths, windows, cells, frame.depth, *shares)
+    return Surroundings(pixels, order, firsts, frame, windows, cells, steps, ring_counts, widths, radii)
 
 
 @njit(cache=True, nogil=True)
@@ -150,35 +182,13 @@ def pinhole(camera: Camera) -> Float32:
 
 
 @njit(cache=True, nogil=True)
-def _kept(good: Bool, judged: Bool, starts: Int64, mask_counts: Int64, source: Int64, points: int) -> Bool:
+def _kept(good: Bool, judged: Bool, firsts: Int64, order: Int64, points: int) -> Bool:
     kept = np.ones(points, np.bool_)
     for k in range(len(judged)):
         if judged[k]:
-            for s in range(starts[k], starts[k] + mask_counts[k]):
-                kept[source[s]] = good[s]
+            for m in range(firsts[k], firsts[k + 1]):
+                kept[order[m]] = good[m]
     return kept
-
-
-@njit(cache=True, nogil=True)
-def _every_nth(
-    points: Float32, depth_in_mask: Float32, source: Int32, starts: Int64, mask_counts: Int64, max_points: int
-) -> tuple[Float32, Float32, Int32, Int64, Int64]:
-    n = len(mask_counts)
-    thin_starts, thin_mask_counts, steps = np.zeros(n + 1, np.int64), np.zeros(n, np.int64), np.zeros(n, np.int64)
-    for k in range(n):
-        count = starts[k + 1] - starts[k]
-        steps[k] = max((count + max_points - 1) // max_points, 1)
-        thin_starts[k + 1] = thin_starts[k] + (count + steps[k] - 1) // steps[k]
-        thin_mask_counts[k] = (mask_counts[k] + steps[k] - 1) // steps[k]
-    thin_points, thin_depth = np.empty((thin_starts[n], 3), np.float32), np.empty(thin_starts[n], np.float32)
-    thin_source = np.empty(thin_starts[n], np.int32)
-    for k in range(n):
-        for j in range(thin_starts[k + 1] - thin_starts[k]):
-            s, i = thin_starts[k] + j, starts[k] + j * steps[k]
-            for a in range(3):
-                thin_points[s, a] = points[i, a]
-            thin_depth[s], thin_source[s] = depth_in_mask[i], source[i]
-    return thin_points, thin_depth, thin_source, thin_starts, thin_mask_counts
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -203,46 +213,61 @@ def _bound(
 def _signed_distances(
     pixels: Int32, order: Int64, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
     share_order: Int64, share_starts: Int64,
-) -> tuple[Float32, Int64]:  # fmt: skip
-    """In every window (cells,) how deep each of the mask's pixels lies in it, and how many readings the ring has.
+) -> tuple[Int16, Int64, Float32]:  # fmt: skip
+    """In every window (cells,) how deep each of the mask's pixels lies in it; readings in the rings; the masks' radii.
 
     Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
     mask; 0 elsewhere. A pixel without a reading is no border of the mask: holes in the depth are common inside of
     objects.
     """
-    steps = np.empty(cells[-1], np.float32)
-    ring_counts = np.zeros(len(widths), np.int64)
+    steps = np.empty(cells[-1], np.int16)
+    ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if cells[k] < cells[k + 1]:
-                ring_counts[k] = _signed_distances_of(
-                    pixels, order[firsts[k] : firsts[k + 1]], CHAMFER_STEP * np.float32(widths[k]), windows[k], depth,
+                ring_counts[k], radii[k] = _signed_distances_of(
+                    pixels, order[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
                     steps[cells[k] : cells[k + 1]],
                 )  # fmt: skip
-    return steps, ring_counts
+    return steps, ring_counts, radii
 
 
 @njit(cache=True, nogil=True)
 def _signed_distances_of(
-    pixels: Int32, members: Int64, ring: np.float32, window: Int64, depth: Float32, steps: Float32
-) -> int:
+    pixels: Int32, members: Int64, ring: np.int16, window: Int64, depth: Float32, steps: Int16
+) -> tuple[int, np.float32]:
+    """Both distances lie side by side in one grid, with FAR cells around each, and spread over it together.
+
+    A shortest way may make its level steps first, all in the row of its source. So the rows are filled by runs, and the
+    steps down and up, straight and diagonal, are left to two sweeps in vector code.
+    """
     v0, u0 = window[0], window[1]
     rows, columns = window[2] - v0, window[3] - u0
-    in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty((rows, columns), np.bool_)
-    to_mask, to_rest = np.empty((rows, columns), np.float32), np.empty((rows, columns), np.float32)
+    middle = columns + 1  # the FAR cell between the distance to the mask and that to the rest
+    in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty(columns, np.bool_)
     for i in members:
         in_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = True
+    grid = np.empty((rows, 2 * columns + 3), np.int16)
     for r in range(rows):
-        _mark_rest(in_mask[r], depth[v0 + r, u0 : u0 + columns], in_rest[r])
-    _chamfer(in_mask, to_mask)
-    _chamfer(in_rest, to_rest)
-    count = 0
-    for r in range(rows):
+        row = grid[r]
+        row[0] = row[middle] = row[-1] = FAR
+        _mark_rest(in_mask[r], depth[v0 + r, u0 : u0 + columns], in_rest)
+        _distances_along(in_mask[r], row[1:middle])
+        _distances_along(in_rest, row[middle + 1 : middle + 1 + columns])
+        if r > 0:
+            _spread_across(grid[r - 1], row, middle)
+    count, radius = 0, np.int16(0)
+    for r in range(rows - 1, -1, -1):
+        row = grid[r]
+        if r < rows - 1:
+            _spread_across(grid[r + 1], row, middle)
+        of_row = steps[r * columns : (r + 1) * columns]
         count += _sign(
-            in_mask[r], to_mask[r], to_rest[r], depth[v0 + r, u0 : u0 + columns], ring,
-            steps[r * columns : (r + 1) * columns],
+            in_mask[r], row[1:middle], row[middle + 1 : middle + 1 + columns], depth[v0 + r, u0 : u0 + columns], ring,
+            of_row,
         )  # fmt: skip
-    return count
+        radius = max(radius, _highest(of_row))
+    return count, PX_PER_STEP * np.float32(radius)
 
 
 @njit(cache=True, nogil=True)
@@ -252,35 +277,27 @@ def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _sign(in_mask: Bool, to_mask: Float32, to_rest: Float32, depth: Float32, ring: np.float32, steps: Float32) -> int:
+def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
     """Puts one row of the two distances together; the number of its readings in the ring."""
-    count = 0
+    count = np.int32(0)
     for c in range(len(steps)):
         in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
-        outside = -to_mask[c] if in_ring else np.float32(0)
+        outside = np.int16(-to_mask[c]) if in_ring else np.int16(0)
         steps[c] = to_rest[c] if in_mask[c] else outside
-        count += bool(in_ring)
-    return count
+        count += np.int32(in_ring)
+    return int(count)
 
 
 @njit(cache=True, nogil=True)
-def _chamfer(sources: Bool, grid: Float32) -> None:
-    """The distance of every cell to the nearest source.
-
-    A shortest way may make its level steps first, all in the row of its source. So those rows are filled by runs, and
-    the steps down and up, straight and diagonal, are left to two sweeps in vector code.
-    """
-    rows = len(grid)
-    for r in range(rows):
-        _distances_along(sources[r], grid[r])
-    for r in range(1, rows):
-        _spread_across(grid[r - 1], grid[r])
-    for r in range(rows - 2, -1, -1):
-        _spread_across(grid[r + 1], grid[r])
+def _highest(steps: Int16) -> np.int16:
+    highest = np.int16(0)
+    for step in steps:
+        highest = step if step > highest else highest
+    return highest
 
 
 @njit(cache=True, nogil=True)
-def _distances_along(sources: Bool, row: Float32) -> None:
+def _distances_along(sources: Bool, row: Int16) -> None:
     """The distance of every cell to the nearest source of its row, FAR without one."""
     columns = len(row)
     row[:] = 0
@@ -297,78 +314,85 @@ def _distances_along(sources: Bool, row: Float32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _fill_gap(gap: Float32, source_before: bool, source_behind: bool) -> None:
-    n = np.int32(len(gap))
+def _fill_gap(gap: Int16, source_before: bool, source_behind: bool) -> None:
+    n, step, far = np.int32(len(gap)), np.int32(CHAMFER_STEP), np.int32(FAR)
     for c in range(n):
-        left = CHAMFER_STEP * np.float32(np.int32(c) + np.int32(1)) if source_before else FAR
-        right = CHAMFER_STEP * np.float32(n - np.int32(c)) if source_behind else FAR
-        gap[c] = left if left < right else right
+        left = step * (np.int32(c) + np.int32(1)) if source_before else far
+        right = step * (n - np.int32(c)) if source_behind else far
+        nearest = left if left < right else right
+        gap[c] = nearest if nearest < far else far
 
 
 @njit(cache=True, nogil=True)
-def _spread_across(neighbors: Float32, row: Float32) -> None:
+def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
     n = len(row)
-    if n == 1:
-        row[0] = min(row[0], neighbors[0] + CHAMFER_STEP)
-        return
-    row[0] = min(row[0], neighbors[0] + CHAMFER_STEP, neighbors[1] + CHAMFER_DIAGONAL)
-    row[n - 1] = min(row[n - 1], neighbors[n - 1] + CHAMFER_STEP, neighbors[n - 2] + CHAMFER_DIAGONAL)
     _lower(row[1 : n - 1], neighbors[: n - 2], neighbors[1 : n - 1], neighbors[2:])
+    row[middle] = FAR
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def _lower(row: Float32, before: Float32, across: Float32, behind: Float32) -> None:
+@njit(cache=True, nogil=True)
+def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
     """row = min(row, across + a step, before or behind + a diagonal); without min() and offsets, so it vectorizes."""
     for i in range(len(row)):
-        diagonal = (before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL
-        straight = across[i] + CHAMFER_STEP
+        diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
+        straight = np.int16(across[i] + CHAMFER_STEP)
         nearest = straight if straight < diagonal else diagonal
         row[i] = nearest if nearest < row[i] else row[i]
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _gather(
-    pixels: Int32, order: Int64, firsts: Int64, windows: Int64, cells: Int64, steps: Float32, depth: Float32,
-    starts: Int64, pinhole: Float32, share_order: Int64, share_starts: Int64,
-) -> tuple[Float32, Float32, Int32, Float32]:  # fmt: skip
-    """Points (as geometry.back_project gives them: tested), their depth in the mask, their source; the masks' radii."""
-    points = np.empty((starts[-1], 3), np.float32)
-    depth_in_mask, source = np.empty(starts[-1], np.float32), np.empty(starts[-1], np.int32)
-    radii = np.zeros(len(firsts) - 1, np.float32)
+    pixels: Int32, order: Int64, firsts: Int64, windows: Int64, cells: Int64, steps: Int16, depth: Float32,
+    pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64, share_order: Int64, share_starts: Int64,
+    points: Float32, depth_in_mask: Float32, source: Int32,
+) -> None:  # fmt: skip
+    """Points (as geometry.back_project gives them: tested), their depth in the mask and their source."""
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
-            own = slice(starts[k], starts[k + 1])
-            radii[k] = _gather_one(
-                pixels, order[firsts[k] : firsts[k + 1]], windows[k], steps[cells[k] : cells[k + 1]], depth, pinhole,
-                points[own], depth_in_mask[own], source[own],
+            members = order[firsts[k] : firsts[k + 1] : nth[k]]
+            middle, end = starts[k] + mask_counts[k], starts[k + 1]
+            window, own_steps = windows[k], steps[cells[k] : cells[k + 1]]
+            _gather_mask(
+                pixels, members, window, own_steps, depth, pinhole, points[starts[k] : middle],
+                depth_in_mask[starts[k] : middle], source[starts[k] : middle],
             )  # fmt: skip
-    return points, depth_in_mask, source, radii
+            if middle < end:
+                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # the ring goes on where the mask ended
+                _gather_ring(
+                    window, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
+                )
+                source[middle:end] = -1
 
 
 @njit(cache=True, nogil=True)
-def _gather_one(
-    pixels: Int32, members: Int64, window: Int64, steps: Float32, depth: Float32, pinhole: Float32,
-    points: Float32, depth_in_mask: Float32, source: Int32,
-) -> np.float32:  # fmt: skip
-    v0, u0 = window[0], window[1]
-    rows, columns = window[2] - v0, window[3] - u0
-    px_per_step = np.float32(1.0) / CHAMFER_STEP
-    radius, s = np.float32(0), 0
-    for i in members:
+def _gather_mask(
+    pixels: Int32, members: Int64, window: Int64, steps: Int16, depth: Float32, pinhole: Float32, points: Float32,
+    depth_in_mask: Float32, source: Int32,
+) -> None:  # fmt: skip
+    v0, u0, columns = window[0], window[1], window[3] - window[1]
+    for s in range(len(members)):
+        i = members[s]
         u, v = pixels[i, 0], pixels[i, 1]
         _back_project(u, v, depth[v, u], pinhole, points, s)
-        depth_in_mask[s] = px_per_step * steps[(v - v0) * columns + u - u0]
-        radius = max(radius, depth_in_mask[s])
+        depth_in_mask[s] = PX_PER_STEP * np.float32(steps[(v - v0) * columns + u - u0])
         source[s] = i
-        s += 1
-    for r in range(rows):
-        for c in range(columns):
-            if steps[r * columns + c] < 0:
-                _back_project(u0 + c, v0 + r, depth[v0 + r, u0 + c], pinhole, points, s)
-                depth_in_mask[s] = px_per_step * steps[r * columns + c]
-                source[s] = -1
-                s += 1
-    return radius
+
+
+@njit(cache=True, nogil=True)
+def _gather_ring(
+    window: Int64, steps: Int16, depth: Float32, pinhole: Float32, skipped: int, nth: int, points: Float32,
+    depth_in_mask: Float32,
+) -> None:  # fmt: skip
+    v0, u0, columns = window[0], window[1], window[3] - window[1]
+    s, until_next = 0, skipped
+    for cell in range(len(steps)):
+        if steps[cell] < 0:
+            if until_next == 0:
+                u, v = u0 + cell % columns, v0 + cell // columns
+                _back_project(u, v, depth[v, u], pinhole, points, s)
+                depth_in_mask[s] = PX_PER_STEP * np.float32(steps[cell])
+                s, until_next = s + 1, nth
+            until_next -= 1
 
 
 @njit(cache=True, nogil=True)

@@ -12,7 +12,7 @@ from framework.parameters import check_bounds
 from framework.refinement import mixture
 from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.mixture_start import start_labels
-from framework.refinement.neighborhood import neighborhoods, ring_bounds
+from framework.refinement.neighborhood import ring_bounds, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -61,8 +61,8 @@ class GmmEm(ClusterRefiner):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.thinned(self.max_points)
+        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.sampled(self.max_points)
         log_odds = mask_log_odds(sample, self.mask_log_odds, self.expected_bleed)
         mixtures = mixture.fit(
             sample.points_camera,
@@ -76,15 +76,14 @@ class GmmEm(ClusterRefiner):
             prior_log_odds=log_odds,
             own_components=self.object_components,
         )
-        begins = around.starts[:-1]
-        judged = around.of_at_least(self.min_points)
+        own, judged = around.own(), around.of_at_least(self.min_points)
         claimed = mixture.likely_members(
-            around.points_camera,
-            begins,
-            begins + np.where(judged, around.mask_counts, 0),
+            own.points_camera,
+            own.starts[:-1],
+            own.starts[:-1] + np.where(judged, own.mask_counts, 0),
             mixtures,
             own_components=self.object_components,
             min_posterior=self.min_posterior,
-            prior_log_odds=mask_log_odds(around, self.mask_log_odds, self.expected_bleed),
+            prior_log_odds=mask_log_odds(own, self.mask_log_odds, self.expected_bleed),
         )
-        return keep_points(clusters, around.kept(claimed, judged, len(clusters.cluster)))
+        return keep_points(clusters, around.kept(claimed, judged))

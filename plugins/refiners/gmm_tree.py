@@ -12,7 +12,7 @@ from framework.parameters import check_bounds
 from framework.refinement import mixture_tree
 from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.mixture_tree import MixtureTree, own_shares
-from framework.refinement.neighborhood import Int64, Neighborhoods, grouped, neighborhoods, ring_bounds
+from framework.refinement.neighborhood import Neighborhoods, grouped, ring_bounds, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -72,8 +72,8 @@ class GmmTree(ClusterRefiner):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.thinned(self.max_points)
+        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.sampled(self.max_points)
         tree = mixture_tree.fit(
             sample.points_camera,
             sample.starts,
@@ -89,7 +89,7 @@ class GmmTree(ClusterRefiner):
         shares = self._object_shares(tree, sample)
         judged = around.of_at_least(self.min_points)
         judged &= np.diff(tree.levels[0].firsts) > 0  # nothing is known against a mask whose tree has no node
-        return keep_points(clusters, around.kept(self._claimed(tree, shares, around), judged, len(clusters.cluster)))
+        return keep_points(clusters, around.kept(self._claimed(tree, shares, around.own()), judged))
 
     def _object_shares(self, tree: MixtureTree, sample: Neighborhoods) -> list[Float32]:
         """For each level (M,) how much of each node is the object's."""
@@ -103,21 +103,19 @@ class GmmTree(ClusterRefiner):
             shares.append(above)
         return shares
 
-    def _claimed(self, tree: MixtureTree, shares: list[Float32], around: Neighborhoods) -> Bool:
-        """(S,) which points the object claims, of those of the masks; each level overrules the one above."""
-        of_mask = np.nonzero(around.source >= 0)[0]
-        claimed = np.zeros(len(around.source), bool)
-        points, odds = around.points_camera[of_mask], self._evidence(around)[of_mask]
-        starts: Int64 = np.concatenate([[0], np.cumsum(around.mask_counts)])
-        above = np.zeros(len(around), np.float32)
+    def _claimed(self, tree: MixtureTree, shares: list[Float32], own: Neighborhoods) -> Bool:
+        """(S,) which of the masks' points the object claims; each level overrules the one above."""
+        claimed, left = np.zeros(len(own.source), bool), np.arange(len(own.source))
+        points, odds, starts = own.points_camera, self._evidence(own), own.starts
+        above = np.zeros(len(own), np.float32)
         for k, level in enumerate(tree.levels):
             child, share = tree.shared(k, points, starts, shares[k], above, odds)
-            claimed[of_mask] = share > self.min_posterior
+            claimed[left] = share > self.min_posterior
             if k + 1 < len(tree.levels):
                 goes_on = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # -1, an outlier, ends here
                 key = np.where(goes_on[child], child, -1)
                 order, starts = grouped(key.astype(np.int32), len(level))
-                of_mask, points, odds, above = of_mask[order], points[order], odds[order], shares[k]
+                left, points, odds, above = left[order], points[order], odds[order], shares[k]
         return claimed
 
     def _evidence(self, around: Neighborhoods) -> Float32:

@@ -10,7 +10,7 @@ from framework.data import Float64, Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement import lloyd
-from framework.refinement.neighborhood import Neighborhoods, neighborhoods, ring_bounds
+from framework.refinement.neighborhood import Neighborhoods, ring_bounds, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -45,14 +45,13 @@ class KMeans(ClusterRefiner):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.thinned(self.max_points)
+        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.sampled(self.max_points)
         _, centers = lloyd.cluster(sample.points_camera, sample.starts, self._start(sample), self.max_iterations)
-        begins = around.starts[:-1]
-        judged = around.of_at_least(self.min_points)
-        ends = begins + np.where(judged, around.mask_counts, 0)
-        labels = lloyd.nearest_centers(around.points_camera, begins, ends, centers)
-        return keep_points(clusters, around.kept(labels < self.object_centers, judged, len(clusters.cluster)))
+        own, judged = around.own(), around.of_at_least(self.min_points)
+        ends = own.starts[:-1] + np.where(judged, own.mask_counts, 0)
+        labels = lloyd.nearest_centers(own.points_camera, own.starts[:-1], ends, centers)
+        return keep_points(clusters, around.kept(labels < self.object_centers, judged))
 
     def _start(self, sample: Neighborhoods) -> Float64:
         """(N, object_centers + background_centers, 3) the object's centers, then the background's."""

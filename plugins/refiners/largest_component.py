@@ -81,9 +81,9 @@ def _keep_largest_of(
     readings = np.full(cells + reach * stride + reach, np.float32(np.nan), np.float32)  # NaN = not in the cluster
     for i in members:
         readings[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0] = depth[pixels[i, 1], pixels[i, 0]]
-    runs, sizes = np.zeros(len(readings), np.int32), np.zeros(len(members) + 1, np.int32)
-    parents = np.arange(len(members) + 1).astype(np.int32)
-    count = _find_runs(readings[:cells], gap, gap_per_depth, runs, sizes)
+    runs = np.zeros(len(readings), np.int32)
+    parents, sizes = np.empty(len(members) + 1, np.int32), np.empty(len(members) + 1, np.int32)
+    count = _find_runs(readings[:cells], gap, gap_per_depth, runs, parents, sizes)
     _unite_near(readings, runs, cells, stride, gap, gap_per_depth, parents)
     _name_by_roots(parents[:count])
     for cell in range(cells):
@@ -107,15 +107,22 @@ def _name_by_roots(parents: Int32) -> None:
 
 
 @njit(cache=True, nogil=True)
-def _find_runs(readings: Float32, gap: np.float32, gap_per_depth: np.float32, runs: Int32, sizes: Int32) -> int:
-    """Numbers the runs from 1, in the order of their first cells; returns one more than the last number."""
+def _find_runs(
+    readings: Float32, gap: np.float32, gap_per_depth: np.float32, runs: Int32, parents: Int32, sizes: Int32
+) -> int:
+    """Numbers the runs from 1, in the order of their first cells; returns one more than the last number.
+
+    Each is a piece of its own, and so is 0, the empty one.
+    """
     run, begin = 0, 0
+    parents[0], sizes[0] = 0, 0
     before = np.float32(np.nan)
     for cell in range(len(readings)):
         z = readings[cell]
         if z == z:
             if not _near(z, before, gap, gap_per_depth):
                 run, begin = run + 1, cell
+                parents[run] = run
             runs[cell] = run
             sizes[run] = cell + 1 - begin
         before = z

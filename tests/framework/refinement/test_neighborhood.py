@@ -11,7 +11,7 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import back_project, lift
-from framework.refinement.neighborhood import grouped, neighborhoods, thread_shares
+from framework.refinement.neighborhood import Neighborhoods, grouped, surroundings, thread_shares
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
 
@@ -25,6 +25,11 @@ def clusters_of(masks: np.ndarray, frame: Frame) -> PointClusters:
     ones = np.ones(n, np.float32)
     detections = Detections(masks, np.zeros((n, 4), np.float32), ones, ones[:, None], ("thing",))
     return lift(detections, frame, Pose(np.eye(4)))
+
+
+def neighborhoods(clusters: PointClusters, frame: Frame, *ring: float, **named: float) -> Neighborhoods:
+    """All points of masks and rings."""
+    return surroundings(clusters, frame, *ring, **named).sampled(10**9)
 
 
 def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
@@ -131,7 +136,7 @@ def test_depth_in_mask_ignores_pixels_without_a_reading():
 def test_thinned_keeps_every_nth_point():
     masks, frame = random_scene(1)
     around = neighborhoods(clusters_of(masks, frame), frame, 0.25, 4, 12)
-    thin = around.thinned(50)
+    thin = surroundings(clusters_of(masks, frame), frame, 0.25, 4, 12).sampled(50)
     counts = np.diff(around.starts)
     for k, step in enumerate(np.maximum(-(-counts // 50), 1)):
         own = slice(around.starts[k], around.starts[k + 1])
