@@ -19,33 +19,40 @@ def start_labels(around: Neighborhoods, log_odds: Float32, object_components: in
     groups, points of the ring in the nearest of the background's. The border of the mask, as far in as it is expected
     to bleed, starts in the nearest group of the ring.
     """
-    labels = np.empty(len(around.source), np.int32)
+    labels = np.empty(len(around.points_camera), np.int32)
     _start_all(
-        around.points_camera, around.source, log_odds, around.starts, object_components, background_components, labels
+        around.points_camera,
+        log_odds,
+        around.starts,
+        around.mask_counts,
+        object_components,
+        background_components,
+        labels,
     )
     return labels
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _start_all(
-    points: Float32, source: Int32, log_odds: Float32, starts: Int64, object_components: int,
+    points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
     background_components: int, labels: Int32,
 ) -> None:  # fmt: skip
     for k in prange(len(starts) - 1):
         own = slice(starts[k], starts[k + 1])
-        _start_one(points[own], source[own], log_odds[own], object_components, background_components, labels[own])
+        _start_one(points[own], log_odds[own], mask_counts[k], object_components, background_components, labels[own])
 
 
 @njit(cache=True, nogil=True)
 def _start_one(
-    points: Float32, source: Int32, log_odds: Float32, object_components: int, background_components: int, labels: Int32
-) -> None:
-    of_ring = source < 0
+    points: Float32, log_odds: Float32, mask_count: int, object_components: int, background_components: int,
+    labels: Int32,
+) -> None:  # fmt: skip
+    of_ring = np.arange(len(points)) >= mask_count
     in_core = ~of_ring & (log_odds >= 0)
     _group(points, in_core, object_components, 0, labels)
     centers = _group(points, of_ring, background_components, object_components, labels)
-    for i in range(len(points)):
-        if not of_ring[i] and not in_core[i]:
+    for i in range(mask_count):
+        if not in_core[i]:
             labels[i] = object_components + nearest(points[i], centers)
 
 

@@ -30,7 +30,6 @@ class Neighborhoods:
 
     points_camera: Float32  # (S, 3) m
     depth_in_mask: Float32  # (S,) px to the mask's border: positive inside, negative in the ring
-    source: Int32  # (S,) index of the cluster's point in the PointClusters, -1 for a point of the ring
     starts: Int64  # (N + 1,)
     mask_counts: Int64  # (N,)
     ring_widths: Int64  # (N,) px
@@ -44,15 +43,22 @@ class Neighborhoods:
         """(N,) points of each ring."""
         return np.asarray(np.diff(self.starts) - self.mask_counts)
 
+    @property
+    def of_ring(self) -> Bool:
+        """(S,) which points are of a ring."""
+        parts = np.stack([self.mask_counts, self.ring_counts], axis=1).ravel()
+        return np.repeat(np.arange(len(parts)) % 2 == 1, parts)
+
 
 @dataclass(frozen=True)
 class Surroundings:
     """The clusters of one frame and where their rings are: what points can be gathered from."""
 
-    pixels: Int32  # (P, 2) (u, v) of the clusters' points
-    order: Int64  # (M,) the points of cluster k are order[firsts[k]:firsts[k + 1]]
-    firsts: Int64  # (N + 1,)
+    clusters: PointClusters
     frame: Frame
+    order: slice | Int64  # index of the M points of all clusters, one cluster after the other
+    pixels: Int32  # (M, 2) (u, v) of these points
+    firsts: Int64  # (N + 1,) where each cluster begins among them
     windows: Int64  # (N, 4) v0 u0 v1 u1 (half open), each cluster's bounding box grown by its ring
     cells: Int64  # (N + 1,) where each window's cells begin among all
     steps: Int16  # (cells,) thirds of a pixel: depth in the mask, below 0 in the ring, 0 in neither
@@ -76,25 +82,26 @@ class Surroundings:
         return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
 
     def own(self) -> Neighborhoods:
-        """All points of the clusters in the order of `order`, without the rings."""
+        """The M points of the clusters, without the rings."""
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
-        """(P,) which points of the PointClusters stay: of clusters that were `judged` (N,) the `good` ones of `own`.
+        """(P,) which points of the PointClusters stay: of clusters that were `judged` (N,) the `good` (M,) ones of `own`.
 
         Points of clusters that were not judged stay, and so do those of no cluster.
         """
-        return np.asarray(_kept(good, judged, self.firsts, self.order, len(self.pixels)), np.bool_)
+        kept = np.ones(len(self.clusters.cluster), np.bool_)
+        kept[self.order] = good | np.repeat(~judged, self.mask_counts)
+        return kept
 
     def _gathered(self, counts: Int64, mask_counts: Int64, nth: Int64) -> Neighborhoods:
         starts = np.concatenate([[0], np.cumsum(counts)])
         points, depth_in_mask = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
-        source = np.empty(starts[-1], np.int32)
         _gather(
-            self.pixels, self.order, self.firsts, self.windows, self.cells, self.steps, self.frame.depth,
-            pinhole(self.frame.camera), starts, mask_counts, nth, *thread_shares(counts), points, depth_in_mask, source,
+            self.pixels, self.firsts, self.windows, self.cells, self.steps, self.frame.depth,
+            pinhole(self.frame.camera), starts, mask_counts, nth, *thread_shares(counts), points, depth_in_mask,
         )  # fmt: skip
-        return Neighborhoods(points, depth_in_mask, source, starts, mask_counts, self.ring_widths, self.mask_radii)
+        return Neighborhoods(points, depth_in_mask, starts, mask_counts, self.ring_widths, self.mask_radii)
 
 
 def ring_bounds(min_ring: int) -> dict[str, tuple[float, float]]:
@@ -117,16 +124,37 @@ def surroundings(
     `ring_fraction` * sqrt(points in the cluster) px of it, bounded to [`min_ring`, `max_ring`] px. Pixels of other
     clusters belong to it like any other. `max_ring` is at most MAX_RING_WIDTH.
     """
-    pixels = clusters.pixels
-    order, firsts = grouped(clusters.cluster, len(clusters))
-    areas = np.diff(firsts)
+    order, firsts = members(clusters)
+    pixels, areas = clusters.pixels[order], np.diff(firsts)
     widths = np.clip(np.rint(ring_fraction * np.sqrt(areas)), min_ring, max_ring).astype(np.int64)
-    shares = thread_shares(areas)
     windows = np.zeros((len(clusters), 4), np.int64)
-    _bound(pixels, order, firsts, widths, *shares, *frame.camera.shape, windows)
+    _bound(pixels, firsts, widths, *frame.camera.shape, windows)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])
-    steps, ring_counts, radii = _signed_distances(pixels, order, firsts, widths, windows, cells, frame.depth, *shares)
-    return Surroundings(pixels, order, firsts, frame, windows, cells, steps, ring_counts, widths, radii)
+    steps, ring_counts, radii = _signed_distances(
+        pixels, firsts, widths, windows, cells, frame.depth, *thread_shares(areas)
+    )
+    return Surroundings(clusters, frame, order, pixels, firsts, windows, cells, steps, ring_counts, widths, radii)
+
+
+def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
+    """The points of all clusters, one cluster after the other: their index, and (N + 1,) where each cluster begins.
+
+    Within a cluster the points keep their order. Points of no cluster (-1) are left out. The index is a slice, which
+    spares a copy of what it is taken of, where points are in this order already, as geometry.lift leaves them.
+    """
+    if _is_sorted(clusters.cluster):
+        firsts = np.searchsorted(clusters.cluster, np.arange(len(clusters) + 1))
+        return slice(int(firsts[0]), int(firsts[-1])), firsts - firsts[0]
+    order, firsts = grouped(clusters.cluster, len(clusters))
+    return order, firsts
+
+
+@njit(cache=True, nogil=True)
+def _is_sorted(cluster: Int32) -> bool:
+    falls = 0
+    for before, after in zip(cluster[:-1], cluster[1:]):  # noqa: B905
+        falls += before > after
+    return falls == 0
 
 
 @njit(cache=True, nogil=True)
@@ -135,9 +163,6 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
 
     Within a cluster the points keep their order. Points of no cluster (-1) are left out.
     """
-    if np.all(cluster[:-1] <= cluster[1:]):  # as geometry.lift leaves them
-        firsts = np.searchsorted(cluster, np.arange(n + 1))
-        return np.arange(firsts[0], firsts[n]), firsts - firsts[0]
     firsts = np.zeros(n + 1, np.int64)
     for k in cluster:
         if k >= 0:
@@ -182,36 +207,32 @@ def pinhole(camera: Camera) -> Float32:
 
 
 @njit(cache=True, nogil=True)
-def _kept(good: Bool, judged: Bool, firsts: Int64, order: Int64, points: int) -> Bool:
-    kept = np.ones(points, np.bool_)
-    for k in range(len(judged)):
-        if judged[k]:
-            for m in range(firsts[k], firsts[k + 1]):
-                kept[order[m]] = good[m]
-    return kept
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _bound(
-    pixels: Int32, order: Int64, firsts: Int64, widths: Int64, share_order: Int64, share_starts: Int64,
-    height: int, width: int, windows: Int64,
-) -> None:  # fmt: skip
+def _bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, windows: Int64) -> None:
     """Sets (N, 4) v0 u0 v1 u1 (half open): each cluster's bounding box grown by its ring, within the image."""
-    for share in prange(len(share_starts) - 1):
-        for k in share_order[share_starts[share] : share_starts[share + 1]]:
-            if firsts[k] == firsts[k + 1]:
-                continue
-            v0, u0, v1, u1 = height, width, 0, 0
-            for i in order[firsts[k] : firsts[k + 1]]:
-                u, v = pixels[i, 0], pixels[i, 1]
-                v0, u0, v1, u1 = min(v0, v), min(u0, u), max(v1, v), max(u1, u)
+    for k in range(len(widths)):
+        if firsts[k] < firsts[k + 1]:
+            u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
             windows[k, 0], windows[k, 1] = max(v0 - widths[k], 0), max(u0 - widths[k], 0)
             windows[k, 2], windows[k, 3] = min(v1 + widths[k] + 1, height), min(u1 + widths[k] + 1, width)
 
 
+@njit(cache=True, nogil=True)
+def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
+    """Lowest u and v, highest u and v of at least one pixel."""
+    u0, v0 = pixels[0, 0], pixels[0, 1]
+    u1, v1 = u0, v0
+    for i in range(len(pixels)):
+        u, v = pixels[i, 0], pixels[i, 1]
+        u0 = u if u < u0 else u0
+        u1 = u if u > u1 else u1
+        v0 = v if v < v0 else v0
+        v1 = v if v > v1 else v1
+    return u0, v0, u1, v1
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _signed_distances(
-    pixels: Int32, order: Int64, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
+    pixels: Int32, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
     share_order: Int64, share_starts: Int64,
 ) -> tuple[Int16, Int64, Float32]:  # fmt: skip
     """In every window (cells,) how deep each of the mask's pixels lies in it; readings in the rings; the masks' radii.
@@ -226,7 +247,7 @@ def _signed_distances(
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if cells[k] < cells[k + 1]:
                 ring_counts[k], radii[k] = _signed_distances_of(
-                    pixels, order[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
+                    pixels[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
                     steps[cells[k] : cells[k + 1]],
                 )  # fmt: skip
     return steps, ring_counts, radii
@@ -234,7 +255,7 @@ def _signed_distances(
 
 @njit(cache=True, nogil=True)
 def _signed_distances_of(
-    pixels: Int32, members: Int64, ring: np.int16, window: Int64, depth: Float32, steps: Int16
+    pixels: Int32, ring: np.int16, window: Int64, depth: Float32, steps: Int16
 ) -> tuple[int, np.float32]:
     """Both distances lie side by side in one grid, with FAR cells around each, and spread over it together.
 
@@ -245,7 +266,7 @@ def _signed_distances_of(
     rows, columns = window[2] - v0, window[3] - u0
     middle = columns + 1  # the FAR cell between the distance to the mask and that to the rest
     in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty(columns, np.bool_)
-    for i in members:
+    for i in range(len(pixels)):
         in_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = True
     grid = np.empty((rows, 2 * columns + 3), np.int16)
     for r in range(rows):
@@ -342,40 +363,36 @@ def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def _gather(
-    pixels: Int32, order: Int64, firsts: Int64, windows: Int64, cells: Int64, steps: Int16, depth: Float32,
+    pixels: Int32, firsts: Int64, windows: Int64, cells: Int64, steps: Int16, depth: Float32,
     pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64, share_order: Int64, share_starts: Int64,
-    points: Float32, depth_in_mask: Float32, source: Int32,
+    points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Points (as geometry.back_project gives them: tested), their depth in the mask and their source."""
+    """Points, as geometry.back_project gives them (tested), and their depth in the mask."""
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
-            members = order[firsts[k] : firsts[k + 1] : nth[k]]
             middle, end = starts[k] + mask_counts[k], starts[k + 1]
             window, own_steps = windows[k], steps[cells[k] : cells[k + 1]]
             _gather_mask(
-                pixels, members, window, own_steps, depth, pinhole, points[starts[k] : middle],
-                depth_in_mask[starts[k] : middle], source[starts[k] : middle],
+                pixels[firsts[k] : firsts[k + 1]], window, own_steps, depth, pinhole, nth[k],
+                points[starts[k] : middle], depth_in_mask[starts[k] : middle],
             )  # fmt: skip
             if middle < end:
                 skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # the ring goes on where the mask ended
                 _gather_ring(
                     window, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
                 )
-                source[middle:end] = -1
 
 
 @njit(cache=True, nogil=True)
 def _gather_mask(
-    pixels: Int32, members: Int64, window: Int64, steps: Int16, depth: Float32, pinhole: Float32, points: Float32,
-    depth_in_mask: Float32, source: Int32,
+    pixels: Int32, window: Int64, steps: Int16, depth: Float32, pinhole: Float32, nth: int, points: Float32,
+    depth_in_mask: Float32,
 ) -> None:  # fmt: skip
     v0, u0, columns = window[0], window[1], window[3] - window[1]
-    for s in range(len(members)):
-        i = members[s]
-        u, v = pixels[i, 0], pixels[i, 1]
+    for s in range(len(points)):
+        u, v = pixels[s * nth, 0], pixels[s * nth, 1]
         _back_project(u, v, depth[v, u], pinhole, points, s)
         depth_in_mask[s] = PX_PER_STEP * np.float32(steps[(v - v0) * columns + u - u0])
-        source[s] = i
 
 
 @njit(cache=True, nogil=True)

@@ -105,7 +105,7 @@ class GmmTree(ClusterRefiner):
 
     def _claimed(self, tree: MixtureTree, shares: list[Float32], own: Neighborhoods) -> Bool:
         """(S,) which of the masks' points the object claims; each level overrules the one above."""
-        claimed, left = np.zeros(len(own.source), bool), np.arange(len(own.source))
+        claimed, left = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
         points, odds, starts = own.points_camera, self._evidence(own), own.starts
         above = np.zeros(len(own), np.float32)
         for k, level in enumerate(tree.levels):

@@ -55,7 +55,7 @@ class KMeans(ClusterRefiner):
 
     def _start(self, sample: Neighborhoods) -> Float64:
         """(N, object_centers + background_centers, 3) the object's centers, then the background's."""
-        of_ring = sample.source < 0
+        of_ring = sample.of_ring
         mask_starts = np.concatenate([[0], np.cumsum(sample.mask_counts)])
         ring_starts = np.concatenate([[0], np.cumsum(sample.ring_counts)])
         objects = lloyd.depth_groups(sample.points_camera[~of_ring], mask_starts, self.object_centers)

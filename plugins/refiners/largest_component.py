@@ -10,7 +10,7 @@ from numba import njit, prange
 from framework.data import Bool, Float32, Frame, Int32, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
-from framework.refinement.neighborhood import Int64, grouped, thread_shares
+from framework.refinement.neighborhood import Int64, bounding_box, members, thread_shares
 from framework.refinement.selection import keep_points
 from framework.refinement.union_find import root, unite
 
@@ -42,47 +42,46 @@ class LargestComponent(ClusterRefiner):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        order, firsts = grouped(clusters.cluster, len(clusters))
-        kept = clusters.cluster < 0  # points of no cluster are nobody's piece
-        _keep_largest(
-            clusters.pixels, order, firsts, frame.depth, np.float32(self.gap), np.float32(self.gap_per_depth),
-            self.reach, *thread_shares(np.diff(firsts)), kept,
+        order, firsts = members(clusters)
+        in_largest = np.empty(firsts[-1], np.bool_)
+        _find_largest(
+            clusters.pixels[order], firsts, frame.depth, np.float32(self.gap), np.float32(self.gap_per_depth),
+            self.reach, *thread_shares(np.diff(firsts)), in_largest,
         )  # fmt: skip
+        kept = np.ones(len(clusters.cluster), np.bool_)  # points of no cluster are nobody's piece
+        kept[order] = in_largest
         return keep_points(clusters, kept)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _keep_largest(
-    pixels: Int32, order: Int64, firsts: Int64, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int,
-    share_order: Int64, share_starts: Int64, kept: Bool,
+def _find_largest(
+    pixels: Int32, firsts: Int64, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int,
+    share_order: Int64, share_starts: Int64, in_largest: Bool,
 ) -> None:  # fmt: skip
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if firsts[k + 1] > firsts[k]:
-                members = order[firsts[k] : firsts[k + 1]]
-                _keep_largest_of(pixels, members, depth, gap, gap_per_depth, reach, kept)
+                own = slice(firsts[k], firsts[k + 1])
+                _find_largest_of(pixels[own], depth, gap, gap_per_depth, reach, in_largest[own])
 
 
 @njit(cache=True, nogil=True)
-def _keep_largest_of(
-    pixels: Int32, members: Int64, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, kept: Bool
+def _find_largest_of(
+    pixels: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, in_largest: Bool
 ) -> None:
     """Union-find over the runs of connected pixels in each row, of which there are far fewer than pixels.
 
     Cells lie row by row in flat arrays, with empty ones at the end of each row, so that a neighbor is as far away
     everywhere and no piece goes on in the next row.
     """
-    u0, v0, u1, v1 = pixels[members[0], 0], pixels[members[0], 1], 0, 0
-    for i in members:
-        u, v = pixels[i, 0], pixels[i, 1]
-        u0, v0, u1, v1 = min(u0, u), min(v0, v), max(u1, u), max(v1, v)
+    u0, v0, u1, v1 = bounding_box(pixels)
     stride = u1 - u0 + 1 + reach
     cells = (v1 - v0 + 1) * stride
     readings = np.full(cells + reach * stride + reach, np.float32(np.nan), np.float32)  # NaN = not in the cluster
-    for i in members:
+    for i in range(len(pixels)):
         readings[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0] = depth[pixels[i, 1], pixels[i, 0]]
     runs = np.zeros(len(readings), np.int32)
-    parents, sizes = np.empty(len(members) + 1, np.int32), np.empty(len(members) + 1, np.int32)
+    parents, sizes = np.empty(len(pixels) + 1, np.int32), np.empty(len(pixels) + 1, np.int32)
     count = _find_runs(readings[:cells], gap, gap_per_depth, runs, parents, sizes)
     _unite_near(readings, runs, cells, stride, gap, gap_per_depth, parents)
     _name_by_roots(parents[:count])
@@ -95,9 +94,9 @@ def _keep_largest_of(
     pieces = np.zeros(count, np.int32)
     for run in range(count):
         pieces[parents[run]] += sizes[run]
-    in_largest = parents[:count] == np.argmax(pieces)
-    for i in members:
-        kept[i] = in_largest[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
+    of_largest = parents[:count] == np.argmax(pieces)
+    for i in range(len(pixels)):
+        in_largest[i] = of_largest[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
 
 
 @njit(cache=True, nogil=True)

@@ -89,7 +89,7 @@ def test_em_beside_scikit_learn(benchmark):
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, 0.25, 4, 12).sampled(1000)
     # a start without empty groups, which scikit-learn could not take
-    labels = (np.arange(len(sample.source)) * 7 // 3 % components).astype(np.int32)
+    labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
     def ours() -> mixture.Mixtures:
         return mixture.fit(

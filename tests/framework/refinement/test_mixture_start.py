@@ -20,11 +20,10 @@ def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:
         + rng.uniform([-1, -1, 1], [1, 1, 3], (4, 3))[rng.integers(0, 4, starts[-1])]
     )
     of_ring = np.concatenate([np.repeat([False, True], pair) for pair in counts])
-    source = np.where(of_ring, -1, np.arange(starts[-1])).astype(np.int32)
     log_odds = np.where(of_ring | (rng.random(starts[-1]) < 0.3), -1, 1).astype(np.float32)
     n = len(counts)
     sets = Neighborhoods(
-        points.astype(np.float32), np.zeros(starts[-1], np.float32), source, starts, masks, np.ones(n, np.int64),
+        points.astype(np.float32), np.zeros(starts[-1], np.float32), starts, masks, np.ones(n, np.int64),
         np.ones(n, np.float32),
     )  # fmt: skip
     return sets, log_odds
@@ -51,7 +50,7 @@ def test_core_and_ring_are_cut_by_place_and_the_border_starts_in_the_ring():
     for k in range(2):
         own = slice(sets.starts[k], sets.starts[k + 1])
         points, found = sets.points_camera[own].astype(np.float64), labels[own]
-        ring = sets.source[own] < 0
+        ring = sets.of_ring[own]
         core = ~ring & (log_odds[own] >= 0)
         np.testing.assert_array_equal(found[core], groups_of(points[core], 2)[0])
         background, centers = groups_of(points[ring], 5)

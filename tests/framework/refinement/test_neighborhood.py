@@ -97,9 +97,7 @@ def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transfor
             np.testing.assert_array_equal(around.points_camera[s], expected)
             assert around.mask_counts[k] == own.sum()
             assert around.ring_counts[k] == ring.sum()
-            source = around.source[s]
-            assert (clusters.cluster[source[: own.sum()]] == k).all()
-            assert (source[own.sum() :] == -1).all()
+            np.testing.assert_array_equal(around.of_ring[s], np.arange(len(pixels)) >= own.sum())
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
@@ -143,7 +141,7 @@ def test_thinned_keeps_every_nth_point():
         np.testing.assert_array_equal(
             thin.points_camera[thin.starts[k] : thin.starts[k + 1]], around.points_camera[own][::step]
         )
-        is_mask = thin.source[thin.starts[k] : thin.starts[k + 1]] >= 0
+        is_mask = ~around.of_ring[own][::step]
         assert is_mask.sum() == thin.mask_counts[k]
 
 
