@@ -86,7 +86,7 @@ class Surroundings:
         return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
 
     def kept(self, good: Bool, judged: Bool) -> Bool:
-        """(P,) which points of the PointClusters stay: of clusters that were `judged` (N,) the `good` (M,) ones of `own`.
+        """(P,) which points of the PointClusters stay: of the `judged` clusters (N,) the `good` (M,) ones of `own`.
 
         Points of clusters that were not judged stay, and so do those of no cluster.
         """
@@ -151,10 +151,7 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
 
 @njit(cache=True, nogil=True)
 def _is_sorted(cluster: Int32) -> bool:
-    falls = 0
-    for before, after in zip(cluster[:-1], cluster[1:]):  # noqa: B905
-        falls += before > after
-    return falls == 0
+    return bool(np.all(cluster[:-1] <= cluster[1:]))
 
 
 @njit(cache=True, nogil=True)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from framework.data import Bool, Frame, Int32, PointClusters, UInt8
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
+from framework.refinement.neighborhood import Int64
 from framework.refinement.planes import Planes, find_planes, plane_image
-from framework.refinement.selection import keep_points
+from framework.refinement.selection import PART, keep_points
 
 
 @dataclass
@@ -62,28 +63,35 @@ class PlaneRemoval(ClusterRefiner):
         return planes.chosen((planes.shares >= self.min_share) & (planes.behind <= self.max_behind) & upright)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def _off_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float) -> Bool:
     """(P,) which points stay. A pixel is in a cluster once, so its points on a plane are a part of the plane's."""
-    labels = np.empty(len(cluster), np.uint8)
-    own = np.zeros((clusters + 1, planes + 1), np.int64)  # the last row is for points of no cluster
-    k, label, count = 0, 0, 0
-    for i in range(len(cluster)):  # counted by runs: one counter that is raised point by point waits for itself
-        labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
-        if labels[i] != label or cluster[i] != k:
-            own[k, label] += count
-            k, label, count = cluster[i], labels[i], 0
-        count += 1
-    own[k, label] += count
+    parts = (len(cluster) + PART - 1) // PART
+    labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
+    counts = np.zeros((parts, clusters + 1, planes + 1), np.int64)  # the last row is for points of no cluster
+    for part in prange(parts):
+        own = slice(part * PART, (part + 1) * PART)
+        _count_on_planes(cluster[own], pixels[own], on_plane, labels[own], counts[part])
+    on_planes = counts.sum(axis=0)
     stays = np.ones((clusters + 1, planes + 1), np.bool_)
     for label in range(1, planes + 1):
-        bound = max_own * _count(on_plane.ravel(), label)
-        for k in range(clusters):
-            stays[k, label] = own[k, label] > bound
-    kept = np.empty(len(cluster), np.bool_)
-    for i in range(len(cluster)):
+        stays[:clusters, label] = on_planes[:clusters, label] > max_own * _count(on_plane.ravel(), label)
+    for i in prange(len(cluster)):
         kept[i] = stays[cluster[i], labels[i]]
     return kept
+
+
+@njit(cache=True, nogil=True)
+def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
+    """By runs of points that have cluster and plane in common: a counter raised point by point waits for itself."""
+    k, label, count = 0, 0, 0
+    for i in range(len(cluster)):
+        labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
+        if labels[i] != label or cluster[i] != k:
+            counts[k, label] += count
+            k, label, count = cluster[i], labels[i], 0
+        count += 1
+    counts[k, label] += count
 
 
 @njit(cache=True, nogil=True)
