@@ -142,16 +142,11 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
     Within a cluster the points keep their order. Points of no cluster (-1) are left out. The index is a slice, which
     spares a copy of what it is taken of, where points are in this order already, as geometry.lift leaves them.
     """
-    if _is_sorted(clusters.cluster):
+    if (clusters.cluster[:-1] <= clusters.cluster[1:]).all():
         firsts = np.searchsorted(clusters.cluster, np.arange(len(clusters) + 1))
         return slice(int(firsts[0]), int(firsts[-1])), firsts - firsts[0]
     order, firsts = grouped(clusters.cluster, len(clusters))
     return order, firsts
-
-
-@njit(cache=True, nogil=True)
-def _is_sorted(cluster: Int32) -> bool:
-    return bool(np.all(cluster[:-1] <= cluster[1:]))
 
 
 @njit(cache=True, nogil=True)
