@@ -1,4 +1,4 @@
-"""Furniture of exact boxes on a floor before a wall, seen by a perfect camera, with masks as bad as a test wants them."""
+"""Furniture of exact boxes on a floor before a wall, seen by a perfect camera; masks as bad as a test wants them."""
 
 from __future__ import annotations
 

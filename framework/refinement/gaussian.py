@@ -10,20 +10,36 @@ from numba import njit
 from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
-JACOBI_SWEEPS = 6  # of a 3x3 matrix: converges quadratically, 4 suffice for double precision
+JACOBI_SWEEPS = 6  # of a 3x3 matrix, at most: converges quadratically, 4 suffice for double precision
+NEGLIGIBLE = 1e-28  # of the squared trace: off-diagonal elements that change an eigenvalue in the 14th digit
 ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are
+FACTORS = 64  # with up to 10^4 components their product stays below 1e256
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
     """out[i] = log(pi_k N(x_i | mu_k, Sigma_k))."""
-    c, mx, my, mz, w00, w10, w11, w20, w21, w22 = row
+    c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array itself takes longer than the loop
+    w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
     for i in range(len(x)):
         dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
         a, b, d = w00 * dx, w10 * dx + w11 * dy, w20 * dx + w21 * dy + w22 * dz
         out[i] = c + half * (a * a + b * b + d * d)
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
+    """values = max(values, log_densities)."""
+    c, mx, my, mz = row[0], row[1], row[2], row[3]
+    w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
+    half = np.float32(-0.5)
+    for i in range(len(x)):
+        dx, dy, dz = x[i] - mx, y[i] - my, z[i] - mz
+        a, b, d = w00 * dx, w10 * dx + w11 * dy, w20 * dx + w21 * dy + w22 * dz
+        density = c + half * (a * a + b * b + d * d)
+        values[i] = density if density > values[i] else values[i]
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
@@ -71,6 +87,45 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
         evidence[i] += densities[i]
 
 
+@njit(cache=True, nogil=True)
+def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
+    """sum_i largest[i] + log(evidence[i]) of the first n, with one logarithm for many factors.
+
+    Each of them lies between 1 and 1 + the number of components: FACTORS of them do not overflow.
+    """
+    total = 0.0
+    for first in range(0, n, FACTORS):
+        end = min(first + FACTORS, n)
+        total += _sum(largest[first:end]) + math.log(_product(evidence[first:end]))
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def _sum(values: Float32) -> float:
+    total = 0.0
+    for value in values:
+        total += value
+    return total
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def _product(values: Float32) -> float:
+    product = 1.0
+    for value in values:
+        product *= value
+    return product
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def invert(values: Float32, others: Float32, n: int) -> float:
+    """values = 1 / values, of the first n; returns the sum of others / values."""
+    total = np.float32(0.0)
+    for i in range(n):
+        values[i] = np.float32(1.0) / values[i]
+        total += others[i] * values[i]
+    return float(total)
+
+
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
     """Adds sum_i gamma_i (1, x_i, x_i x_i^T); single precision suffices within a block."""
@@ -115,6 +170,8 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
     """Raises the eigenvalues of a symmetric (3, 3) matrix to at least `floor`, in place (cyclic Jacobi)."""
     A, V = Sigma.copy(), np.eye(3)
     for _ in range(JACOBI_SWEEPS):
+        if A[0, 1] * A[0, 1] + A[0, 2] * A[0, 2] + A[1, 2] * A[1, 2] < NEGLIGIBLE * (A[0, 0] + A[1, 1] + A[2, 2]) ** 2:
+            break
         for p in range(2):
             for q in range(p + 1, 3):
                 if A[p, q] == 0.0:

@@ -41,17 +41,17 @@ def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
 def _lloyd_all(points: Float32, starts: Int64, centers: Float64, max_iterations: int, labels: Int32) -> None:
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
-            _lloyd(points[starts[k] : starts[k + 1]], centers[k], max_iterations, labels[starts[k] : starts[k + 1]])
+            lloyd(points[starts[k] : starts[k + 1]], centers[k], max_iterations, labels[starts[k] : starts[k + 1]])
 
 
 @njit(cache=True, nogil=True)
-def _lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
+def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32) -> None:
     sums = np.zeros((len(centers), 4))
     for _ in range(max_iterations):
         changed = False
         sums[:] = 0.0
         for i in range(len(points)):
-            j = _nearest(points[i], centers)
+            j = nearest(points[i], centers)
             changed |= j != labels[i]
             labels[i] = j
             sums[j, 0] += 1.0
@@ -67,7 +67,7 @@ def _lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32
 
 
 @njit(cache=True, nogil=True)
-def _nearest(point: Float32, centers: Float64) -> int:
+def nearest(point: Float32, centers: Float64) -> int:
     nearest, least = 0, np.inf
     for j in range(len(centers)):
         x, y, z = point[0] - centers[j, 0], point[1] - centers[j, 1], point[2] - centers[j, 2]
@@ -82,23 +82,33 @@ def _nearest_all(points: Float32, begins: Int64, ends: Int64, centers: Float64) 
     labels = np.full(len(points), -1, np.int32)
     for k in range(len(begins)):
         for i in prange(begins[k], ends[k]):
-            labels[i] = _nearest(points[i], centers[k])
+            labels[i] = nearest(points[i], centers[k])
     return labels
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
-    n = len(starts) - 1
-    means = np.zeros((n, groups, 3))
-    for k in prange(n):
-        own = points[starts[k] : starts[k + 1]]
-        if len(own) == 0:
-            continue
-        by_depth = np.argsort(own[:, 2], kind="mergesort")
-        for g in range(groups):
-            first, last = g * len(own) // groups, (g + 1) * len(own) // groups
-            last = max(last, first + 1)
-            for r in range(first, last):
-                for a in range(3):
-                    means[k, g, a] += own[by_depth[r], a] / (last - first)
+    means = np.zeros((len(starts) - 1, groups, 3))
+    for k in prange(len(starts) - 1):
+        means[k] = depth_groups_of(points[starts[k] : starts[k + 1]], groups)
+    return means
+
+
+@njit(cache=True, nogil=True)
+def depth_groups_of(points: Float32, groups: int) -> Float64:
+    """`depth_groups` of one set, (groups, 3)."""
+    n, means = len(points), np.zeros((groups, 3))
+    if n == 0:
+        return means
+    depth_bits, keys = points[:, 2].copy().view(np.int32), np.empty(n, np.int64)
+    for i in range(n):  # bits sort like their number, a negative one's backwards; below them the index keeps the order
+        bits = np.int64(depth_bits[i])
+        keys[i] = ((bits if bits >= 0 else bits ^ 0x7FFFFFFF) << 32) + i
+    keys.sort()
+    for g in range(groups):
+        first, last = g * n // groups, (g + 1) * n // groups
+        last = max(last, first + 1)
+        for key in keys[first:last]:
+            for a in range(3):
+                means[g, a] += points[key & 0xFFFFFFFF, a] / (last - first)
     return means

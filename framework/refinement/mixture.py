@@ -22,8 +22,11 @@ from framework.refinement.gaussian import (
     constant_exponential,
     exponentials,
     floor_eigenvalues,
+    invert,
     log_densities,
+    log_evidence,
     raise_to,
+    raise_to_density,
     set_coefficients,
 )
 
@@ -31,6 +34,8 @@ Int64 = npt.NDArray[np.int64]
 
 MIN_SUPPORT = 4.0  # points that a component needs to have a covariance of its own in 3D; with fewer it is dropped
 BLOCK = 256  # points that a kernel handles at once: their densities stay in the first-level cache
+BATCH = 16 * BLOCK  # points that a thread takes at once
+MARGIN = 1e-3  # nats, more than what single precision rounds log densities by
 
 
 @dataclass(frozen=True)
@@ -102,11 +107,13 @@ def likely_members(
     rows = _coefficients(mixtures.weights, mixtures.means, mixtures.covariances)
     log_outliers = _logarithms(mixtures.outlier_weights * mixtures.outlier_densities)
     odds = np.zeros(len(points), np.float32) if prior_log_odds is None else prior_log_odds
-    blocks = -(-(ends - begins) // BLOCK)
+    blocks = -(-(ends - begins) // BATCH)
     owner = np.repeat(np.arange(len(begins)), blocks)
-    firsts = begins[owner] + BLOCK * (np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks))
-    claimed = _claim(points, owner, firsts, ends, odds, rows, log_outliers, own_components, min_posterior)
-    return np.asarray(claimed, np.bool_)
+    firsts = begins[owner] + BATCH * (np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks))
+    lasts = np.minimum(firsts + BATCH, ends[owner])
+    claimed = np.zeros(len(points), np.bool_)
+    _claim(points, owner, firsts, lasts, odds, rows, log_outliers, own_components, min_posterior, claimed)
+    return claimed
 
 
 def _logarithms(values: Float64) -> Float32:
@@ -174,6 +181,7 @@ def _expect(
     components = len(rows)
     densities = np.empty((components, BLOCK), np.float32)
     largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    outliers_before = np.empty(BLOCK, np.float32)
     total, outliers = 0.0, 0.0
     for first in range(0, xyz.shape[1], BLOCK):
         x, y, z = xyz[0, first : first + BLOCK], xyz[1, first : first + BLOCK], xyz[2, first : first + BLOCK]
@@ -185,13 +193,11 @@ def _expect(
                 add_to(densities[j], odds[first : first + n])
             raise_to(largest, densities[j], n)
         constant_exponential(log_outlier, largest, evidence, n)
-        outliers_before = evidence[:n].copy()
+        outliers_before[:n] = evidence[:n]
         for j in range(components):
             exponentials(densities[j], largest, evidence, n)
-        for i in range(n):
-            total += largest[i] + math.log(evidence[i])
-            evidence[i] = np.float32(1.0) / evidence[i]
-            outliers += outliers_before[i] * evidence[i]
+        total += log_evidence(largest, evidence, n)
+        outliers += invert(evidence, outliers_before, n)
         for j in range(components):
             add_moments(x, y, z, densities[j], evidence, moments[j])
     return total, outliers
@@ -249,43 +255,63 @@ def _coefficients(weights: Float64, means: Float64, covariances: Float64) -> Flo
 
 @njit(cache=True, nogil=True, parallel=True)
 def _claim(
-    points: Float32, owner: Int64, firsts: Int64, ends: Int64, odds: Float32, rows: Float32, log_outliers: Float32,
-    own_components: int, min_posterior: float,
-) -> Bool:  # fmt: skip
-    """Whether own / (own + others) > min_posterior for each point of the blocks that begin at `firsts`."""
-    claimed = np.zeros(len(points), np.bool_)
+    points: Float32, owner: Int64, firsts: Int64, lasts: Int64, odds: Float32, rows: Float32, log_outliers: Float32,
+    own_components: int, min_posterior: float, claimed: Bool,
+) -> None:  # fmt: skip
+    """Whether own / (own + others) > min_posterior for each point of the batches, of one mixture each."""
     for b in prange(len(owner)):
-        k, first = owner[b], firsts[b]
-        _claim_block(
-            points[first : min(first + BLOCK, ends[k])], odds[first : first + BLOCK], rows[k], log_outliers[k],
-            own_components, min_posterior, claimed[first : first + BLOCK],
-        )  # fmt: skip
-    return claimed
+        k, first, last = owner[b], firsts[b], lasts[b]
+        if rows[k, :, 0].max() <= ABSENT:
+            claimed[first:last] = True
+        else:
+            _claim_batch(
+                points[first:last], odds[first:last], rows[k], log_outliers[k], own_components, min_posterior,
+                claimed[first:last],
+            )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
-def _claim_block(
+def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    n, components = len(points), len(rows)
-    if rows[:, 0].max() <= ABSENT:
-        claimed[:n] = True
-        return
-    xyz, densities = np.empty((3, n), np.float32), np.empty((components, n), np.float32)
-    for i in range(n):
-        for a in range(3):
-            xyz[a, i] = points[i, a]
-    largest, own, others = np.full(n, log_outlier), np.zeros(n, np.float32), np.empty(n, np.float32)
-    for j in range(components):
-        log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
-        if j < own_components:
-            add_to(densities[j], odds[:n])
-        raise_to(largest, densities[j], n)
-    constant_exponential(log_outlier, largest, others, n)
-    for j in range(own_components):
-        exponentials(densities[j], largest, own, n)
-    for j in range(own_components, components):
-        exponentials(densities[j], largest, others, n)
-    for i in range(n):
-        claimed[i] = own[i] > min_posterior * (own[i] + others[i])
+    """Most points need no exponential: a sum of n terms lies between its largest term and n times that."""
+    components = len(rows)
+    log_bound = math.log(min_posterior / (1.0 - min_posterior))
+    certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)
+    hopeless = np.float32(log_bound - math.log(own_components) - MARGIN)
+    xyz, densities = np.empty((3, BLOCK), np.float32), np.empty((components, BLOCK), np.float32)
+    own, others = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    doubtful, doubts = np.empty(len(points) + 1, np.int64), 0
+    for first in range(0, len(points), BLOCK):
+        n = min(BLOCK, len(points) - first)
+        for i in range(n):
+            for a in range(3):
+                xyz[a, i] = points[first + i, a]
+        own[:n], others[:n] = ABSENT, log_outlier
+        for j in range(components):
+            raise_to_density(xyz[0, :n], xyz[1, :n], xyz[2, :n], rows[j], own if j < own_components else others)
+        for i in range(n):
+            margin = own[i] + odds[first + i] - others[i]
+            claimed[first + i] = margin > certain
+            doubtful[doubts] = first + i
+            doubts += hopeless < margin <= certain
+    own_odds, largest = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
+    for first in range(0, doubts, BLOCK):
+        n = min(BLOCK, doubts - first)
+        for d in range(n):
+            i = doubtful[first + d]
+            own_odds[d] = odds[i]
+            for a in range(3):
+                xyz[a, d] = points[i, a]
+        largest[:n], own[:n] = log_outlier, 0
+        for j in range(components):
+            log_densities(xyz[0, :n], xyz[1, :n], xyz[2, :n], rows[j], densities[j])
+            if j < own_components:
+                add_to(densities[j], own_odds[:n])
+            raise_to(largest, densities[j], n)
+        constant_exponential(log_outlier, largest, others, n)
+        for j in range(components):
+            exponentials(densities[j], largest, own if j < own_components else others, n)
+        for d in range(n):
+            claimed[doubtful[first + d]] = own[d] > min_posterior * (own[d] + others[d])

@@ -4,93 +4,151 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Frame, Int32, PointClusters
 
+Int16 = npt.NDArray[np.int16]
 Int64 = npt.NDArray[np.int64]
 
-# 3-4 chamfer distance (Borgefors 1986), at most 8 % from the Euclidean one; floats of whole numbers are exact
-CHAMFER_STEP, CHAMFER_DIAGONAL = np.float32(3), np.float32(4)
-FAR = np.float32(1e6)  # beyond every image
+# 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, at most 8 % from the Euclidean one
+CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
+FAR = np.int16(30000)  # 10 000 px; two steps more still fit
+PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
 MAX_RING_WIDTH = 80  # px; wider rings tell nothing about the object
 
 
 @dataclass(frozen=True)
 class Neighborhoods:
-    """For each of N clusters its own points, then those of the ring around its mask, in one flat array.
+    """Points of N masks, each followed by those of the ring around it, in one flat array.
 
-    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`; its first `mask_counts[k]` points are the cluster's own.
+    Neighborhood k is `points_camera[starts[k]:starts[k + 1]]`; its first `mask_counts[k]` points are the mask's own.
     """
 
     points_camera: Float32  # (S, 3) m
     depth_in_mask: Float32  # (S,) px to the mask's border: positive inside, negative in the ring
-    source: Int64  # (S,) index of the cluster's point in the PointClusters, -1 for a point of the ring
     starts: Int64  # (N + 1,)
     mask_counts: Int64  # (N,)
     ring_widths: Int64  # (N,) px
-    mask_radii: Float32  # (N,) px, depth in the mask of its innermost point; 0 for an empty cluster
+    mask_radii: Float32  # (N,) px, depth in the mask of its innermost pixel; 0 for an empty cluster
 
     def __len__(self) -> int:
         return len(self.mask_counts)
 
     @property
     def ring_counts(self) -> Int64:
-        """(N,) points in each ring; 0 where nothing around the mask has a depth reading."""
+        """(N,) points of each ring."""
         return np.asarray(np.diff(self.starts) - self.mask_counts)
 
     @property
-    def owner(self) -> Int64:
-        """(S,) the neighborhood that each point is in."""
-        return np.repeat(np.arange(len(self)), np.diff(self.starts))
+    def of_ring(self) -> Bool:
+        """(S,) which points are of a ring."""
+        parts = np.stack([self.mask_counts, self.ring_counts], axis=1).ravel()
+        return np.repeat(np.arange(len(parts)) % 2 == 1, parts)
 
-    def kept(self, good: Bool, judged: Bool, points: int) -> Bool:
-        """(`points`,) which points of the PointClusters stay: the `good` (S,) ones of clusters that were `judged` (N,).
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The clusters of one frame and where their rings are: what points can be gathered from."""
+
+    clusters: PointClusters
+    frame: Frame
+    order: slice | Int64  # index of the M points of all clusters, one cluster after the other
+    pixels: Int32  # (M, 2) (u, v) of these points
+    firsts: Int64  # (N + 1,) where each cluster begins among them
+    windows: Int64  # (N, 4) v0 u0 v1 u1 (half open), each cluster's bounding box grown by its ring
+    cells: Int64  # (N + 1,) where each window's cells begin among all
+    steps: Int16  # (cells,) thirds of a pixel: depth in the mask, below 0 in the ring, 0 in neither
+    ring_counts: Int64  # (N,) readings in each ring
+    ring_widths: Int64  # (N,) px
+    mask_radii: Float32  # (N,) px
+
+    @property
+    def mask_counts(self) -> Int64:
+        """(N,) points of each cluster."""
+        return np.diff(self.firsts)
+
+    def of_at_least(self, min_points: int) -> Bool:
+        """(N,) which clusters have at least `min_points` points, and as many in their ring."""
+        return np.asarray((self.mask_counts >= min_points) & (self.ring_counts >= min_points))
+
+    def sampled(self, max_points: int) -> Neighborhoods:
+        """Every n-th point of each neighborhood, n chosen so that at most `max_points` are left of it."""
+        counts = self.mask_counts + self.ring_counts
+        nth = np.maximum(-(-counts // max_points), 1)
+        return self._gathered(-(-counts // nth), -(-self.mask_counts // nth), nth)
+
+    def own(self) -> Neighborhoods:
+        """The M points of the clusters, without the rings."""
+        return self._gathered(self.mask_counts, self.mask_counts, np.ones_like(self.ring_counts))
+
+    def kept(self, good: Bool, judged: Bool) -> Bool:
+        """(P,) which points of the PointClusters stay: of the `judged` clusters (N,) the `good` (M,) ones of `own`.
 
         Points of clusters that were not judged stay, and so do those of no cluster.
         """
-        return np.asarray(_kept(good, judged, self.starts, self.mask_counts, self.source, points), np.bool_)
+        kept = np.ones(len(self.clusters.cluster), np.bool_)
+        kept[self.order] = good | np.repeat(~judged, self.mask_counts)
+        return kept
 
-    def thinned(self, max_points: int) -> Neighborhoods:
-        """Every n-th point of each neighborhood, n chosen so that at most `max_points` are left of it."""
-        counts = np.diff(self.starts)
-        chosen, starts, mask_counts = _every_nth(self.starts, self.mask_counts, -(-counts // max_points))
-        return Neighborhoods(
-            self.points_camera[chosen],
-            self.depth_in_mask[chosen],
-            self.source[chosen],
-            starts,
-            mask_counts,
-            self.ring_widths,
-            self.mask_radii,
-        )
+    def _gathered(self, counts: Int64, mask_counts: Int64, nth: Int64) -> Neighborhoods:
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        points, depth_in_mask = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
+        _gather(
+            self.pixels, self.firsts, self.windows, self.cells, self.steps, self.frame.depth,
+            pinhole(self.frame.camera), starts, mask_counts, nth, *thread_shares(counts), points, depth_in_mask,
+        )  # fmt: skip
+        return Neighborhoods(points, depth_in_mask, starts, mask_counts, self.ring_widths, self.mask_radii)
 
 
-def neighborhoods(
+def ring_bounds(min_ring: int) -> dict[str, tuple[float, float]]:
+    """For `check_bounds`: what the parameters may be by which a plugin chooses rings and what it looks at of them."""
+    return {
+        "ring_fraction": (0.0, 10.0),
+        "min_ring": (1, MAX_RING_WIDTH),
+        "max_ring": (min_ring, MAX_RING_WIDTH),
+        "max_points": (100, 10**9),
+        "min_points": (10, 10**9),
+    }
+
+
+def surroundings(
     clusters: PointClusters, frame: Frame, ring_fraction: float, min_ring: int, max_ring: int
-) -> Neighborhoods:
-    """The N clusters of one frame with their rings, in camera coordinates.
+) -> Surroundings:
+    """The N clusters of one frame with their rings.
 
     A ring holds the pixels that have a depth reading, are not in the cluster themselves and lie within
     `ring_fraction` * sqrt(points in the cluster) px of it, bounded to [`min_ring`, `max_ring`] px. Pixels of other
     clusters belong to it like any other; those of known structure are as if they had no reading: they need not be told
     from the object any more, and are no border to it. `max_ring` is at most MAX_RING_WIDTH.
     """
-    camera, pixels = frame.camera, clusters.pixels
-    depth = frame.depth if clusters.structure is None else np.where(clusters.structure, np.float32(0), frame.depth)
-    order, firsts = grouped(clusters.cluster, len(clusters))
-    areas = np.diff(firsts)
+    order, firsts = members(clusters)
+    pixels, areas = clusters.pixels[order], np.diff(firsts)
+    readings = frame.depth if clusters.structure is None else np.where(clusters.structure, np.float32(0), frame.depth)
     widths = np.clip(np.rint(ring_fraction * np.sqrt(areas)), min_ring, max_ring).astype(np.int64)
-    windows = _windows(pixels, order, firsts, widths, *camera.shape)
+    windows = np.zeros((len(clusters), 4), np.int64)
+    _bound(pixels, firsts, widths, *frame.camera.shape, windows)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])
-    outside, inside, ring_counts = _distances(pixels, order, firsts, widths, windows, cells, depth)
-    starts = np.concatenate([[0], np.cumsum(areas + ring_counts)])
-    points, depth_in_mask, source, radii = _gather(
-        pixels, order, firsts, widths, windows, cells, outside, inside, depth, starts, pinhole(camera)
+    steps, ring_counts, radii = _signed_distances(
+        pixels, firsts, widths, windows, cells, readings, *thread_shares(areas)
     )
-    return Neighborhoods(points, depth_in_mask, source, starts, areas, widths, radii)
+    return Surroundings(clusters, frame, order, pixels, firsts, windows, cells, steps, ring_counts, widths, radii)
+
+
+def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
+    """The points of all clusters, one cluster after the other: their index, and (N + 1,) where each cluster begins.
+
+    Within a cluster the points keep their order. Points of no cluster (-1) are left out. The index is a slice, which
+    spares a copy of what it is taken of, where points are in this order already, as geometry.lift leaves them.
+    """
+    if (clusters.cluster[:-1] <= clusters.cluster[1:]).all():
+        firsts = np.searchsorted(clusters.cluster, np.arange(len(clusters) + 1))
+        return slice(int(firsts[0]), int(firsts[-1])), firsts - firsts[0]
+    order, firsts = grouped(clusters.cluster, len(clusters))
+    return order, firsts
 
 
 @njit(cache=True, nogil=True)
@@ -114,172 +172,242 @@ def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
     return order, firsts
 
 
+def thread_shares(costs: Int64) -> tuple[Int64, Int64]:
+    """Which thread takes which of N clusters: (N,) their order and (threads + 1,) where each thread's share begins.
+
+    Numba cuts a parallel loop into parts of equal length, but a few large clusters have most of the points. Here the
+    costliest goes first, to the thread that has least to do (Graham 1969). Clusters do not know of each other, so that
+    results do not depend on it.
+    """
+    order, starts = _longest_first(costs, numba.get_num_threads())
+    return order, starts
+
+
+@njit(cache=True, nogil=True)
+def _longest_first(costs: Int64, threads: int) -> tuple[Int64, Int64]:
+    loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
+    for k in np.argsort(-costs, kind="mergesort"):
+        owners[k] = np.argmin(loads)
+        loads[owners[k]] += costs[k] + 1
+    order = np.argsort(owners, kind="mergesort")
+    for k in range(len(costs)):
+        starts[owners[k] + 1] += 1
+    return order, np.cumsum(starts)
+
+
 def pinhole(camera: Camera) -> Float32:
     """(4,) fx, fy, cx, cy in the precision of geometry.back_project, for kernels."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
 
 
 @njit(cache=True, nogil=True)
-def _kept(good: Bool, judged: Bool, starts: Int64, mask_counts: Int64, source: Int64, points: int) -> Bool:
-    kept = np.ones(points, np.bool_)
-    for k in range(len(judged)):
-        if judged[k]:
-            for s in range(starts[k], starts[k] + mask_counts[k]):
-                kept[source[s]] = good[s]
-    return kept
+def _bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, windows: Int64) -> None:
+    """Sets (N, 4) v0 u0 v1 u1 (half open): each cluster's bounding box grown by its ring, within the image."""
+    for k in range(len(widths)):
+        if firsts[k] < firsts[k + 1]:
+            u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
+            windows[k, 0], windows[k, 1] = max(v0 - widths[k], 0), max(u0 - widths[k], 0)
+            windows[k, 2], windows[k, 3] = min(v1 + widths[k] + 1, height), min(u1 + widths[k] + 1, width)
 
 
 @njit(cache=True, nogil=True)
-def _every_nth(starts: Int64, mask_counts: Int64, steps: Int64) -> tuple[Int64, Int64, Int64]:
-    n = len(steps)
-    thin_starts, thin_mask_counts = np.zeros(n + 1, np.int64), np.zeros(n, np.int64)
-    for k in range(n):
-        step = max(steps[k], 1)
-        thin_starts[k + 1] = thin_starts[k] + (starts[k + 1] - starts[k] + step - 1) // step
-        thin_mask_counts[k] = (mask_counts[k] + step - 1) // step
-    chosen = np.empty(thin_starts[n], np.int64)
-    for k in range(n):
-        for j in range(thin_starts[k + 1] - thin_starts[k]):
-            chosen[thin_starts[k] + j] = starts[k] + j * max(steps[k], 1)
-    return chosen, thin_starts, thin_mask_counts
-
-
-@njit(cache=True, nogil=True)
-def _windows(pixels: Int32, order: Int64, firsts: Int64, widths: Int64, height: int, width: int) -> Int64:
-    """(N, 4) v0 u0 v1 u1 (half open): each cluster's bounding box grown by its ring, within the image."""
-    n = len(widths)
-    windows = np.zeros((n, 4), np.int64)
-    for k in range(n):
-        if firsts[k] == firsts[k + 1]:
-            continue
-        v0, u0, v1, u1 = height, width, 0, 0
-        for i in order[firsts[k] : firsts[k + 1]]:
-            u, v = pixels[i, 0], pixels[i, 1]
-            v0, u0, v1, u1 = min(v0, v), min(u0, u), max(v1, v), max(u1, u)
-        windows[k, 0], windows[k, 1] = max(v0 - widths[k], 0), max(u0 - widths[k], 0)
-        windows[k, 2], windows[k, 3] = min(v1 + widths[k] + 1, height), min(u1 + widths[k] + 1, width)
-    return windows
+def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
+    """Lowest u and v, highest u and v of at least one pixel."""
+    u0, v0 = pixels[0, 0], pixels[0, 1]
+    u1, v1 = u0, v0
+    for i in range(len(pixels)):
+        u, v = pixels[i, 0], pixels[i, 1]
+        u0 = u if u < u0 else u0
+        u1 = u if u > u1 else u1
+        v0 = v if v < v0 else v0
+        v1 = v if v > v1 else v1
+    return u0, v0, u1, v1
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _distances(
-    pixels: Int32, order: Int64, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32
-) -> tuple[Float32, Float32, Int64]:
-    """In every window (cells,) the distance to the mask and that to what is not the mask, and the ring's readings.
+def _signed_distances(
+    pixels: Int32, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
+    share_order: Int64, share_starts: Int64,
+) -> tuple[Int16, Int64, Float32]:  # fmt: skip
+    """In every window (cells,) how deep each of the mask's pixels lies in it; readings in the rings; the masks' radii.
 
-    Distances are in thirds of a pixel. A pixel without a reading is no border of the mask: holes in the depth are
-    common inside of objects.
+    Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
+    mask; 0 elsewhere. A pixel without a reading is no border of the mask: holes in the depth are common inside of
+    objects.
     """
-    n = len(widths)
-    outside, inside = np.full(cells[n], FAR), np.full(cells[n], FAR)
-    ring_counts = np.zeros(n, np.int64)
-    for k in prange(n):
-        v0, u0 = windows[k, 0], windows[k, 1]
-        rows, columns = windows[k, 2] - v0, windows[k, 3] - u0
-        to_mask = outside[cells[k] : cells[k + 1]].reshape((rows, columns))
-        to_rest = inside[cells[k] : cells[k + 1]].reshape((rows, columns))
-        for i in order[firsts[k] : firsts[k + 1]]:
-            to_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = 0
-        for r in range(rows):
-            for c in range(columns):
-                if to_mask[r, c] > 0 and depth[v0 + r, u0 + c] > 0:
-                    to_rest[r, c] = 0
-        if rows > 0:
-            _chamfer(to_mask)
-            _chamfer(to_rest)
-        count = 0
-        for r in range(rows):
-            for c in range(columns):
-                if 0 < to_mask[r, c] <= CHAMFER_STEP * widths[k] and depth[v0 + r, u0 + c] > 0:
-                    count += 1
-        ring_counts[k] = count
-    return outside, inside, ring_counts
+    steps = np.empty(cells[-1], np.int16)
+    ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)
+    for share in prange(len(share_starts) - 1):
+        for k in share_order[share_starts[share] : share_starts[share + 1]]:
+            if cells[k] < cells[k + 1]:
+                ring_counts[k], radii[k] = _signed_distances_of(
+                    pixels[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
+                    steps[cells[k] : cells[k + 1]],
+                )  # fmt: skip
+    return steps, ring_counts, radii
 
 
 @njit(cache=True, nogil=True)
-def _chamfer(grid: Float32) -> None:
-    """Spreads the distance from the cells that are 0, down the grid and up again."""
-    rows = grid.shape[0]
-    _spread_right(grid[0])
-    for r in range(1, rows):
-        _spread_across(grid[r - 1], grid[r])
-        _spread_right(grid[r])
-    _spread_left(grid[rows - 1])
-    for r in range(rows - 2, -1, -1):
-        _spread_across(grid[r + 1], grid[r])
-        _spread_left(grid[r])
+def _signed_distances_of(
+    pixels: Int32, ring: np.int16, window: Int64, depth: Float32, steps: Int16
+) -> tuple[int, np.float32]:
+    """Both distances lie side by side in one grid, with FAR cells around each, and spread over it together.
+
+    A shortest way may make its level steps first, all in the row of its source. So the rows are filled by runs, and the
+    steps down and up, straight and diagonal, are left to two sweeps in vector code.
+    """
+    v0, u0 = window[0], window[1]
+    rows, columns = window[2] - v0, window[3] - u0
+    middle = columns + 1  # the FAR cell between the distance to the mask and that to the rest
+    in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty(columns, np.bool_)
+    for i in range(len(pixels)):
+        in_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = True
+    grid = np.empty((rows, 2 * columns + 3), np.int16)
+    for r in range(rows):
+        row = grid[r]
+        row[0] = row[middle] = row[-1] = FAR
+        _mark_rest(in_mask[r], depth[v0 + r, u0 : u0 + columns], in_rest)
+        _distances_along(in_mask[r], row[1:middle])
+        _distances_along(in_rest, row[middle + 1 : middle + 1 + columns])
+        if r > 0:
+            _spread_across(grid[r - 1], row, middle)
+    count, radius = 0, np.int16(0)
+    for r in range(rows - 1, -1, -1):
+        row = grid[r]
+        if r < rows - 1:
+            _spread_across(grid[r + 1], row, middle)
+        of_row = steps[r * columns : (r + 1) * columns]
+        count += _sign(
+            in_mask[r], row[1:middle], row[middle + 1 : middle + 1 + columns], depth[v0 + r, u0 : u0 + columns], ring,
+            of_row,
+        )  # fmt: skip
+        radius = max(radius, _highest(of_row))
+    return count, PX_PER_STEP * np.float32(radius)
 
 
 @njit(cache=True, nogil=True)
-def _spread_across(neighbors: Float32, row: Float32) -> None:
-    _lower(row, neighbors, CHAMFER_STEP)
-    _lower(row[:-1], neighbors[1:], CHAMFER_DIAGONAL)
-    _lower(row[1:], neighbors[:-1], CHAMFER_DIAGONAL)
+def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
+    for c in range(len(in_rest)):
+        in_rest[c] = (not in_mask[c]) & (depth[c] > 0)
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def _lower(values: Float32, others: Float32, step: np.float32) -> None:
-    """values = min(values, others + step); without min() and without offsets in indices, so that it vectorizes."""
-    for i in range(len(values)):
-        other = others[i] + step
-        values[i] = other if other < values[i] else values[i]
+@njit(cache=True, nogil=True)
+def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
+    """Puts one row of the two distances together; the number of its readings in the ring."""
+    count = np.int32(0)
+    for c in range(len(steps)):
+        in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
+        outside = np.int16(-to_mask[c]) if in_ring else np.int16(0)
+        steps[c] = to_rest[c] if in_mask[c] else outside
+        count += np.int32(in_ring)
+    return int(count)
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def _spread_right(row: Float32) -> None:
-    nearest = FAR
-    for c in range(len(row)):
-        nearest += CHAMFER_STEP
-        nearest = row[c] if row[c] < nearest else nearest
-        row[c] = nearest
+@njit(cache=True, nogil=True)
+def _highest(steps: Int16) -> np.int16:
+    highest = np.int16(0)
+    for step in steps:
+        highest = step if step > highest else highest
+    return highest
 
 
-@njit(cache=True, nogil=True, fastmath={"nnan", "nsz"})
-def _spread_left(row: Float32) -> None:
-    nearest = FAR
-    for c in range(len(row) - 1, -1, -1):
-        nearest += CHAMFER_STEP
-        nearest = row[c] if row[c] < nearest else nearest
-        row[c] = nearest
+@njit(cache=True, nogil=True)
+def _distances_along(sources: Bool, row: Int16) -> None:
+    """The distance of every cell to the nearest source of its row, FAR without one."""
+    columns = len(row)
+    row[:] = 0
+    begin = 0
+    while begin < columns:
+        if sources[begin]:
+            begin += 1
+            continue
+        end = begin + 1
+        while end < columns and not sources[end]:
+            end += 1
+        _fill_gap(row[begin:end], begin > 0, end < columns)
+        begin = end + 1
+
+
+@njit(cache=True, nogil=True)
+def _fill_gap(gap: Int16, source_before: bool, source_behind: bool) -> None:
+    n, step, far = np.int32(len(gap)), np.int32(CHAMFER_STEP), np.int32(FAR)
+    for c in range(n):
+        left = step * (np.int32(c) + np.int32(1)) if source_before else far
+        right = step * (n - np.int32(c)) if source_behind else far
+        nearest = left if left < right else right
+        gap[c] = nearest if nearest < far else far
+
+
+@njit(cache=True, nogil=True)
+def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
+    n = len(row)
+    _lower(row[1 : n - 1], neighbors[: n - 2], neighbors[1 : n - 1], neighbors[2:])
+    row[middle] = FAR
+
+
+@njit(cache=True, nogil=True)
+def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
+    """row = min(row, across + a step, before or behind + a diagonal); without min() and offsets, so it vectorizes."""
+    for i in range(len(row)):
+        diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
+        straight = np.int16(across[i] + CHAMFER_STEP)
+        nearest = straight if straight < diagonal else diagonal
+        row[i] = nearest if nearest < row[i] else row[i]
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _gather(
-    pixels: Int32, order: Int64, firsts: Int64, widths: Int64, windows: Int64, cells: Int64,
-    outside: Float32, inside: Float32, depth: Float32, starts: Int64, pinhole: Float32,
-) -> tuple[Float32, Float32, Int64, Float32]:  # fmt: skip
-    """Points (as geometry.back_project gives them: tested), their depth in the mask, their source; the masks' radii."""
-    n = len(widths)
-    points = np.empty((starts[n], 3), np.float32)
-    depth_in_mask = np.empty(starts[n], np.float32)
-    source = np.full(starts[n], -1, np.int64)
-    radii = np.zeros(n, np.float32)
-    px_per_step = np.float32(1.0) / CHAMFER_STEP
-    for k in prange(n):
-        v0, u0 = windows[k, 0], windows[k, 1]
-        rows, columns = windows[k, 2] - v0, windows[k, 3] - u0
-        to_mask = outside[cells[k] : cells[k + 1]].reshape((rows, columns))
-        to_rest = inside[cells[k] : cells[k + 1]].reshape((rows, columns))
-        s = starts[k]
-        for i in order[firsts[k] : firsts[k + 1]]:
-            u, v = pixels[i, 0], pixels[i, 1]
-            _back_project(u, v, depth[v, u], pinhole, points[s])
-            depth_in_mask[s] = px_per_step * to_rest[v - v0, u - u0]
-            source[s] = i
-            radii[k] = max(radii[k], depth_in_mask[s])
-            s += 1
-        for r in range(rows):
-            for c in range(columns):
-                z = depth[v0 + r, u0 + c]
-                if 0 < to_mask[r, c] <= CHAMFER_STEP * widths[k] and z > 0:
-                    _back_project(u0 + c, v0 + r, z, pinhole, points[s])
-                    depth_in_mask[s] = -px_per_step * to_mask[r, c]
-                    s += 1
-    return points, depth_in_mask, source, radii
+    pixels: Int32, firsts: Int64, windows: Int64, cells: Int64, steps: Int16, depth: Float32,
+    pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64, share_order: Int64, share_starts: Int64,
+    points: Float32, depth_in_mask: Float32,
+) -> None:  # fmt: skip
+    """Points, as geometry.back_project gives them (tested), and their depth in the mask."""
+    for share in prange(len(share_starts) - 1):
+        for k in share_order[share_starts[share] : share_starts[share + 1]]:
+            middle, end = starts[k] + mask_counts[k], starts[k + 1]
+            window, own_steps = windows[k], steps[cells[k] : cells[k + 1]]
+            _gather_mask(
+                pixels[firsts[k] : firsts[k + 1]], window, own_steps, depth, pinhole, nth[k],
+                points[starts[k] : middle], depth_in_mask[starts[k] : middle],
+            )  # fmt: skip
+            if middle < end:
+                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # the ring goes on where the mask ended
+                _gather_ring(
+                    window, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
+                )
 
 
 @njit(cache=True, nogil=True)
-def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, point: Float32) -> None:
-    point[0] = np.float32(u - pinhole[2]) * (z / pinhole[0])
-    point[1] = np.float32(v - pinhole[3]) * (z / pinhole[1])
-    point[2] = z
+def _gather_mask(
+    pixels: Int32, window: Int64, steps: Int16, depth: Float32, pinhole: Float32, nth: int, points: Float32,
+    depth_in_mask: Float32,
+) -> None:  # fmt: skip
+    v0, u0, columns = window[0], window[1], window[3] - window[1]
+    for s in range(len(points)):
+        u, v = pixels[s * nth, 0], pixels[s * nth, 1]
+        _back_project(u, v, depth[v, u], pinhole, points, s)
+        depth_in_mask[s] = PX_PER_STEP * np.float32(steps[(v - v0) * columns + u - u0])
+
+
+@njit(cache=True, nogil=True)
+def _gather_ring(
+    window: Int64, steps: Int16, depth: Float32, pinhole: Float32, skipped: int, nth: int, points: Float32,
+    depth_in_mask: Float32,
+) -> None:  # fmt: skip
+    v0, u0, columns = window[0], window[1], window[3] - window[1]
+    s, until_next = 0, skipped
+    for cell in range(len(steps)):
+        if steps[cell] < 0:
+            if until_next == 0:
+                u, v = u0 + cell % columns, v0 + cell // columns
+                _back_project(u, v, depth[v, u], pinhole, points, s)
+                depth_in_mask[s] = PX_PER_STEP * np.float32(steps[cell])
+                s, until_next = s + 1, nth
+            until_next -= 1
+
+
+@njit(cache=True, nogil=True)
+def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float32, s: int) -> None:
+    points[s, 0] = np.float32(u - pinhole[2]) * (z / pinhole[0])
+    points[s, 1] = np.float32(v - pinhole[3]) * (z / pinhole[1])
+    points[s, 2] = z

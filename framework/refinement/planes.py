@@ -134,8 +134,9 @@ def _solve(moment: Float64, m: Float64) -> bool:
 @njit(cache=True, nogil=True)
 def _deviation(moment: Float64, m: Float64) -> float:
     """The rms of q - m . r over the readings, 1/m."""
-    n, sx, sy, sxx, sxy, syy, sq, sxq, syq, sqq = moment
-    a, b, c = m
+    n, sx, sy, sxx, sxy = moment[0], moment[1], moment[2], moment[3], moment[4]
+    syy, sq, sxq, syq, sqq = moment[5], moment[6], moment[7], moment[8], moment[9]
+    a, b, c = m[0], m[1], m[2]
     linear = a * sxq + b * syq + c * sq
     quadratic = a * a * sxx + b * b * syy + c * c * n + 2.0 * (a * b * sxy + a * c * sx + b * c * sy)
     return math.sqrt(max(sqq - 2.0 * linear + quadratic, 0.0) / n)

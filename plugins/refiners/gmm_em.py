@@ -6,15 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters
+from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
-from framework.refinement import lloyd, mixture
+from framework.refinement import mixture
 from framework.refinement.mask_evidence import mask_log_odds
-from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, neighborhoods
+from framework.refinement.mixture_start import start_labels
+from framework.refinement.neighborhood import ring_bounds, surroundings
 from framework.refinement.selection import keep_points
-
-START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
 
 
 @dataclass
@@ -29,15 +28,15 @@ class GmmEm(ClusterRefiner):
     index. Clusters with fewer than `min_points` points, or with as few in their ring, are left as they are.
     """
 
-    object_components: int = 2  # from 1; the visible faces of an object, which one Gaussian covers badly
+    object_components: int = 3  # from 1; the visible faces of an object, which one Gaussian covers badly
     background_components: int = 6  # from 1; occluders, supporting surface, neighbors, walls
     max_iterations: int = 8  # from 1
     tolerance: float = 1e-3  # nats a point; EM ends when the mean log-likelihood gains less
     std_floor: float = 0.01  # m, least standard deviation of a component along any axis
     outlier_fraction: float = 0.02  # in [0, 1), share of outliers at the start
     min_posterior: float = 0.5  # in (0, 1), a point stays when the object's share of it is larger
-    mask_log_odds: float = 2.0  # nats, from 0; 0 = the mask is the start only, as in the paper
-    expected_bleed: float = 0.5  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
+    mask_log_odds: float = 4.0  # nats, from 0; 0 = the mask is the start only, as in the paper
+    expected_bleed: float = 0.4  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
     ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
     min_ring: int = 4  # px, least width
     max_ring: int = 12  # px, largest width
@@ -56,70 +55,35 @@ class GmmEm(ClusterRefiner):
             min_posterior=(1e-6, 1 - 1e-6),
             mask_log_odds=(0.0, 20.0),
             expected_bleed=(0.0, 0.99),
-            ring_fraction=(0.0, 10.0),
-            min_ring=(1, MAX_RING_WIDTH),
-            max_ring=(self.min_ring, MAX_RING_WIDTH),
-            max_points=(100, 10**9),
-            min_points=(10, 10**9),
+            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.thinned(self.max_points)
+        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.sampled(self.max_points)
+        log_odds = mask_log_odds(sample, self.mask_log_odds, self.expected_bleed)
         mixtures = mixture.fit(
             sample.points_camera,
             sample.starts,
-            self._start(sample),
+            start_labels(sample, log_odds, self.object_components, self.background_components),
             self.object_components + self.background_components,
             max_iterations=self.max_iterations,
             tolerance=self.tolerance,
             variance_floor=self.std_floor**2,
             outlier_fraction=self.outlier_fraction,
-            prior_log_odds=self._prior(sample),
+            prior_log_odds=log_odds,
             own_components=self.object_components,
         )
-        begins = around.starts[:-1]
-        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        own, judged = around.own(), around.of_at_least(self.min_points)
         claimed = mixture.likely_members(
-            around.points_camera,
-            begins,
-            begins + np.where(judged, around.mask_counts, 0),
+            own.points_camera,
+            own.starts[:-1],
+            own.starts[:-1] + np.where(judged, own.mask_counts, 0),
             mixtures,
             own_components=self.object_components,
             min_posterior=self.min_posterior,
-            prior_log_odds=self._prior(around),
+            prior_log_odds=mask_log_odds(own, self.mask_log_odds, self.expected_bleed),
         )
-        return keep_points(clusters, around.kept(claimed, judged, len(clusters.cluster)))
-
-    def _start(self, sample: Neighborhoods) -> Int32:
-        """(S,) the component that each point starts in: the object's come first, then the background's.
-
-        The border of the mask, as far in as it is expected to bleed, starts in the nearest group of the ring.
-        """
-        points, of_ring = sample.points_camera, sample.source < 0
-        in_core = ~of_ring & (self._prior(sample) >= 0)
-        of_border = ~of_ring & ~in_core
-        labels = np.empty(len(points), np.int32)
-        labels[in_core], _ = _groups(points[in_core], _counts(in_core, sample), self.object_components)
-        labels[of_ring], centers = _groups(points[of_ring], sample.ring_counts, self.background_components)
-        ends = np.cumsum(_counts(of_border, sample))
-        begins = ends - _counts(of_border, sample)
-        labels[of_border] = lloyd.nearest_centers(points[of_border], begins, ends, centers)
-        labels[~in_core] += self.object_components
-        return labels
-
-    def _prior(self, around: Neighborhoods) -> Float32:
-        return mask_log_odds(around, self.mask_log_odds, self.expected_bleed)
-
-
-def _counts(chosen: Bool, sample: Neighborhoods) -> Int64:
-    """(N,) how many points of each neighborhood are chosen (S,)."""
-    return np.bincount(sample.owner[chosen], minlength=len(sample))
-
-
-def _groups(points: Float32, counts: Int64, groups: int) -> tuple[Int32, Float64]:
-    """Each of the N sets, `counts` long, cut into groups that lie together: (S,) in [0, groups), (N, groups, 3)."""
-    starts = np.concatenate([[0], np.cumsum(counts)])
-    return lloyd.cluster(points, starts, lloyd.depth_groups(points, starts, groups), START_ITERATIONS)
+        return keep_points(clusters, around.kept(claimed, judged))

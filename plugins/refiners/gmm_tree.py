@@ -12,7 +12,7 @@ from framework.parameters import check_bounds
 from framework.refinement import mixture_tree
 from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.mixture_tree import MixtureTree, own_shares
-from framework.refinement.neighborhood import MAX_RING_WIDTH, Int64, Neighborhoods, grouped, neighborhoods
+from framework.refinement.neighborhood import Neighborhoods, grouped, ring_bounds, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -43,8 +43,8 @@ class GmmTree(ClusterRefiner):
     min_node: int = 32  # from 8, points that a node needs to get children
     parent_points: float = 4.0  # from 0, points that the parent's share counts for in its children's
     min_posterior: float = 0.5  # in (0, 1), a point stays when the object's share of it is larger
-    mask_log_odds: float = 2.0  # nats, from 0, of a point deep in the mask
-    expected_bleed: float = 0.5  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
+    mask_log_odds: float = 4.0  # nats, from 0, of a point deep in the mask
+    expected_bleed: float = 0.4  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
     ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
     min_ring: int = 4  # px, least width
     max_ring: int = 12  # px, largest width
@@ -66,18 +66,14 @@ class GmmTree(ClusterRefiner):
             min_posterior=(1e-6, 1 - 1e-6),
             mask_log_odds=(0.0, 20.0),
             expected_bleed=(0.0, 0.99),
-            ring_fraction=(0.0, 10.0),
-            min_ring=(1, MAX_RING_WIDTH),
-            max_ring=(self.min_ring, MAX_RING_WIDTH),
-            max_points=(100, 10**9),
-            min_points=(10, 10**9),
+            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.thinned(self.max_points)
+        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.sampled(self.max_points)
         tree = mixture_tree.fit(
             sample.points_camera,
             sample.starts,
@@ -91,9 +87,9 @@ class GmmTree(ClusterRefiner):
             min_points=self.min_node,
         )
         shares = self._object_shares(tree, sample)
-        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
+        judged = around.of_at_least(self.min_points)
         judged &= np.diff(tree.levels[0].firsts) > 0  # nothing is known against a mask whose tree has no node
-        return keep_points(clusters, around.kept(self._claimed(tree, shares, around), judged, len(clusters.cluster)))
+        return keep_points(clusters, around.kept(self._claimed(tree, shares, around.own()), judged))
 
     def _object_shares(self, tree: MixtureTree, sample: Neighborhoods) -> list[Float32]:
         """For each level (M,) how much of each node is the object's."""
@@ -107,21 +103,19 @@ class GmmTree(ClusterRefiner):
             shares.append(above)
         return shares
 
-    def _claimed(self, tree: MixtureTree, shares: list[Float32], around: Neighborhoods) -> Bool:
-        """(S,) which points the object claims, of those of the masks; each level overrules the one above."""
-        of_mask = np.nonzero(around.source >= 0)[0]
-        claimed = np.zeros(len(around.source), bool)
-        points, odds = around.points_camera[of_mask], self._evidence(around)[of_mask]
-        starts: Int64 = np.concatenate([[0], np.cumsum(around.mask_counts)])
-        above = np.zeros(len(around), np.float32)
+    def _claimed(self, tree: MixtureTree, shares: list[Float32], own: Neighborhoods) -> Bool:
+        """(S,) which of the masks' points the object claims; each level overrules the one above."""
+        claimed, left = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
+        points, odds, starts = own.points_camera, self._evidence(own), own.starts
+        above = np.zeros(len(own), np.float32)
         for k, level in enumerate(tree.levels):
             child, share = tree.shared(k, points, starts, shares[k], above, odds)
-            claimed[of_mask] = share > self.min_posterior
+            claimed[left] = share > self.min_posterior
             if k + 1 < len(tree.levels):
                 goes_on = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # -1, an outlier, ends here
                 key = np.where(goes_on[child], child, -1)
                 order, starts = grouped(key.astype(np.int32), len(level))
-                of_mask, points, odds, above = of_mask[order], points[order], odds[order], shares[k]
+                left, points, odds, above = left[order], points[order], odds[order], shares[k]
         return claimed
 
     def _evidence(self, around: Neighborhoods) -> Float32:

@@ -10,7 +10,7 @@ from framework.data import Float64, Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement import lloyd
-from framework.refinement.neighborhood import MAX_RING_WIDTH, Neighborhoods, neighborhoods
+from framework.refinement.neighborhood import Neighborhoods, ring_bounds, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -39,28 +39,23 @@ class KMeans(ClusterRefiner):
             object_centers=(1, 64),
             background_centers=(1, 64),
             max_iterations=(1, 1000),
-            ring_fraction=(0.0, 10.0),
-            min_ring=(1, MAX_RING_WIDTH),
-            max_ring=(self.min_ring, MAX_RING_WIDTH),
-            max_points=(100, 10**9),
-            min_points=(10, 10**9),
+            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if clusters.exact:
             return clusters
-        around = neighborhoods(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.thinned(self.max_points)
+        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
+        sample = around.sampled(self.max_points)
         _, centers = lloyd.cluster(sample.points_camera, sample.starts, self._start(sample), self.max_iterations)
-        begins = around.starts[:-1]
-        judged = (around.mask_counts >= self.min_points) & (around.ring_counts >= self.min_points)
-        ends = begins + np.where(judged, around.mask_counts, 0)
-        labels = lloyd.nearest_centers(around.points_camera, begins, ends, centers)
-        return keep_points(clusters, around.kept(labels < self.object_centers, judged, len(clusters.cluster)))
+        own, judged = around.own(), around.of_at_least(self.min_points)
+        ends = own.starts[:-1] + np.where(judged, own.mask_counts, 0)
+        labels = lloyd.nearest_centers(own.points_camera, own.starts[:-1], ends, centers)
+        return keep_points(clusters, around.kept(labels < self.object_centers, judged))
 
     def _start(self, sample: Neighborhoods) -> Float64:
         """(N, object_centers + background_centers, 3) the object's centers, then the background's."""
-        of_ring = sample.source < 0
+        of_ring = sample.of_ring
         mask_starts = np.concatenate([[0], np.cumsum(sample.mask_counts)])
         ring_starts = np.concatenate([[0], np.cumsum(sample.ring_counts)])
         objects = lloyd.depth_groups(sample.points_camera[~of_ring], mask_starts, self.object_centers)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 
+import numba
 import numpy as np
 import pytest
 from sklearn.mixture import GaussianMixture
@@ -15,7 +16,8 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
 from framework.refinement import mixture, mixture_tree
-from framework.refinement.neighborhood import neighborhoods
+from framework.refinement.neighborhood import surroundings
+from plugins.refiners.chain import Chain
 from plugins.refiners.dbscan import Dbscan
 from plugins.refiners.geometric import Geometric
 from plugins.refiners.gmm_em import GmmEm
@@ -49,9 +51,15 @@ def ten_masks() -> tuple[PointClusters, Frame]:
     return lift(detections, frame, Pose(np.eye(4))), frame
 
 
+def default_chain() -> Chain:
+    """The links of conf/refiner/chain.yaml, which all three together are to take at most 10 ms on 2 cores."""
+    return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm(), "largest_component": LargestComponent()})
+
+
 @pytest.mark.parametrize(
     "refiner",
     [
+        default_chain(),
         Identity(),
         GmmEm(),
         GmmTree(),
@@ -70,6 +78,8 @@ def test_refine_ten_masks(benchmark, refiner: ClusterRefiner):
     refined = benchmark(refiner.refine, clusters, frame)
     assert len(refined) == MASKS
     benchmark.extra_info["points"] = len(clusters.cluster)
+    benchmark.extra_info["points left"] = len(refined.cluster)
+    benchmark.extra_info["threads"] = numba.get_num_threads()
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -77,9 +87,9 @@ def test_em_beside_scikit_learn(benchmark):
     """The same points, start and number of iterations: log-likelihoods agree, times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()
-    sample = neighborhoods(clusters, frame, 0.25, 4, 12).thinned(1000)
+    sample = surroundings(clusters, frame, 0.25, 4, 12).sampled(1000)
     # a start without empty groups, which scikit-learn could not take
-    labels = (np.arange(len(sample.source)) * 7 // 3 % components).astype(np.int32)
+    labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
     def ours() -> mixture.Mixtures:
         return mixture.fit(
@@ -122,7 +132,7 @@ def test_em_beside_scikit_learn(benchmark):
 def test_tree_beside_flat_mixture(benchmark, levels: int, components: int):
     """As many Gaussians, the same kind of start, iterations and points, of ten masks at once: who is faster."""
     clusters, frame = ten_masks()
-    sample = neighborhoods(clusters, frame, 0.25, 4, 12).thinned(10_000)
+    sample = surroundings(clusters, frame, 0.25, 4, 12).sampled(10_000)
     points, starts = sample.points_camera, sample.starts
     em = {"max_iterations": 8, "tolerance": 1e-3, "variance_floor": 0.01**2, "outlier_fraction": 0.02}
 

@@ -50,7 +50,7 @@ TOUCHING = [[(-0.6, 1.0, 0.0, 0.0, 1.6, 1.5)], [(0.0, 0.9, 0.0, 0.9, 1.6, 0.7)]]
 
 
 def test_two_touching_objects_under_one_bleeding_mask_come_apart() -> None:
-    """Every other frame, the first one too, shows both under one mask, the others a mask for each; all bleed by 8 px."""
+    """Every other frame, the first too, has one mask over both, the others have a mask for each; all bleed by 8 px."""
     scene = BoxScene(TOUCHING)
     frames = [scene.frame(look_from(-1.2 + 0.1 * k, -1.6, 1.4, (0.1, 1.2, 0.5)), k) for k in range(24)]
     detections = []

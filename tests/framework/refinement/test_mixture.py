@@ -85,6 +85,38 @@ def test_posterior_with_prior_and_outliers_by_hand(bound):
     assert not mixture.likely_members(points, nothing, nothing, ours, own_components=1, min_posterior=bound).any()
 
 
+@pytest.mark.parametrize("components", [1, 3, 8])
+def test_who_claims_a_point_is_decided_as_by_the_full_posterior(components):
+    """Near the border and far from it: the points that are decided without a sum, and those that are not."""
+    rng = np.random.default_rng(components)
+    n = components + 2
+    ours = mixture.Mixtures(
+        weights=rng.dirichlet(np.ones(n + 1), 2)[:, :n],
+        means=rng.normal(0, 0.5, (2, n, 3)),
+        covariances=np.tile(0.3**2 * np.eye(3), (2, n, 1, 1)),
+        outlier_weights=np.array([0.1, 0.0]),
+        outlier_densities=np.array([0.05, 0.05]),
+        log_likelihoods=np.zeros(2),
+        iterations=np.zeros(2, np.int64),
+    )
+    points = rng.normal(0, 1, (10_000, 3)).astype(np.float32)
+    odds = rng.uniform(-2, 2, 10_000).astype(np.float32)
+    starts = np.array([0, 5100, 10_000])
+    claimed = mixture.likely_members(
+        points, starts[:-1], starts[1:], ours, own_components=2, min_posterior=0.4, prior_log_odds=odds
+    )
+    for k in range(2):
+        own = slice(starts[k], starts[k + 1])
+        squares = ((points[own, None].astype(np.float64) - ours.means[k]) ** 2).sum(axis=-1) / 0.3**2
+        densities = ours.weights[k] * np.exp(-0.5 * squares) / ((2 * np.pi) ** 1.5 * 0.3**3)
+        object_part = densities[:, :2].sum(axis=1) * np.exp(odds[own])
+        others = densities[:, 2:].sum(axis=1) + ours.outlier_weights[k] * ours.outlier_densities[k]
+        posterior = object_part / (object_part + others)
+        clear = np.abs(posterior - 0.4) > 1e-4
+        assert clear.mean() > 0.99
+        np.testing.assert_array_equal(claimed[own][clear], posterior[clear] > 0.4)
+
+
 def test_likelihood_never_falls_and_the_stopping_rule_stops():
     points, labels = blobs(5)
     starts = np.array([0, len(points)])

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
+import numba
 import numpy as np
+import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import back_project, lift
-from framework.refinement.neighborhood import grouped, neighborhoods
+from framework.refinement.neighborhood import Neighborhoods, grouped, surroundings, thread_shares
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
 
@@ -23,6 +27,11 @@ def clusters_of(masks: np.ndarray, frame: Frame) -> PointClusters:
     return lift(detections, frame, Pose(np.eye(4)))
 
 
+def neighborhoods(clusters: PointClusters, frame: Frame, *ring: float, **named: float) -> Neighborhoods:
+    """All points of masks and rings."""
+    return surroundings(clusters, frame, *ring, **named).sampled(10**9)
+
+
 def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
     """Five blobs, some at the image's border and overlapping, over a depth image with holes."""
     rng = np.random.default_rng(seed)
@@ -34,12 +43,39 @@ def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
     return masks.astype(bool), frame_of(depth)
 
 
-def test_grouped_is_a_stable_sort():
-    cluster = np.random.default_rng(0).integers(-1, 4, 200).astype(np.int32)
+@pytest.mark.parametrize("make", [np.asarray, np.sort, lambda cluster: cluster[:0]])
+def test_grouped_is_a_stable_sort(make):
+    cluster = make(np.random.default_rng(0).integers(-1, 4, 200).astype(np.int32))
     order, firsts = grouped(cluster, 5)
     expected = np.argsort(cluster, kind="stable")[(cluster < 0).sum() :]
     np.testing.assert_array_equal(order, expected)
     np.testing.assert_array_equal(firsts, np.searchsorted(cluster[expected], np.arange(6)))
+
+
+def test_threads_share_the_clusters_evenly():
+    threads = numba.get_num_threads()
+    for costs in ([5, 1, 9, 4, 3, 2], [7], [0, 0, 0], []):
+        order, starts = thread_shares(np.array(costs, np.int64))
+        assert sorted(order) == list(range(len(costs)))
+        assert len(starts) == threads + 1
+        assert (starts[0], starts[-1]) == (0, len(costs))
+        loads = [sum(costs[k] for k in order[a:b]) for a, b in pairwise(starts)]
+        assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
+
+
+def test_depth_in_mask_is_the_chamfer_distance():
+    """To the nearest reading outside of the cluster inside of it, to the cluster around it; exactly."""
+    for seed in range(5):
+        masks, frame = random_scene(seed)
+        around = neighborhoods(clusters_of(masks, frame), frame, ring_fraction=0.25, min_ring=6, max_ring=8)
+        for k in range(5):
+            own, seen = masks[k] & (frame.depth > 0), frame.depth > 0
+            outside, inside = _chamfer_reference(own), _chamfer_reference(~own & seen)
+            ring = ~own & seen & (outside <= 3 * around.ring_widths[k])
+            expected = np.concatenate([inside[own], -outside[ring]]) / 3
+            found = around.depth_in_mask[around.starts[k] : around.starts[k + 1]]
+            np.testing.assert_allclose(found, expected, rtol=1e-6)
+            assert around.mask_radii[k] == found.max(initial=0)
 
 
 def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transform():
@@ -61,9 +97,7 @@ def test_points_are_those_of_back_project_and_rings_those_of_a_distance_transfor
             np.testing.assert_array_equal(around.points_camera[s], expected)
             assert around.mask_counts[k] == own.sum()
             assert around.ring_counts[k] == ring.sum()
-            source = around.source[s]
-            assert (clusters.cluster[source[: own.sum()]] == k).all()
-            assert (source[own.sum() :] == -1).all()
+            np.testing.assert_array_equal(around.of_ring[s], np.arange(len(pixels)) >= own.sum())
 
 
 def _chamfer_reference(mask: np.ndarray) -> np.ndarray:
@@ -100,14 +134,14 @@ def test_depth_in_mask_ignores_pixels_without_a_reading():
 def test_thinned_keeps_every_nth_point():
     masks, frame = random_scene(1)
     around = neighborhoods(clusters_of(masks, frame), frame, 0.25, 4, 12)
-    thin = around.thinned(50)
+    thin = surroundings(clusters_of(masks, frame), frame, 0.25, 4, 12).sampled(50)
     counts = np.diff(around.starts)
     for k, step in enumerate(np.maximum(-(-counts // 50), 1)):
         own = slice(around.starts[k], around.starts[k + 1])
         np.testing.assert_array_equal(
             thin.points_camera[thin.starts[k] : thin.starts[k + 1]], around.points_camera[own][::step]
         )
-        is_mask = thin.source[thin.starts[k] : thin.starts[k + 1]] >= 0
+        is_mask = ~around.of_ring[own][::step]
         assert is_mask.sum() == thin.mask_counts[k]
 
 

@@ -214,6 +214,28 @@ def test_largest_component_is_that_of_scipy():
         np.testing.assert_array_equal(found, largest)
 
 
+@pytest.mark.parametrize("reach", [1, 2, 3])
+@pytest.mark.parametrize("density", [0.05, 0.3, 0.9])
+def test_largest_component_is_that_of_all_pairs(reach, density):
+    """Over noisy depth, beside a graph with an edge for every pair of points that are near in image and depth."""
+    from scipy.sparse.csgraph import connected_components
+
+    camera = Camera(37, 23, 50.0, 50.0, 18.0, 11.0)
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        depth = (2 + rng.choice([0.0, 0.05, 0.1, 0.15], (23, 37), p=[0.4, 0.3, 0.2, 0.1])).astype(np.float32)
+        frame = frame_of(depth, camera)
+        before = lifted(rng.random((1, 23, 37)) < density, frame)
+        u, v = before.pixels.T
+        z = depth[v, u].astype(np.float64)
+        near = np.maximum(np.abs(u - u[:, None]), np.abs(v - v[:, None])) <= reach
+        near &= np.abs(z - z[:, None]) < 0.03 + 0.02 * np.minimum(z, z[:, None])
+        _, piece = connected_components(near, directed=False)
+        largest = np.bincount(piece).argmax()  # pieces are numbered in the order of their first points
+        refined = LargestComponent(reach=reach).refine(before, frame)
+        np.testing.assert_array_equal(refined.pixels, before.pixels[piece == largest])
+
+
 @pytest.mark.parametrize(
     ("make", "parameters", "message"),
     [

@@ -1,0 +1,68 @@
+"""Where expectation maximization starts: from the mask and the ring around it, each cut into groups by place."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.data import Bool, Float32, Float64, Int32
+from framework.refinement.lloyd import depth_groups_of, lloyd, nearest
+from framework.refinement.neighborhood import Int64, Neighborhoods
+
+START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
+
+
+def start_labels(around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int) -> Int32:
+    """(S,) the component that each point starts in: the object's come first, then the background's.
+
+    Points of the mask whose `log_odds` (S,) do not speak against the object start in the nearest of the object's
+    groups, points of the ring in the nearest of the background's. The border of the mask, as far in as it is expected
+    to bleed, starts in the nearest group of the ring.
+    """
+    labels = np.empty(len(around.points_camera), np.int32)
+    _start_all(
+        around.points_camera,
+        log_odds,
+        around.starts,
+        around.mask_counts,
+        object_components,
+        background_components,
+        labels,
+    )
+    return labels
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _start_all(
+    points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
+    background_components: int, labels: Int32,
+) -> None:  # fmt: skip
+    for k in prange(len(starts) - 1):
+        own = slice(starts[k], starts[k + 1])
+        _start_one(points[own], log_odds[own], mask_counts[k], object_components, background_components, labels[own])
+
+
+@njit(cache=True, nogil=True)
+def _start_one(
+    points: Float32, log_odds: Float32, mask_count: int, object_components: int, background_components: int,
+    labels: Int32,
+) -> None:  # fmt: skip
+    of_ring = np.arange(len(points)) >= mask_count
+    in_core = ~of_ring & (log_odds >= 0)
+    _group(points, in_core, object_components, 0, labels)
+    centers = _group(points, of_ring, background_components, object_components, labels)
+    for i in range(mask_count):
+        if not in_core[i]:
+            labels[i] = object_components + nearest(points[i], centers)
+
+
+@njit(cache=True, nogil=True)
+def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels: Int32) -> Float64:
+    """Sets the labels of the chosen points; their groups' centers."""
+    members = np.nonzero(chosen)[0]
+    own, own_labels = points[members], np.full(len(members), -1, np.int32)
+    centers: Float64 = depth_groups_of(own, groups)
+    lloyd(own, centers, START_ITERATIONS, own_labels)
+    for j, i in enumerate(members):
+        labels[i] = first_label + own_labels[j]
+    return centers
