@@ -105,6 +105,18 @@ def test_a_plane_stays_in_the_cluster_that_holds_most_of_it_and_leaves_the_other
     np.testing.assert_array_equal(left, half)
 
 
+@pytest.mark.parametrize(("share", "stays"), [(0.4, False), (0.6, True)])
+def test_a_cluster_holds_of_a_plane_what_it_holds_of_all_its_strips(share, stays):
+    """A wall seen between posts, in a mask that ends in the middle of it and is longer than what a thread counts."""
+    post = np.arange(320) // 32 % 2 == 1
+    depth = np.where(post, 1.5, 2.0) * np.ones(CAMERA.shape)
+    frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
+    mask = np.ones(CAMERA.shape, bool)
+    mask[int(share * 240) :] = False
+    [left] = masks_of(PlaneRemoval(distance=0.02).refine(lifted(frame, mask), frame))
+    np.testing.assert_array_equal(left, mask & (post | stays))
+
+
 def test_a_screen_before_a_wall_keeps_its_front_and_loses_the_wall():
     """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
