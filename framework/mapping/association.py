@@ -67,12 +67,16 @@ class PixelLists(NamedTuple):
 
 @njit(cache=True, nogil=True)
 def _link_points(pixels, cluster, first, following):
+    """Whether all pixels lie in the image; links the points up to the one that does not."""
     first[:] = -1
     for p in range(pixels.shape[0] - 1, -1, -1):
+        u, v = pixels[p, 0], pixels[p, 1]
+        if not (0 <= u < first.shape[1] and 0 <= v < first.shape[0]):
+            return False
         if cluster[p] >= 0:
-            u, v = pixels[p, 0], pixels[p, 1]
             following[p] = first[v, u]
             first[v, u] = p
+    return True
 
 
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
@@ -80,14 +84,13 @@ def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> Pix
 
     Raises DataError when a pixel lies outside the image: a refiner made it up, and kernels do not check bounds.
     """
-    u, v = clusters.pixels.T
-    if len(u) and (min(u.min(), v.min()) < 0 or u.max() >= shape[1] or v.max() >= shape[0]):
+    lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
+    if not _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next):
+        u, v = clusters.pixels.T
         raise DataError(
             f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
             f"v in [{v.min()}, {v.max()}]"
         )
-    lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
-    _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next)
     return lists
 
 
@@ -122,19 +125,36 @@ def look_up_instances(
 
 @njit(cache=True, nogil=True)
 def _count_visible(instance_ids, visible):
-    """Adds to visible (ids + 1,) the pixels of each instance."""
-    for v in range(instance_ids.shape[0]):
-        for u in range(instance_ids.shape[1]):
-            visible[instance_ids[v, u]] += 1
+    """Adds to visible (ids + 1,) the pixels of each instance, by runs: a counter raised by one waits for itself."""
+    label, count = np.int32(0), 0
+    for found in instance_ids.flat:
+        if found != label:
+            visible[label] += count
+            label, count = found, 0
+        count += 1
+    visible[label] += count
 
 
 @njit(cache=True, nogil=True)
 def _count_votes(pixels, cluster, instance_ids, stride, column, votes):
-    """Adds to votes (N, M + 1) the points of each cluster that fall on the instance of each column."""
+    """Adds to votes (N, M + 1) the points of each cluster that fall on the instance of each column, by runs.
+
+    Divisions cost more than all the rest, so that of each coordinate is looked up; -1 = not a multiple of the stride.
+    """
+    sample = np.full(stride * max(instance_ids.shape), -1, np.int32)
+    sample[::stride] = np.arange(max(instance_ids.shape))
+    k, label, count = np.int32(0), np.int32(0), 0
     for p in range(pixels.shape[0]):
-        u, v = pixels[p, 0], pixels[p, 1]
-        if cluster[p] >= 0 and u % stride == 0 and v % stride == 0:
-            votes[cluster[p], column[instance_ids[v // stride, u // stride]]] += 1
+        u, v = sample[pixels[p, 0]], sample[pixels[p, 1]]
+        if cluster[p] >= 0 and u >= 0 and v >= 0:
+            found = instance_ids[v, u]
+            if found != label or cluster[p] != k:
+                if count > 0:
+                    votes[k, column[label]] += count
+                k, label, count = cluster[p], found, 0
+            count += 1
+    if count > 0:
+        votes[k, column[label]] += count
 
 
 def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1) -> Overlaps:

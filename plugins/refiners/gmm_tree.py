@@ -43,8 +43,8 @@ class GmmTree(ClusterRefiner):
     min_node: int = 32  # from 8, points that a node needs to get children
     parent_points: float = 4.0  # from 0, points that the parent's share counts for in its children's
     min_posterior: float = 0.5  # in (0, 1), a point stays when the object's share of it is larger
-    mask_log_odds: float = 4.0  # nats, from 0, of a point deep in the mask
-    expected_bleed: float = 0.4  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
+    mask_log_odds: float = 2.0  # nats, from 0, of a point deep in the mask
+    expected_bleed: float = 0.5  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
     ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
     min_ring: int = 4  # px, least width
     max_ring: int = 12  # px, largest width

@@ -57,9 +57,7 @@ def test_two_touching_objects_under_one_bleeding_mask_come_apart() -> None:
     for frame in frames:
         first, second = bled(true_mask(frame, 1), 8), bled(true_mask(frame, 2), 8)
         apart = frame.index % 2 == 1
-        detections.append(
-            detected([first, second], [TABLE, COUCH]) if apart else detected([first | second], [COUCH])
-        )
+        detections.append(detected([first, second], [TABLE, COUCH]) if apart else detected([first | second], [COUCH]))
     assert_one_each(scene, mapped(frames, detections), 0.9)
 
 
