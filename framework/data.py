@@ -170,7 +170,7 @@ class PointClusters:
     scores: Float32  # (N,) in [0, 1]
     classes: tuple[str, ...]  # names of the C columns
     exact: bool = False  # as in Detections
-    structure: Bool | None = None  # (H, W) pixels on floors and walls, which are of no object; None = nobody looked
+    structure: Bool | None = None  # (H, W) pixels on floors and walls, which are of no object; None = none is known
 
     def __post_init__(self) -> None:
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)
@@ -252,6 +252,20 @@ class InstanceMesh:
         _check("InstanceMesh.colors", self.colors, (v, 3), np.uint8)
         _check("InstanceMesh.instance_ids", self.instance_ids, (v,), np.int32)
         _check("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
+
+    def of(self, instance: Instance) -> InstanceMesh:
+        """The instance's own mesh: its vertices, in their order, and the triangles between them."""
+        number = np.full(len(self.vertices), -1, np.int32)
+        number[instance.vertices] = np.arange(len(instance.vertices), dtype=np.int32)
+        triangles = number[self.triangles]
+        return InstanceMesh(
+            self.vertices[instance.vertices],
+            triangles[(triangles >= 0).all(axis=1)],
+            self.colors[instance.vertices],
+            self.instance_ids[instance.vertices],
+            self.class_ids[instance.vertices],
+            self.classes,
+        )
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from framework.data import (
+    Box,
     Camera,
     Detections,
     Frame,
     FrameTruth,
+    Instance,
     InstanceMesh,
     PointClusters,
     Pose,
@@ -110,6 +112,8 @@ def test_sound_data_pass() -> None:
         (clusters, {"cluster": np.array([0, 2, 1], np.int32)}, r"cluster must be in \[-1, 2\), found 0 to 2"),
         (clusters, {"points_world": with_nan((3, 3))}, "points_world holds values that are not finite"),
         (clusters, {"pixels": np.zeros((2, 2), np.int32)}, "pixels must have shape"),
+        (clusters, {"structure": np.zeros((3, 4), np.uint8)}, "structure must be an array of bool, found uint8"),
+        (clusters, {"structure": np.zeros(12, np.bool_)}, r"structure must have shape \(any, any\)"),
         (mesh, {"class_ids": np.zeros(2, np.int32)}, "class_ids must have shape"),
         (mesh, {"triangles": [[0, 1, 2]]}, "triangles must be an array of int32, found list"),
     ],
@@ -118,6 +122,24 @@ def test_unsound_data_are_refused_in_one_line(make: Callable[..., object], chang
     with pytest.raises(DataError, match=said) as caught:
         make(**changes)
     assert "\n" not in str(caught.value)
+
+
+def test_an_instance_has_a_mesh_of_its_own() -> None:
+    """The quad 0 1 2 3, of which the instance has all but vertex 1."""
+    whole = mesh(
+        vertices=np.arange(12, dtype=np.float32).reshape(4, 3),
+        triangles=np.array([[0, 1, 2], [0, 2, 3]], np.int32),
+        colors=np.zeros((4, 3), np.uint8),
+        instance_ids=np.array([5, 0, 5, 5], np.int32),
+        class_ids=np.array([0, -1, 0, 0], np.int32),
+        classes=("chair",),
+    )
+    box = Box(np.zeros(3), np.ones(3), np.eye(3))
+    chair = Instance(5, np.ones(1, np.float32), 0.9, 3, 0, 2, np.array([0, 2, 3], np.int32), box, box)
+    own = whole.of(chair)
+    assert own.vertices.tolist() == whole.vertices[[0, 2, 3]].tolist()
+    assert own.triangles.tolist() == [[0, 1, 2]]
+    assert own.instance_ids.tolist() == [5, 5, 5]
 
 
 def test_a_frame_takes_views_of_images_and_hands_out_whole_ones() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import cv2
@@ -61,6 +62,25 @@ def test_threads_share_the_clusters_evenly():
         assert (starts[0], starts[-1]) == (0, len(costs))
         loads = [sum(costs[k] for k in order[a:b]) for a, b in pairwise(starts)]
         assert max(loads) <= sum(costs) / threads + max(costs, default=0), "Graham's bound"
+
+
+def test_known_structure_is_no_border_and_in_no_ring_but_may_be_in_a_mask():
+    """As if it had no reading, except for the clusters' own points."""
+    masks, frame = random_scene(0)
+    structure = np.random.default_rng(1).random((40, 60)) < 0.5
+    clusters = clusters_of(masks, frame)
+    found = neighborhoods(replace(clusters, structure=structure), frame, 0.25, 6, 8)
+    in_a_mask = masks.any(axis=0)
+    for k in range(5):
+        own = masks[k] & (frame.depth > 0)
+        seen = (frame.depth > 0) & ~structure
+        outside, inside = _chamfer_reference(own), _chamfer_reference(~own & seen)
+        ring = ~own & seen & (outside <= 3 * found.ring_widths[k])
+        part = slice(found.starts[k], found.starts[k + 1])
+        expected = np.concatenate([inside[own], -outside[ring]]) / 3
+        np.testing.assert_allclose(found.depth_in_mask[part], expected, rtol=1e-6)
+        assert (found.points_camera[part, 2] > 0).all()
+    assert (structure & in_a_mask & (frame.depth > 0)).any(), "there was something to tell apart"
 
 
 def test_depth_in_mask_is_the_chamfer_distance():

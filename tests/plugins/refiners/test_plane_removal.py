@@ -71,6 +71,14 @@ def test_a_box_on_the_floor_loses_the_floor_and_keeps_its_sides_down_to_the_dist
     np.testing.assert_array_equal(left, (ids == 1) & (heights(frame, pitch) > 0.02))
 
 
+def test_the_next_refiner_learns_where_floor_and_walls_are():
+    frame, ids = scene(BOX)
+    refined = PlaneRemoval(distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame)
+    assert refined.structure is not None
+    np.testing.assert_array_equal(refined.structure[ids == 1], heights(frame)[ids == 1] <= 0.02)
+    assert refined.structure[ids == 0].mean() > 0.99
+
+
 def test_the_noise_of_the_sensor_comes_on_top_of_the_distance():
     """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
     frame, ids = scene(BOX, noise=0.002)
@@ -94,10 +102,13 @@ def test_a_plane_stays_in_the_cluster_that_holds_most_of_it_and_leaves_the_other
     """A table top that hides all: nothing is behind it, so that only the share that a cluster holds can tell."""
     frame, ids = scene(((-9.0, 0.5, -9.0), (9.0, 0.6, 9.0)), ((-0.1, 0.3, 0.4), (0.1, 0.5, 0.6)), pitch=0.9)
     assert (ids > 0).all()
-    top, cup = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, ids == 1, bleeding(ids == 2)), frame))
+    refined = PlaneRemoval(min_area=0.3).refine(lifted(frame, ids == 1, bleeding(ids == 2)), frame)
+    top, cup = masks_of(refined)
     np.testing.assert_array_equal(top, ids == 1)
     assert cup.sum() > 0.8 * (ids == 2).sum()
     assert not cup[ids == 1].any()
+    assert refined.structure is not None
+    assert not refined.structure[ids == 1].any(), "what an object keeps is no structure, whoever else lost it"
     half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
     [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
     assert not left.any()
