@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from framework.command_line import CONF, EXIT_FAILED, Jobs, one_line_errors
+from framework.command_line import CONF, Jobs
 from framework.experiment import with_row
 from framework.reports.records import is_recorded
 
@@ -32,10 +31,7 @@ def job(config: DictConfig) -> None:
 
 def main() -> None:
     """The console script `instancemap`."""
-    with one_line_errors():
-        job()
-    if jobs.failed:
-        sys.exit(EXIT_FAILED)
+    jobs.run(job)
 
 
 if __name__ == "__main__":

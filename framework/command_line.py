@@ -82,6 +82,13 @@ class Jobs:
 
         return reported_job
 
+    def run(self, command: Callable[[], None]) -> None:
+        """Runs Hydra's command for a reported job, and ends the process with a status when one has failed."""
+        with one_line_errors():
+            command()
+        if self.failed:
+            sys.exit(EXIT_FAILED)
+
 
 def one_line(error: BaseException) -> str:
     """What is wrong, in one line; Hydra's messages are made to say what the user can do."""

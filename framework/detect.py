@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 import math
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -18,7 +17,7 @@ from omegaconf import DictConfig
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from framework.command_line import CONF, EXIT_FAILED, Jobs, one_line_errors
+from framework.command_line import CONF, Jobs
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import Detector, RGBDSequence
 
@@ -113,10 +112,7 @@ def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
 
 
 def main() -> None:
-    with one_line_errors():
-        job()
-    if jobs.failed:
-        sys.exit(EXIT_FAILED)
+    jobs.run(job)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ Draws the masks in the image and their points in 3D from the side (the paper's F
 from __future__ import annotations
 
 import logging
-import sys
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -15,7 +14,7 @@ import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from framework.command_line import CONF, EXIT_FAILED, Jobs, one_line_errors
+from framework.command_line import CONF, Jobs
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import ClusterRefiner, Detector, RGBDSequence
 
@@ -97,10 +96,7 @@ def called(refiner: str, overrides: Iterable[str]) -> str:
 
 
 def main() -> None:
-    with one_line_errors():
-        job()
-    if jobs.failed:
-        sys.exit(EXIT_FAILED)
+    jobs.run(job)
 
 
 if __name__ == "__main__":
