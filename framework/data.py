@@ -313,6 +313,8 @@ def _check_scores(name: str, scores: Float32) -> None:
 
 def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> None:
     _check(name, rows, shape, np.float32)
+    if shape[0] and not shape[1]:
+        raise DataError(f"{name}: there are {shape[0]} rows and no class to be distributed over")
     if rows.size and (rows.min() < 0 or np.abs(rows.sum(axis=1) - 1).max() > PROBABILITY_TOLERANCE):
         worst = rows.sum(axis=1)[np.abs(rows.sum(axis=1) - 1).argmax()]
         raise DataError(

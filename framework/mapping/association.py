@@ -1,9 +1,9 @@
 """Data association: which instance of the map is each cluster of the frame?
 
 A cluster's pixels vote for the instances that the map holds at the surface measured there. Which pairs may match is
-said by their overlap over the smaller of the two, so that a part of an object still finds the whole; among those, one
-cluster gets at most one instance and the reverse, best IoU first, so that a table does not get the book that lies on
-it.
+said by their overlap, by default over the smaller of the two, so that a part of an object still finds the whole; among
+those, one cluster gets at most one instance and the reverse, best IoU first, so that a table does not get the book that
+lies on it.
 """
 
 from __future__ import annotations

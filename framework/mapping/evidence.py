@@ -41,7 +41,8 @@ INSTANCE_SLOTS, CLASS_SLOTS = 4, 12  # labels that a voxel can tell apart in com
 NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 NO_CLASS = 255  # in a free slot
-MOST_UNITS = 32_000  # of class evidence in compact storage: where more speaks for a class, it is certain
+MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
+MOST_GAIN = 2**15 - 1 - MOST_UNITS  # units that one cluster may add there: what int16 has room for
 
 
 class Combine(IntEnum):
@@ -218,12 +219,17 @@ def update_voxel(evidence, row, n, measurement, point):
             ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
         )
         known = 0  # bits of the named classes that have a slot
+        too_much = np.int64(0)
         for s in range(len(classes) if combine == SUM else 0):
             if classes[s] == NO_CLASS:
                 break  # slots are filled from the front
-            value = class_values[s] + measurement.class_gain[k, classes[s]]
-            class_values[s] = min(max(value, -measurement.most_units), measurement.most_units)
+            value = max(class_values[s] + measurement.class_gain[k, classes[s]], -measurement.most_units)
+            class_values[s] = value
+            too_much = max(too_much, value - measurement.most_units)
             known |= measurement.named_bit[k, classes[s]]
+        for s in range(len(classes) if too_much > 0 else 0):  # the distances stay, and with them the likeliest class
+            if classes[s] != NO_CLASS:
+                class_values[s] = max(class_values[s] - too_much, -measurement.most_units)
         for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
             label = measurement.named_classes[k, m]
             if m > 0 and label == measurement.named_classes[k, 0]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from framework.data import Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.mapping.association import PixelLists
-from framework.mapping.evidence import MOST_UNITS, Combine, Measurement, Storage, named_classes
+from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
 from framework.mapping.instance_fuser import InstanceFuser
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.integration import Integrator
@@ -91,7 +91,7 @@ class EvidenceFuser(InstanceFuser):
         matched[instance_ids] = True
         class_gain, named, bits = named_classes(self.class_evidence(clusters), self.logarithmic)
         compact = self.storage is Storage.COMPACT
-        units = self.units if compact else self.units << EXACT_BITS
+        units, most_gain = (self.units, MOST_GAIN) if compact else (self.units << EXACT_BITS, np.inf)
         return Measurement(
             first_point=points.first,
             next_point=points.next,
@@ -100,7 +100,7 @@ class EvidenceFuser(InstanceFuser):
             instance_gain=self.instance_evidence(clusters),
             absence=np.float32(self.absence_evidence()),
             matched=matched,
-            class_gain=np.rint(class_gain * units).astype(np.int64),
+            class_gain=np.rint(np.clip(class_gain * units, -most_gain, most_gain)).astype(np.int64),
             named_classes=named,
             named_bit=bits,
             combine=int(self.combine),

@@ -51,14 +51,14 @@ class InstanceFuser(MapFuser):
     min_depth: float = 0.2  # m, > 0
     max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
     label_band: float = 2.0  # voxels, >= 1: labels go to voxels within this distance of the measured surface
-    overlap: float = 0.35  # in (0, 1): a cluster updates an instance above this overlap
+    overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
     class_gate: float = 0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
-    duplicate_overlap: float = 0.6  # in (0, 1]: a cluster that shares this with a better one creates nothing
+    duplicate_overlap: float = 0.6  # in [0, 1]: a cluster that shares this with a better one creates nothing
     split: bool = True  # whether two clusters on one instance split it: the better one keeps it, the other is new
-    merge_overlap: float = 0.5  # in (0, 1]: two instances under one cluster above this are one object ...
+    merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
     min_observations: int = 3  # frames, >= 1: before that an instance is tentative
     min_confidence: float = 0.1  # in [0, 1]: likewise
@@ -130,15 +130,15 @@ class InstanceFuser(MapFuser):
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame: Frame) -> Int32:
         """(N,) the instance of each cluster, an old or a new one; 0 = none."""
-        overlapping = overlaps.by(self.overlap_rule, self.create_points) > self.overlap
-        allowed = overlapping & self._agree(clusters, overlaps.instance_ids)
+        allowed = overlaps.by(self.overlap_rule, self.create_points) > self.overlap
+        allowed &= self._agree(clusters, overlaps.instance_ids)
         match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (
             (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         )
         if not self.split:
-            may_create &= ~overlapping.any(axis=1)
+            may_create &= ~allowed.any(axis=1)
         if may_create.any():
             may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
         for k in np.flatnonzero(may_create):

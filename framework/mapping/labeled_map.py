@@ -14,8 +14,7 @@ from framework.mapping.instance_table import InstanceTable
 class LabeledMap(SceneMap):
     """A map whose voxels know the instance that they belong to, and a table of these instances.
 
-    `mesh` and `instances` have the instances that count; `render` shows the tentative ones too, as association needs
-    them.
+    `mesh` and `instances` have the instances that count; `render` and `instances_seen` the tentative ones too.
     """
 
     def __init__(self, table: InstanceTable, confirmation: Confirmation) -> None:

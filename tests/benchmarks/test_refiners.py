@@ -52,7 +52,7 @@ def ten_masks() -> tuple[PointClusters, Frame]:
 
 
 def default_chain() -> Chain:
-    """The links of conf/refiner/chain.yaml, which all three together are to take at most 10 ms on 2 cores."""
+    """The links of conf/refiner/chain.yaml, which are to take at most 10 ms together on 2 cores."""
     return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm()})
 
 

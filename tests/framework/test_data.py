@@ -112,6 +112,11 @@ def test_sound_data_pass() -> None:
         (clusters, {"cluster": np.array([0, 2, 1], np.int32)}, r"cluster must be in \[-1, 2\), found 0 to 2"),
         (clusters, {"points_world": with_nan((3, 3))}, "points_world holds values that are not finite"),
         (clusters, {"pixels": np.zeros((2, 2), np.int32)}, "pixels must have shape"),
+        (
+            clusters,
+            {"class_probabilities": np.zeros((2, 0), np.float32), "classes": ()},
+            "there are 2 rows and no class to be distributed over",
+        ),
         (clusters, {"structure": np.zeros((3, 4), np.uint8)}, "structure must be an array of bool, found uint8"),
         (clusters, {"structure": np.zeros(12, np.bool_)}, r"structure must have shape \(any, any\)"),
         (mesh, {"class_ids": np.zeros(2, np.int32)}, "class_ids must have shape"),

@@ -110,4 +110,6 @@ def test_a_long_video_costs_a_few_frames() -> None:
 def test_the_refiner_is_called_as_on_the_command_line() -> None:
     overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
     assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
+    added = "+refiner@refiner.links.last=largest_component"
+    assert called("chain", [added, "~refiner.links.gmm_em", "seed=1"]) == f"refiner=chain {added} ~refiner.links.gmm_em"
     assert called("gmm_em", []) == "refiner=gmm_em"

@@ -9,6 +9,7 @@ from framework.errors import DataError
 from framework.mapping.evidence import (
     CLASS_SLOTS,
     INSTANCE_SLOTS,
+    MOST_GAIN,
     MOST_UNITS,
     NEW_CLASSES,
     NO_CLASS,
@@ -266,11 +267,26 @@ def test_small_numbers_saturate_and_do_not_wrap() -> None:
     evidence = blank()._replace(class_value=np.zeros((1, 512, CLASS_SLOTS), np.int16))
     said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(most_units=MOST_UNITS)
     gains = said.class_gain * 0
-    gains[:, 2], gains[:, 3] = 30_000, -30_000
-    for _ in range(4):
+    gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
+    for _ in range(40):
         update_voxel(evidence, 0, 0, said._replace(class_gain=gains), np.int32(0))
     assert evidence.class_value[0, 0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
     assert best_class(evidence, 0, 0) == 2
+
+
+@pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
+def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classes: int, best: float) -> None:
+    """The same distribution 1000 times, its best class the last one and most of the rest on the first."""
+    p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
+    p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
+    gains, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
+    evidence = blank()._replace(class_value=np.zeros((1, 512, CLASS_SLOTS), np.int16))
+    said = measured([1], [0.9], p, 1.0, 1)._replace(
+        class_gain=np.rint(64 * gains).astype(np.int64), named_classes=named, named_bit=bits, most_units=MOST_UNITS
+    )
+    for _ in range(1000):
+        update_voxel(evidence, 0, 0, said, np.int32(0))
+        assert best_class(evidence, 0, 0) == classes - 1
 
 
 def test_too_many_classes_are_refused() -> None:

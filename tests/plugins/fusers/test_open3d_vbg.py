@@ -323,7 +323,7 @@ def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open
     assert coords == sorted(coords, key=lambda xyz: xyz[::-1]), "Open3D's order differs between runs"
 
 
-def test_a_damaged_or_foreign_file_is_refuse_masks(mapped: Open3DMap, tmp_path: Path) -> None:
+def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path) -> None:
     path = tmp_path / "map.npz"
     mapped.save(path)
     whole = path.read_bytes()
