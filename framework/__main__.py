@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from framework.command_line import CONF, Jobs
-from framework.experiment import with_row
+from framework.command_line import CONF, EXIT_FAILED, Jobs
+from framework.experiment import WriteTables, with_row
 from framework.reports.records import is_recorded
 
 jobs = Jobs()
@@ -32,6 +33,8 @@ def job(config: DictConfig) -> None:
 def main() -> None:
     """The console script `instancemap`."""
     jobs.run(job)
+    if WriteTables.failed:
+        sys.exit(EXIT_FAILED)
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 from hydra import compose
 from hydra.conf import HydraConf
@@ -17,6 +17,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.errors import ConfigError, InstanceMapError
+from framework.reports.comparison import TableChoice
 
 log = logging.getLogger(__name__)
 
@@ -29,12 +30,13 @@ OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(by_name), rep
 def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, Choices]:
     """A job's config and choices by group, with the overrides of the experiment's row that the job is for.
 
-    Raises ConfigError for a row that the experiment does not have.
+    Raises ConfigError for a row that the experiment does not have, and for a `table` that could not be made afterwards.
     """
     choices: Choices = dict(hydra_config.runtime.choices)
     rows = config.get("rows")
     if not rows:
         return config, choices
+    TableChoice.of(config.table)
     if config.row not in rows:
         raise ConfigError(f"there is no row={config.row}; the experiment has {', '.join(map(str, rows))}")
     overrides = [*hydra_config.overrides.task, *rows[config.row]]
@@ -48,6 +50,8 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
 class WriteTables(Callback):
     """Makes the tables when the sweep has ended, from all records in its place."""
 
+    failed: ClassVar[bool] = False  # whether there is a table that could not be made: Hydra keeps callbacks' errors
+
     def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
         from framework.reports.tables import (
             write_tables,  # here: every job makes a callback, none but the sweep calls it
@@ -57,3 +61,4 @@ class WriteTables(Callback):
             print(write_tables(Path(config.hydra.sweep.dir)))
         except InstanceMapError as error:  # Hydra would make a warning of many lines of it
             log.error("no table: %s", error)
+            WriteTables.failed = True

@@ -92,7 +92,9 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
 
 def called(refiner: str, overrides: Iterable[str]) -> str:
     """How the refiner is chosen on the command line, with the parameters that are not the config's."""
-    return " ".join([f"refiner={refiner}", *(item for item in overrides if item.lstrip("+~").startswith(("refiner.", "refiner@")))])
+    return " ".join(
+        [f"refiner={refiner}", *(item for item in overrides if item.lstrip("+~").startswith(("refiner.", "refiner@")))]
+    )
 
 
 def main() -> None:

@@ -25,7 +25,12 @@ from tests.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereD
 CHECKOUT = Path(__file__).resolve().parent.parent
 README = (CHECKOUT / "README.md").read_text()
 LINES = [line for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
-COMMANDS = [line for line in LINES if line.startswith("python -m framework ")]
+COMMANDS = {  # by the main config that they compose
+    line: config
+    for line in LINES
+    for config in ("config", *(path.stem for path in CONF.glob("*.yaml")))
+    if line.startswith(f"python -m framework{'' if config == 'config' else f'.{config}'} ")
+}
 BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
 
 
@@ -106,7 +111,10 @@ def test_every_command_composes(command: str) -> None:
     choices = [override.split("=")[1].split(",") for override in overrides if override.split("=")[0] in STAGES]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         for k in range(max(map(len, choices), default=1)):
-            compose("config", overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides])
+            compose(
+                COMMANDS[command],
+                overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides],
+            )
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)

@@ -50,9 +50,12 @@ class Incomplete:
     reason: str
 
 
+WITH_CHANGES = " with changes"  # ends the name of code that is no commit
+
+
 def commit_of(metrics: Mapping[str, Any]) -> str:
     """The code that ran, short: "7dcc5d0", "7dcc5d0 with changes" or "unknown"."""
-    changes = " with changes" if metrics.get("git_dirty") is True else ""
+    changes = WITH_CHANGES if metrics.get("git_dirty") is True else ""
     return f"{str(metrics.get('git_commit'))[:7]}{changes}"
 
 
@@ -104,7 +107,7 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
         log.info("run again: the record in %s is of another config", directory)
         return False
     now = commit_of(code_version())
-    if record.commit == now:
+    if record.commit == now and not now.endswith(WITH_CHANGES):  # two trees with changes may differ
         log.info("kept: the complete record in %s", directory)
     else:
         told = "kept: the complete record in %s, of commit %s; this is %s, and resume=false would run it again"
@@ -127,7 +130,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
-        content = json.loads(path.read_text())
+        content = json.loads(path.read_text("utf-8"))
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
     if not isinstance(content, dict):

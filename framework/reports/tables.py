@@ -115,7 +115,7 @@ class Comparison:
         over = ", ".join(self.choice.over)
         yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
         if self.base is None:
-            yield f"No differences: {self._base_name} has no complete run."
+            yield f"No differences: {self._base_name} is no row with a complete run; table.base=ROW names another."
         elif len(self.rows) > 1:
             yield (
                 f"Differences are paired by {over}: mean ± standard error; "
@@ -201,7 +201,7 @@ def write_tables(directory: Path) -> str:
     text = markdown(comparison)
     for name, content in (("md", text), ("tex", latex(comparison)), ("csv", comma_separated(comparison))):
         with written_whole(directory / f"table.{name}") as temporary:
-            temporary.write_text(content)
+            temporary.write_text(content, "utf-8")
     return text
 
 

@@ -95,7 +95,7 @@ def test_no_differences_without_the_base(sweep: Path) -> None:
         path.unlink()
     text = write_tables(sweep)
     assert "less chain" not in text
-    assert "- No differences: chain has no complete run." in text
+    assert "- No differences: chain is no row with a complete run; table.base=ROW names another." in text
     assert text.count("| identity ") == 1
 
 
