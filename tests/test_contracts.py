@@ -6,6 +6,7 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 
@@ -202,6 +203,19 @@ def test_refiner_is_repeatable(refiner: ClusterRefiner, room: CornerRoom) -> Non
     first = refiner.refine(bleeding(room[1]), room[1])
     refiner.refine(bleeding(room[2]), room[2])
     assert same(first, refiner.refine(bleeding(room[1]), room[1]))
+
+
+def test_refiner_does_not_depend_on_the_number_of_threads(refiner: ClusterRefiner, room: CornerRoom) -> None:
+    threads = numba.get_num_threads()
+    if threads < 2:
+        pytest.skip("this machine has one core")
+    clusters = bleeding(room[1])
+    by_all = refiner.refine(clusters, room[1])
+    numba.set_num_threads(1)
+    try:
+        assert same(by_all, refiner.refine(clusters, room[1]))
+    finally:
+        numba.set_num_threads(threads)
 
 
 def test_refiner_takes_no_clusters(refiner: ClusterRefiner, room: CornerRoom) -> None:

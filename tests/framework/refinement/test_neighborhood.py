@@ -12,7 +12,7 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import back_project, lift
-from framework.refinement.neighborhood import Neighborhoods, grouped, surroundings, thread_shares
+from framework.refinement.neighborhood import Neighborhoods, grouped, members, surroundings, thread_shares
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
 
@@ -51,6 +51,18 @@ def test_grouped_is_a_stable_sort(make):
     expected = np.argsort(cluster, kind="stable")[(cluster < 0).sum() :]
     np.testing.assert_array_equal(order, expected)
     np.testing.assert_array_equal(firsts, np.searchsorted(cluster[expected], np.arange(6)))
+
+
+@pytest.mark.parametrize("make", [np.asarray, np.sort])
+def test_the_members_of_sorted_clusters_are_found_without_an_index(make):
+    masks, frame = random_scene(0)
+    whole = clusters_of(masks, frame)
+    cluster = make(np.where(np.arange(len(whole.cluster)) % 7 == 0, -1, whole.cluster).astype(np.int32))
+    order, firsts = members(replace(whole, cluster=cluster))
+    expected, expected_firsts = grouped(cluster, len(whole))
+    assert isinstance(order, slice) == (make is np.sort)
+    np.testing.assert_array_equal(np.arange(len(cluster))[order], expected)
+    np.testing.assert_array_equal(firsts, expected_firsts)
 
 
 def test_threads_share_the_clusters_evenly():
