@@ -21,7 +21,7 @@ class BayesianTsdf(EvidenceFuser):
 
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
     instance_floor: float = 0.05  # in (0, 1): P(O = another instance); the matched one has the detection's score
-    absence: float = 0.3  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
+    absence: float = 0.7  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
 
     def __post_init__(self) -> None:
         super().__post_init__()
