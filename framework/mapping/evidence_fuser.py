@@ -91,7 +91,9 @@ class EvidenceFuser(InstanceFuser):
         matched[instance_ids] = True
         class_gain, named, bits = named_classes(self.class_evidence(clusters), self.logarithmic)
         compact = self.storage is Storage.COMPACT
-        units, most_gain = (self.units, MOST_GAIN) if compact else (self.units << EXACT_BITS, np.inf)
+        units = self.units if compact else self.units << EXACT_BITS
+        if compact and self.combine is Combine.SUM:
+            class_gain = np.clip(class_gain, -MOST_GAIN / units, MOST_GAIN / units)
         return Measurement(
             first_point=points.first,
             next_point=points.next,
@@ -100,7 +102,7 @@ class EvidenceFuser(InstanceFuser):
             instance_gain=self.instance_evidence(clusters),
             absence=np.float32(self.absence_evidence()),
             matched=matched,
-            class_gain=np.rint(np.clip(class_gain * units, -most_gain, most_gain)).astype(np.int64),
+            class_gain=np.rint(class_gain * units).astype(np.int64),
             named_classes=named,
             named_bit=bits,
             combine=int(self.combine),
