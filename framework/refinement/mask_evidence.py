@@ -10,10 +10,11 @@ from framework.refinement.neighborhood import Int64, Neighborhoods
 
 
 def mask_log_odds(around: Neighborhoods, largest: float, expected_bleed: float) -> Float32:
-    """(S,) log-odds of each point for the object: `largest` deep in the mask, as much against it in the ring.
+    """(S,) log-odds of each point for the object: `largest` a ring's width deep in the mask, as much against outside.
 
-    Between them runs a linear ramp, whose zero lies `expected_bleed` widths of the ring inside of the mask's border. A
-    mask too thin for the whole ramp gets a shorter one, so that its innermost points always speak for the object.
+    Between them runs a linear ramp, whose zero lies `expected_bleed` widths of the ring inside of the mask's border and
+    which ends 1 - 2 `expected_bleed` widths outside of it. A mask too thin for the whole ramp gets a shorter one, so
+    that its innermost points always speak for the object.
     """
     reach = np.maximum(np.minimum(around.ring_widths, around.mask_radii), 1).astype(np.float32)
     log_odds = np.empty(len(around.depth_in_mask), np.float32)

@@ -23,9 +23,10 @@ class GmmEm(ClusterRefiner):
     Eqs. [1] to [4] of the paper, once for each mask: object components start from the mask's points, background
     components from a ring of pixels around the mask, grouped by place; a uniform component takes outliers. The mask
     stays known after the start: a point deep inside has log-odds of `mask_log_odds` for the object, a point of the ring
-    as much against it, with a linear ramp between (our choice: without it the Gaussians of object and background
-    trade places in one mask of eight). Clusters only shrink: a dropped point leaves the arrays, clusters keep their
-    index. Clusters with fewer than `min_points` points, or with as few in their ring, are left as they are.
+    up to as much against it, with a linear ramp between (our choice: without it the Gaussians of object and background
+    trade places in one mask of eight). What an earlier refiner knows as `structure` is neither border nor ring.
+    Clusters only shrink: a dropped point leaves the arrays, clusters keep their index. Clusters with fewer than
+    `min_points` points, or with as few in their ring, are left as they are.
     """
 
     object_components: int = 3  # from 1; the visible faces of an object, which one Gaussian covers badly
