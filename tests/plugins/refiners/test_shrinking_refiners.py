@@ -75,7 +75,7 @@ def test_gmm_em_takes_the_bleeding_away(px):
     before = lifted(bleeding(ids == 1, px)[None], frame)
     recall, rejection = recall_and_rejection(GmmEm().refine(before, frame), before, ids)
     assert recall > 0.97
-    assert rejection > 0.95
+    assert rejection > (0.95 if px < 6 else 0.88)  # the mask is believed up to 4.8 px of bleeding: `expected_bleed`
     for other in (KMeans(), LargestComponent(), GmmEm(mask_log_odds=0.0)):
         other_recall, other_rejection = recall_and_rejection(other.refine(before, frame), before, ids)
         assert recall + rejection > other_recall + other_rejection, other
