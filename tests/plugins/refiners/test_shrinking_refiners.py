@@ -76,6 +76,10 @@ def test_gmm_em_takes_the_bleeding_away(px):
     recall, rejection = recall_and_rejection(GmmEm().refine(before, frame), before, ids)
     assert recall > 0.97
     assert rejection > (0.95 if px < 6 else 0.88)  # the mask is believed up to 4.8 px of bleeding: `expected_bleed`
+    doubting = GmmEm(object_components=2, mask_log_odds=2.0, expected_bleed=0.5).refine(before, frame)
+    doubting_recall, doubting_rejection = recall_and_rejection(doubting, before, ids)
+    assert doubting_recall > 0.97
+    assert doubting_rejection > 0.95, "a mask that is believed less lets the mixture take more away"
     for other in (KMeans(), LargestComponent(), GmmEm(mask_log_odds=0.0)):
         other_recall, other_rejection = recall_and_rejection(other.refine(before, frame), before, ids)
         assert recall + rejection > other_recall + other_rejection, other
