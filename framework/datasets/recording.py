@@ -27,8 +27,13 @@ log = logging.getLogger(__name__)
 class StoredImages(Protocol):
     """The two images of a frame, registered to each other and not read yet. Reading raises FrameError."""
 
-    color_name: Path | str  # for messages
-    depth_name: Path | str
+    @property
+    def color_name(self) -> Path | str:
+        """For messages: the file, and where in it."""
+
+    @property
+    def depth_name(self) -> Path | str:
+        """Likewise."""
 
     def color(self) -> UInt8:
         """(H, W, 3) RGB."""
