@@ -143,7 +143,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
         raise DataError(f"{mesh}: expected a vertex property `label` of whole numbers, found {sorted(ply.properties)}")
-    if len(labels) and not (0 <= int(labels.min()) and int(labels.max()) <= MOST_ID):
+    if len(labels) and (labels.min() < 0 or labels.max() > MOST_ID):
         raise DataError(f"{mesh}: a label must be in [0, {MOST_ID}], found {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
