@@ -1,4 +1,4 @@
-"""The map's surface as a binary PLY file."""
+"""The map's surface as a binary PLY file, written and read back."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import numpy as np
 
 from framework.atomic_files import written_whole
 from framework.data import InstanceMesh
+from framework.errors import DataError
+from framework.ply import read_ply
 
 _VERTEX = np.dtype(
     [
@@ -18,6 +20,7 @@ _VERTEX = np.dtype(
     ]
 )
 _FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
+_CLASSES = "classes "  # begins the comment that names the classes
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
@@ -40,7 +43,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
             "ply",
             "format binary_little_endian 1.0",
             "comment InstanceMap; metres; instance 0 = none; class -1 = none, else an index into:",
-            f"comment classes {','.join(mesh.classes)}",
+            f"comment {_CLASSES}{','.join(mesh.classes)}",
             f"element vertex {len(vertices)}",
             *(f"property float {axis}" for axis in ("x", "y", "z")),
             *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
@@ -55,3 +58,26 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
         file.write(header.encode("ascii", "replace"))
         vertices.tofile(file)
         faces.tofile(file)
+
+
+def read_mesh(path: Path) -> InstanceMesh:
+    """The mesh that `write_mesh` wrote, to the bit. Raises DataError, naming the file, for anything else."""
+    ply = read_ply(path)
+    columns = {}
+    for name in _VERTEX.names or ():
+        if name in "xyz":
+            continue
+        if name not in ply.properties or ply.properties[name].dtype != _VERTEX[name]:
+            raise DataError(f"{path} is no mesh of a run: expected {_VERTEX[name]} {name} of each vertex")
+        columns[name] = ply.properties[name]
+    listed = [comment.removeprefix(_CLASSES) for comment in ply.comments if comment.startswith(_CLASSES)]
+    if len(listed) != 1:
+        raise DataError(f"{path} is no mesh of a run: expected one line 'comment {_CLASSES}...', found {len(listed)}")
+    return InstanceMesh(
+        vertices=ply.vertices,
+        triangles=ply.triangles,
+        colors=np.stack([columns[channel] for channel in ("red", "green", "blue")], axis=1),
+        instance_ids=columns["instance"],
+        class_ids=columns["class"],
+        classes=tuple(listed[0].split(",")) if listed[0] else (),
+    )

@@ -20,9 +20,10 @@ from framework.interfaces import SceneMap
 from framework.journal import RunResult
 from framework.pipeline import Pipeline
 from framework.reports import provenance, run_record
+from framework.reports.instances_file import write_instances
 from framework.reports.mesh_file import write_mesh
 from framework.reports.metrics import pose_source, run_metrics
-from framework.reports.run_record import RunRecord, headline, write_instances
+from framework.reports.run_record import RunRecord, headline
 from framework.trajectory_file import read_tum
 from tests.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
 
