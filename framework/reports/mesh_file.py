@@ -35,7 +35,7 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
 
 
 def read_mesh(path: Path) -> InstanceMesh:
-    """The mesh that `write_mesh` wrote, to the bit. Raises DataError, naming the file, for anything else."""
+    """The mesh that `write_mesh` wrote, exactly. Raises DataError, naming the file, for anything else."""
     ply = read_ply(path)
     for name, kind in TYPES.items():
         if name not in ply.properties or ply.properties[name].dtype != kind:
