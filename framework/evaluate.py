@@ -77,9 +77,10 @@ def told(found: Reevaluation, transfer: Transfer) -> str:
     prefix = "instances." if transfer is Transfer.TO_TRUTH else f"instances.{transfer.value}."
     shown = [key for key in (*(prefix + name for name in MAIN_FIGURES), "annotation_release") if key in changed]
     parts = [f"{head(key)} {_step(*changed[key])}" for key in shown]
-    parts += [
-        f"{count} {word}" for count, word in ((len(changed) - len(shown), "others"), (len(added), "new")) if count
-    ]
+    if others := len(changed) - len(shown):
+        parts.append(f"{others} other{'s' * (others > 1)}")
+    if added:
+        parts.append(f"{len(added)} new")
     return ", ".join(parts) or "unchanged"
 
 

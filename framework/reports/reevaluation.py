@@ -35,7 +35,8 @@ class Truth:
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Truth:
         """From a run's config. Raises InstanceMapError when the dataset cannot be built or read."""
-        sequence = build(RGBDSequence, OmegaConf.create(dict(config)).get("dataset"))
+        node = OmegaConf.create(dict(config)).get("dataset")
+        sequence = build(RGBDSequence, node)  # type: ignore[type-abstract]
         return cls(sequence.scene_truth(), sequence.annotation)
 
 

@@ -100,7 +100,7 @@ def test_figures_of_other_code_are_replaced_and_all_others_kept(stored: Path, co
     write_metrics(stored, old)
     status, out, err = command(stored)
     assert (status, err) == (0, "")
-    assert out == f"{stored}: AP50 0.125 -> 1.000, annotation_release first -> not known, 1 others, 5 new\n"
+    assert out == f"{stored}: AP50 0.125 -> 1.000, annotation_release first -> not known, 1 other, 5 new\n"
     assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
 
 
@@ -108,7 +108,7 @@ def test_the_figures_of_the_other_transfer_can_be_printed(stored: Path, command)
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
     assert command(stored, "--transfer", "to_map", "--dry-run")[1].startswith(
-        f"{stored}: instances.to_map.ap25 0.250 -> {true['instances.to_map.ap25']:.3f}, 1 others"
+        f"{stored}: instances.to_map.ap25 0.250 -> {true['instances.to_map.ap25']:.3f}, 1 other"
     )
 
 
@@ -235,7 +235,7 @@ def test_a_run_without_truth_stays_as_it_is(stored: Path, command) -> None:
     _with_dataset(stored, truth=False)
     before = (stored / "metrics.json").read_bytes()
     assert command(stored) == (0, f"{stored}: unchanged\n", "")
-    assert json.loads(before) == metrics_of(stored)
+    assert (stored / "metrics.json").read_bytes() == before
 
 
 def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
