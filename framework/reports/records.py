@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -40,6 +41,11 @@ class Record:
     @property
     def commit(self) -> str:
         return commit_of(self.metrics)
+
+    @property
+    def annotation(self) -> str:
+        """Which release of the true instances the run was compared with; "" = the dataset does not say."""
+        return str(self.metrics.get("annotation_release") or "")
 
 
 @dataclass(frozen=True)
@@ -126,6 +132,12 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold keys and values, found a list")
     return {str(key): value for key, value in content.items()}
+
+
+def digest(records: Sequence[Record]) -> str:
+    """One short hash of the configs of several runs, whatever their order."""
+    hashes = sorted(str(record.metrics["config_hash"]) for record in records)
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -13,8 +13,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError
+from framework.reports.layouts import head
 from framework.reports.provenance import config_hash
-from framework.reports.tables import head, write_tables
+from framework.reports.tables import write_tables
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 TABLE = {"over": ["seed"], "base": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
