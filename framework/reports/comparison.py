@@ -46,7 +46,7 @@ class TableChoice:
                 raise ConfigError(f"table.{name} must name at least one key")
         if self.across and self.by:
             raise ConfigError(
-                f"only one of table.across={self.across} and table.by={self.by} can be, the other is null"
+                f"table.across={self.across} and table.by={self.by} are two layouts: one of them must be null"
             )
         if self.apart in self.over:
             raise ConfigError(f"table.over has {self.apart}, whose values table.{self.layout} shows one by one")

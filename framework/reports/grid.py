@@ -14,7 +14,7 @@ class Grid:
     heads: list[str]
     body: list[list[str]]
     words: int = 1  # how many columns, from the left, hold words; the others hold figures
-    bold: frozenset[tuple[int, int]] = frozenset()  # (line, column) of the best figures
+    bold: frozenset[tuple[int, int]] = frozenset()  # (line, column)
     groups: frozenset[int] = frozenset()  # lines that begin another group than the line above
 
 
@@ -26,7 +26,7 @@ def decimals(values: Iterable[float]) -> int:
 
 def figure(value: float, spread: float, places: int, signed: bool = False) -> str:
     """Value ± spread, the spread only where it is known."""
-    text = f"{value:{'+' if signed else ''}.{places}f}"
+    text = f"{round(value, places) + 0.0:{'+' if signed else ''}.{places}f}"  # + 0.0: no -0.000
     return text if math.isnan(spread) else f"{text} ± {spread:.{places}f}"
 
 

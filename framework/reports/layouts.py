@@ -109,4 +109,4 @@ def published_cell(published: PublishedRow, key: Key, places: int) -> str:
     value = published.values.get(key, math.nan)
     if value is None:
         return NOT_KNOWN
-    return NOTHING if math.isnan(value) else figure(value, math.nan, places)
+    return NOTHING if math.isnan(value) else figure(value, math.nan, min(places, published.decimals))

@@ -26,6 +26,7 @@ class PublishedRow:
     source: str
     remark: str  # how the numbers were come by, and what they are not
     poses: str
+    decimals: int  # of the values, in our unit
     values: Mapping[Key, float | None] | None  # in our unit; None = nobody has looked it up, or none of all
 
     def has(self, sequence: str) -> bool:
@@ -58,6 +59,7 @@ def read_published(section: str) -> Published:
             source=row["source"],
             remark=row.get("remark", ""),
             poses=row.get("poses", NOT_KNOWN),
+            decimals=node["decimals"],
             values=None if row["values"] is None else dict(_leaves(row["values"], node["scale"])),
         )
         for row in node["rows"]

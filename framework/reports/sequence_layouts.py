@@ -1,6 +1,6 @@
 """How a comparison over sequences is laid out: a column for each sequence, or a group of lines for each.
 
-Lines of the same poses stand together, and the best figure among them is in bold.
+Lines of the same poses stand together, and the highest figure among them is in bold.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ MISSING = "missing"  # a figure that a run would have, of which there is no comp
 class _Line:
     words: list[str]
     cells: list[str]
-    variant: tuple[str, ...] | None = None  # lines that share it compete for the best; None = competes with none
+    variant: tuple[str, ...] | None = None  # lines that share it compete for the highest; None = competes with none
     figures: Sequence[float] = ()  # for each cell; NaN = does not compete
 
 
@@ -33,7 +33,6 @@ def across_grid(comparison: Comparison) -> Grid:
     sequences, seeds = comparison.sequences, _seeds(comparison)
     means = {row.name: mean_by_sequence(row.values(key)) for row in comparison.rows}
     overall = {row.name: mean_over_sequences(row.values(key)) for row in comparison.rows}
-    most = max(mean.count for mean in overall.values())
     places = decimals(mean.value for found in means.values() for mean in found.values())
     sections = [
         [
@@ -44,7 +43,7 @@ def across_grid(comparison: Comparison) -> Grid:
                     _mean_cell(overall[row.name], len(sequences), places),
                 ],
                 row.variant,
-                [*(_value(means[row.name], s) for s in sequences), _comparable(overall[row.name], most)],
+                [*(_value(means[row.name], s) for s in sequences), _comparable(row, rows, overall)],
             )
             for row in rows
         ]
@@ -67,19 +66,19 @@ def by_grid(comparison: Comparison) -> Grid:
     """A group of lines a sequence, each line a row with all of its figures; the last group are their means."""
     keys, seeds = comparison.choice.columns, _seeds(comparison)
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
-    means = {(row.name, key): mean_by_sequence(row.values(key)) for row in rows for key in keys}
-    overall = {(row.name, key): mean_over_sequences(row.values(key)) for row in rows for key in keys}
-    most = {key: max(overall[row.name, key].count for row in rows) for key in keys}
-    places = decimals(mean.value for found in means.values() for mean in found.values())
+    means = {key: {row.name: mean_by_sequence(row.values(key)) for row in rows} for key in keys}
+    overall = {key: {row.name: mean_over_sequences(row.values(key)) for row in rows} for key in keys}
+    most = {key: max(mean.count for mean in overall[key].values()) for key in keys}
+    places = decimals(mean.value for rows_of in means.values() for found in rows_of.values() for mean in found.values())
     begun = {run[-1] for row in rows for run in row.records}
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
         sections[sequence] = [
             _Line(
                 _words(comparison, row),
-                [_cell(row, means[row.name, key], sequence, seeds, places) for key in keys],
+                [_cell(row, means[key][row.name], sequence, seeds, places) for key in keys],
                 row.variant,
-                [_value(means[row.name, key], sequence) for key in keys],
+                [_value(means[key][row.name], sequence) for key in keys],
             )
             for row in (rows if sequence in begun else ())
         ] + [
@@ -90,9 +89,9 @@ def by_grid(comparison: Comparison) -> Grid:
     sections["mean"] = [
         _Line(
             _words(comparison, row),
-            [_mean_cell(overall[row.name, key], most[key], places) for key in keys],
+            [_mean_cell(overall[key][row.name], most[key], places) for key in keys],
             row.variant,
-            [_comparable(overall[row.name, key], most[key]) for key in keys],
+            [_comparable(row, rows, overall[key]) for key in keys],
         )
         for row in rows
     ] + [
@@ -132,15 +131,16 @@ def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], places: int) ->
     bold: set[tuple[int, int]] = set()
     groups: set[int] = set()
     for section in sections:
-        groups.add(len(lines))
-        bold |= {(len(lines) + k, len(line.words) + column) for k, line, column in _best(section, places)}
+        if lines:
+            groups.add(len(lines))
+        bold |= {(len(lines) + k, len(line.words) + column) for k, line, column in _highest(section, places)}
         lines += section
     words = len(lines[0].words)
     return Grid(heads, [[*line.words, *line.cells] for line in lines], words, frozenset(bold), frozenset(groups))
 
 
-def _best(section: Sequence[_Line], places: int) -> Iterable[tuple[int, _Line, int]]:
-    """(place, line, column) of the figures that no rival's exceeds as it is printed; without a rival none is best."""
+def _highest(section: Sequence[_Line], places: int) -> Iterable[tuple[int, _Line, int]]:
+    """(place, line, column) of the figures that no rival's exceeds as it is printed; without a rival there is none."""
     for k, line in enumerate(section):
         if line.variant is None:
             continue
@@ -172,9 +172,10 @@ def _value(means: Mapping[str, Mean], sequence: str) -> float:
     return means[sequence].value if sequence in means else math.nan
 
 
-def _comparable(mean: SequenceMean, most: int) -> float:
-    """NaN for the mean of fewer sequences than others have."""
-    return mean.value if mean.count == most else math.nan
+def _comparable(row: Row, rows: Sequence[Row], means: Mapping[str, SequenceMean]) -> float:
+    """A row's mean; NaN for that of fewer sequences than a row has that it competes with."""
+    most = max(means[other.name].count for other in rows if other.variant == row.variant)
+    return means[row.name].value if means[row.name].count == most else math.nan
 
 
 def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, places: int) -> str:

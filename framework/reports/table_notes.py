@@ -36,7 +36,7 @@ def _averaging(comparison: Comparison) -> Iterator[str]:
         yield (
             f"Mean ± sample standard deviation over {over}, where there are several. The mean is over the sequences "
             f"({choice.apart}), each of which counts as one; its deviation is over the runs that have all of them. "
-            "In bold: the best of the same poses. missing: no complete run."
+            "In bold: the highest of the same poses. missing: no complete run."
         )
     else:
         yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
@@ -77,11 +77,11 @@ def _protocol(comparison: Comparison) -> Iterator[str]:
     if comparison.choice.apart:
         told = counted(record.annotation or "not told by the dataset" for record in comparison.records)
         yield f"Annotation release: {told}."
-    near = f"the nearest within {MAX_DISTANCE * 100:.0f} cm"
+    near = f"within {MAX_DISTANCE * 100:.0f} cm"
     if False in kinds:
-        yield f"Transfer: each true vertex takes the instance of the map's vertex {near}; AP in [0, 1]."
+        yield f"Transfer: each true vertex takes the instance of the map's nearest vertex {near}. AP is in [0, 1]."
     if True in kinds:
-        yield f"Transfer of to_map: each of the map's vertices takes the instance of the true vertex {near}."
+        yield f"Transfer of to_map: each vertex of the map takes the instance of the nearest true vertex {near}."
 
 
 def _published(comparison: Comparison) -> Iterator[str]:
@@ -122,7 +122,9 @@ def _same(records: Sequence[Record]) -> str:
 
 
 def _machine(record: Record) -> str:
-    return f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
+    cores = f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
+    threads = record.config.get("threads")
+    return f"{cores}, threads={threads}" if threads else cores
 
 
 def counted(words: Iterable[str]) -> str:

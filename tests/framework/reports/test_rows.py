@@ -115,6 +115,26 @@ def test_an_experiments_row_is_split_where_the_command_line_changed_more() -> No
     assert list(names(records, "b", "a")) == split
 
 
+def test_rows_that_differ_in_what_no_row_changes_are_told_apart() -> None:
+    """One row was tracked and the other was not: that is no difference between the rows, and is in their names."""
+    records = [
+        record({"row": "a", "seed": 0}, tracker="icp", fuser="bayes"),
+        record({"row": "b", "seed": 0}, tracker="given", fuser="count"),
+    ]
+    changes = {"a": [], "b": ["+fuser=count", "fuser@fuser.inner=x", "fuser.voxel=1"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, tracker=icp", "b, tracker=given"]
+    changes["b"].append("tracker=given")
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
+
+
+def test_a_row_tells_its_poses_in_words() -> None:
+    given = record({}, tracker="ground_truth")
+    given = Record(given.directory, {**given.metrics, "pose_source": "ground_truth"}, {}, 0.0)
+    assert Row("a", {("0",): given}).poses == "ground truth"
+    tracked = {(str(seed),): record({}, tracker=name) for seed, name in enumerate(("pnp", "icp", "icp"))}
+    assert Row("b", tracked).poses == "tracked (icp/pnp)"
+
+
 def test_rows_can_be_averaged_over_anything() -> None:
     records = [record({"seed": seed, "dataset": {"scene": scene}}) for seed in (0, 1) for scene in "xy"]
     assert names(records, over=("dataset.scene",)) == {"seed=0": [("x",), ("y",)], "seed=1": [("x",), ("y",)]}
