@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import logging
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,12 +131,6 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold keys and values, found a list")
     return {str(key): value for key, value in content.items()}
-
-
-def digest(records: Sequence[Record]) -> str:
-    """One short hash of the configs of several runs, whatever their order."""
-    hashes = sorted(str(record.metrics["config_hash"]) for record in records)
-    return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]
 
 
 def _read_json(path: Path) -> dict[str, Any]:

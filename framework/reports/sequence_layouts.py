@@ -68,8 +68,8 @@ def by_grid(comparison: Comparison) -> Grid:
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
     means = {key: {row.name: mean_by_sequence(row.values(key)) for row in rows} for key in keys}
     overall = {key: {row.name: mean_over_sequences(row.values(key)) for row in rows} for key in keys}
-    most = {key: max(mean.count for mean in overall[key].values()) for key in keys}
-    places = decimals(mean.value for rows_of in means.values() for found in rows_of.values() for mean in found.values())
+    found_in = {key: len({sequence for found in means[key].values() for sequence in found}) for key in keys}
+    places = decimals(mean.value for of_key in means.values() for found in of_key.values() for mean in found.values())
     begun = {run[-1] for row in rows for run in row.records}
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
@@ -89,7 +89,7 @@ def by_grid(comparison: Comparison) -> Grid:
     sections["mean"] = [
         _Line(
             _words(comparison, row),
-            [_mean_cell(overall[key][row.name], most[key], places) for key in keys],
+            [_mean_cell(overall[key][row.name], found_in[key], places) for key in keys],
             row.variant,
             [_comparable(row, rows, overall[key]) for key in keys],
         )

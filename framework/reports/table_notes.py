@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from framework.build import STAGES
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.reports.comparison import Comparison
-from framework.reports.records import Record, digest
+from framework.reports.records import Record
 from framework.reports.rows import CHOICE, CONFIDENCE, Run
 from framework.reports.sequences import mean_by_sequence
 
@@ -133,3 +134,9 @@ def counted(words: Iterable[str]) -> str:
     if len(counts) == 1:
         return counts[0][0]
     return ", ".join(f"{word} ({count} run{'s' * (count > 1)})" for word, count in counts)
+
+
+def digest(records: Sequence[Record]) -> str:
+    """One short hash of the configs of several runs, whatever their order."""
+    hashes = sorted(str(record.metrics["config_hash"]) for record in records)
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

@@ -12,10 +12,9 @@ from framework.atomic_files import written_whole
 from framework.reports.comparison import Comparison
 from framework.reports.grid import Grid, latex_grid, markdown_grid
 from framework.reports.layouts import difference_grid, row_grid
-from framework.reports.records import digest
 from framework.reports.rows import Mean
 from framework.reports.sequence_layouts import across_grid, by_grid, difference_across_grid
-from framework.reports.table_notes import counted, notes
+from framework.reports.table_notes import counted, digest, notes
 
 
 def write_tables(directory: Path) -> str:

@@ -127,6 +127,12 @@ def test_rows_that_differ_in_what_no_row_changes_are_told_apart() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
 
 
+def test_rows_of_other_data_are_told_apart_though_each_has_but_one() -> None:
+    records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}", "stride": 1}}) for row in "ab"]
+    changes = {"a": [], "b": ["dataset.stride=2"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
+
+
 def test_a_row_tells_its_poses_in_words() -> None:
     given = record({}, tracker="ground_truth")
     given = Record(given.directory, {**given.metrics, "pose_source": "ground_truth"}, {}, 0.0)

@@ -210,6 +210,19 @@ def test_the_papers_table_2_in_groups(sweep: Path) -> None:
     assert second[2] == "| Rival (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
 
+def test_the_highest_mean_is_among_those_of_as_many_sequences(sweep: Path) -> None:
+    """The tracked row with the most sequences has fewer than those with given poses, and wins all the same."""
+    experiment(sweep, BY)
+    for row, scene, value in (("ours", "011", 0.2), ("rival", "011", 0.3), ("other", "078", 0.9), ("ours", "016", 0.2)):
+        run(sweep, row, scene, 0, tracker="icp", **{AP50: value})
+    run(sweep, "rival", "016", 0, tracker="icp", **{AP50: 0.1})
+    first, _ = grids(write_tables(sweep))
+    cells = {tuple(line.split(" | ")[1:3]): line.split(" | ")[-1] for line in first[-6:]}
+    assert cells["ours", "tracked (icp)"] == "**0.200 (2 of 3)** |"
+    assert cells["Rival (re-implementation)", "tracked (icp)"] == "**0.200 (2 of 3)** |"
+    assert cells["other", "tracked (icp)"] == "0.900 (1 of 3) |"
+
+
 def test_published_numbers_stand_in_their_sequences_group(sweep: Path) -> None:
     experiment(sweep, BY | {"published": "table2"})
     first, _ = grids(write_tables(sweep))
