@@ -216,6 +216,7 @@ def test_the_highest_mean_is_among_those_of_as_many_sequences(sweep: Path) -> No
     for row, scene, value in (("ours", "011", 0.2), ("rival", "011", 0.3), ("other", "078", 0.9), ("ours", "016", 0.2)):
         run(sweep, row, scene, 0, tracker="icp", **{AP50: value})
     run(sweep, "rival", "016", 0, tracker="icp", **{AP50: 0.1})
+    run(sweep, "ours", "078", 0, **{AP50: 0.9})
     first, _ = grids(write_tables(sweep))
     cells = {tuple(line.split(" | ")[1:3]): line.split(" | ")[-1] for line in first[-6:]}
     assert cells["ours", "tracked (icp)"] == "**0.200 (2 of 3)** |"
