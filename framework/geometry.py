@@ -7,9 +7,12 @@ import math
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
+from scipy.spatial.transform import Rotation
 
 from framework.data import Bool, Camera, Detections, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
+
+PRINTED_ROTATION_TOLERANCE = 1e-2  # largest entry of |R R^T - I| that is rounding of a published matrix, not a fault
 
 
 def inverse(T_a_b: Float64) -> Float64:
@@ -61,6 +64,33 @@ def nearest_rotation(R: Float64) -> Float64:
     """The rotation nearest to a (3, 3) matrix in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def nearest_rigid(matrix: Float64) -> Float64:
+    """The rigid motion that a published (4, 4) matrix means: its rotation's rounding errors are removed.
+
+    Raises DataError, which only says why, when it is none up to PRINTED_ROTATION_TOLERANCE.
+    """
+    if not np.isfinite(matrix).all():
+        raise DataError("the pose is not finite")
+    if not np.allclose(matrix[3], (0, 0, 0, 1), atol=PRINTED_ROTATION_TOLERANCE):
+        raise DataError(f"the last row must be 0 0 0 1, found {' '.join(f'{value:.4g}' for value in matrix[3])}")
+    R = matrix[:3, :3]
+    error, det = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
+    if error > PRINTED_ROTATION_TOLERANCE or det < 0:
+        raise DataError(f"the pose is not a rigid motion: |R R^T - I| is {error:.2g}, det R {det:.2g}")
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = nearest_rotation(R), matrix[:3, 3]
+    return T
+
+
+def interpolate(T_world_a: Float64, T_world_b: Float64, share: float) -> Float64:
+    """The pose (4, 4) a `share` in [0, 1] of the way from a to b: evenly along a line and about one axis (slerp)."""
+    R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
+    T = np.eye(4)
+    T[:3, :3] = R_a @ Rotation.from_rotvec(share * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()
+    T[:3, 3] = (1 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
+    return T
 
 
 def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:
