@@ -76,8 +76,9 @@ def nearest_rigid(matrix: Float64) -> Float64:
     if not np.allclose(matrix[3], (0, 0, 0, 1), atol=PRINTED_ROTATION_TOLERANCE):
         raise DataError(f"the last row must be 0 0 0 1, found {' '.join(f'{value:.4g}' for value in matrix[3])}")
     R = matrix[:3, :3]
-    error, det = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
-    if error > PRINTED_ROTATION_TOLERANCE or det < 0:
+    with np.errstate(all="ignore"):  # numbers of any size come from files
+        error, det = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
+    if not (error <= PRINTED_ROTATION_TOLERANCE and det > 0):
         raise DataError(f"the pose is not a rigid motion: |R R^T - I| is {error:.2g}, det R {det:.2g}")
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = nearest_rotation(R), matrix[:3, 3]

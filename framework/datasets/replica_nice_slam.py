@@ -1,9 +1,11 @@
 """Replica as NICE-SLAM distributes it (Straub et al., 2019; Zhu et al., CVPR 2022): renders of eight scanned rooms.
 
-cam_params.json                     of all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
-room0/results/frame000000.jpg       8-bit colour, from 0
-room0/results/depth000000.png       uint16 along z, `scale` units a metre
-room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
+    cam_params.json                     of all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
+    room0/results/frame000000.jpg       8-bit colour, from 0
+    room0/results/depth000000.png       uint16 along z, `scale` units a metre
+    room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
+
+The camera's axes are x right, y down, z forward: NICE-SLAM turns them for its own use when it reads them.
 """
 
 from __future__ import annotations
@@ -22,10 +24,7 @@ CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
 @dataclass
 class ReplicaNiceSlam(Recording):
-    """A scene of Replica in NICE-SLAM's layout. It has exact depth and poses, and no instances.
-
-    The camera's axes are x right, y down, z forward: NICE-SLAM turns them for its own use when it reads them.
-    """
+    """A scene of Replica in NICE-SLAM's layout: exact depth and poses, and no instances."""
 
     def open(self) -> Contents:
         path = self.folder.parent / "cam_params.json"

@@ -30,7 +30,7 @@ DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published
 COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
 BASELINE = 0.025  # m; the colour camera stands this far along the depth camera's x axis
 
-_IMAGE_NAME = re.compile(r"frame-(\d{6})\.(color|depth)\.png")
+_IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
 
 
 @dataclass(frozen=True)

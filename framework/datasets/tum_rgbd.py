@@ -179,6 +179,6 @@ def _listed(path: Path, number: int, line: str) -> ListedImage:
         timestamp = float(words[0])
     except ValueError:
         timestamp = math.nan
-    if len(words) < 2 or not math.isfinite(timestamp):
+    if len(words) < 2 or not math.isfinite(timestamp) or "\0" in line:
         raise DataError(f"{path}, line {number}: expected `timestamp filename`, found {line.strip()!r}")
     return ListedImage(timestamp, path.parent / words[1].strip())
