@@ -12,7 +12,8 @@ from scipy.spatial.transform import Rotation
 from framework.data import Bool, Camera, Detections, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
 
-PRINTED_ROTATION_TOLERANCE = 1e-2  # largest entry of |R R^T - I| that is rounding of a published matrix, not a fault
+RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| that is rounding of a published matrix, not a fault
+EXACT_WITHIN = 1e-12  # such a rotation is as exact as float64 writes it, and stays as it is
 
 
 def inverse(T_a_b: Float64) -> Float64:
@@ -67,21 +68,22 @@ def nearest_rotation(R: Float64) -> Float64:
 
 
 def nearest_rigid(matrix: Float64) -> Float64:
-    """The rigid motion that a published (4, 4) matrix means: its rotation's rounding errors are removed.
+    """The rigid motion that a published (4, 4) matrix means: without its rotation's rounding errors.
 
-    Raises DataError, which only says why, when it is none up to PRINTED_ROTATION_TOLERANCE.
+    Raises DataError, which only says why, when it means none.
     """
     if not np.isfinite(matrix).all():
         raise DataError("the pose is not finite")
-    if not np.allclose(matrix[3], (0, 0, 0, 1), atol=PRINTED_ROTATION_TOLERANCE):
-        raise DataError(f"the last row must be 0 0 0 1, found {' '.join(f'{value:.4g}' for value in matrix[3])}")
+    if not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise DataError("the last row of the pose is not 0 0 0 1")
     R = matrix[:3, :3]
     with np.errstate(all="ignore"):  # numbers of any size come from files
-        error, det = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
-    if not (error <= PRINTED_ROTATION_TOLERANCE and det > 0):
-        raise DataError(f"the pose is not a rigid motion: |R R^T - I| is {error:.2g}, det R {det:.2g}")
+        error, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
+    if not (error <= RIGID_WITHIN and determinant > 0):
+        raise DataError(f"the pose is not rigid: |R R^T - I| is {error:.2g}, det R {determinant:.2g}")
     T = np.eye(4)
-    T[:3, :3], T[:3, 3] = nearest_rotation(R), matrix[:3, 3]
+    T[:3, :3] = R if error <= EXACT_WITHIN else nearest_rotation(R)
+    T[:3, 3] = matrix[:3, 3]
     return T
 
 

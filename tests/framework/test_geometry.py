@@ -152,15 +152,20 @@ def test_nearest_rigid_removes_the_rounding_of_a_published_pose(xi: np.ndarray, 
     np.testing.assert_array_equal(repaired[:, 3], T[:, 3])
 
 
+def test_nearest_rigid_keeps_an_exact_pose_to_the_last_bit() -> None:
+    T = geometry.exp_se3(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
+    np.testing.assert_array_equal(geometry.nearest_rigid(T), T)
+
+
 @pytest.mark.parametrize(
     ("matrix", "why"),
     [
         (np.diag([1.0, 1.0, -1.0, 1.0]), "det R -1"),
-        (np.diag([1.0, 1.01, 1.0, 1.0]), "not a rigid motion"),
+        (np.diag([1.0, 1.01, 1.0, 1.0]), "not rigid"),
         (np.zeros((4, 4)), "last row"),
         (np.diag([1.0, 1.0, 1.0, -1.0]), "last row"),
         (np.full((4, 4), np.inf), "not finite"),
-        (np.where(np.eye(4, dtype=bool), 1.0, [[1e200], [-1e200], [1e200], [0.0]]), "not a rigid motion"),
+        (np.array([[1e200, -1e200, 0, 0], [1e200, 1e200, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "not rigid"),
     ],
 )
 def test_nearest_rigid_refuses_what_is_no_pose(matrix: np.ndarray, why: str) -> None:

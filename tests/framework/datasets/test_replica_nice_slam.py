@@ -78,7 +78,7 @@ def test_a_pose_that_is_none_is_the_fault_of_its_frame(root: Path) -> None:
     stretched = pose_at(1)
     stretched[0] *= 1.1
     write_poses(root / "room0", [pose_at(0), stretched, pose_at(2)])
-    assert "traj.txt, line 2: the pose is not a rigid motion" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    assert "traj.txt, line 2: the pose is not rigid" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
     write_poses(root / "room0", [pose_at(0), np.full((4, 4), np.nan), pose_at(2)])
     assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 

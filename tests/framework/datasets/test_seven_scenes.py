@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
     assert (frame.color == (80, 100, 200)).all()
-    assert set(np.unique(frame.depth)) == {0, 2}  # the colour camera sees a border that the depth camera does not
+    assert set(np.unique(frame.depth)) == {0, 2}  # the border, which the depth camera does not see
     assert (frame.depth > 0).mean() == pytest.approx((529 / 585) ** 2, abs=0.02)
     T_depthcamera_camera = inverse(pose_at(2)) @ frame.T_world_camera
     np.testing.assert_allclose(T_depthcamera_camera[:3, :3], np.eye(3), atol=1e-6)
@@ -64,9 +65,11 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
 def test_it_runs_through_the_pipeline(folder: Path) -> None:
     """The wall that each depth camera has 2 m before it is mapped where that camera saw it."""
     root = folder.parents[1]
-    result, points_world = mapped(opened("seven_scenes", f"dataset.root={root}", "dataset.scene=chess/seq-01"))
-    assert (result.frames, result.frames_skipped) == (FRAMES, 0)
-    for k, points in enumerate(np.split(points_world, FRAMES)):
+    result, points_world = mapped(
+        opened("seven_scenes", f"dataset.root={root}", "dataset.scene=chess/seq-01", "dataset.stop=2")
+    )
+    assert (result.frames, result.frames_skipped) == (2, 0)
+    for k, points in enumerate(np.split(points_world, 2)):
         z = transform(inverse(pose_at(k)), points.astype(np.float64))[:, 2]
         seen = np.abs(z) > 1e-5  # what has no reading is mapped at the camera itself by the tests' fuser
         assert seen.mean() > 0.7
@@ -125,18 +128,15 @@ def test_rounded_rotations_are_made_rigid(folder: Path) -> None:
         ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, found 3"),
         ("1 0 0 0\n0 one 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers: .*'one'"),
         ("1 0 0 0\n0 1 0 0\n0 0 nan 0\n0 0 0 1\n", "pose.txt: the pose is not finite"),
-        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: the pose is not a rigid motion"),
-        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: the pose is not a rigid motion"),
-        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: the last row must be 0 0 0 1"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: the pose is not rigid"),
+        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: the pose is not rigid"),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: the last row of the pose is not 0 0 0 1"),
     ],
 )
 def test_a_pose_that_is_none_is_the_fault_of_its_frame(folder: Path, text: str | None, message: str) -> None:
     path = folder / "frame-000001.pose.txt"
     path.unlink() if text is None else path.write_text(text)
-    found = fault_of(SevenScenes(folder), 1)
-    assert "frame-000001" in found
-    with pytest.raises(AssertionError, match=message):
-        raise AssertionError(found)
+    assert re.search(rf"frame-000001\.{message}", fault_of(SevenScenes(folder), 1))
 
 
 @pytest.mark.parametrize("name", ["color", "depth"])
@@ -150,14 +150,9 @@ def test_a_folder_without_frames_says_how_a_scene_is_named(folder: Path) -> None
         SevenScenes(folder.parents[1], scene="chess")
 
 
-@pytest.mark.parametrize("name", ["color", "depth"])
-def test_images_of_another_size(folder: Path, name: str) -> None:
-    write = {
-        "color": lambda path: write_color(path, (1, 2, 3), (240, 320)),
-        "depth": lambda path: write_depth(path, 1, (240, 320)),
-    }
-    write[name](folder / f"frame-000001.{name}.png")
+def test_images_of_another_size(folder: Path) -> None:
+    write_color(folder / "frame-000001.color.png", (1, 2, 3), (240, 320))
     assert "is 320x240, but the camera of 7-Scenes says 640x480" in fault_of(SevenScenes(folder), 1)
-    write[name](folder / f"frame-000000.{name}.png")
-    with pytest.raises(DataError, match="is 320x240"):
+    write_depth(folder / "frame-000000.depth.png", 1, (240, 320))
+    with pytest.raises(DataError, match=r"frame-000000\.depth\.png is 320x240"):
         SevenScenes(folder)

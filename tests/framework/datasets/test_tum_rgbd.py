@@ -61,12 +61,13 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
 
 
 def test_it_runs_through_the_pipeline(folder: Path) -> None:
-    result, points_world = mapped(opened("tum_rgbd", f"dataset.root={folder.parent}", f"dataset.scene={folder.name}"))
-    assert (result.frames, result.frames_skipped, result.frames_lost) == (FRAMES, 0, 0)
+    places = f"dataset.root={folder.parent}", f"dataset.scene={folder.name}"
+    result, points_world = mapped(opened("tum_rgbd", *places, "dataset.stop=2"))
+    assert (result.frames, result.frames_skipped, result.frames_lost) == (2, 0, 0)
     np.testing.assert_allclose(points_world[:, 2], 2, atol=1e-6)
     # the first pixel of each frame lies left of the camera, which walks along x
     lefts = points_world[:: 640 * 480, 0]
-    np.testing.assert_allclose(lefts, (0 - 318.6) / 517.3 * 2 + np.arange(FRAMES) / 30, atol=1e-4)
+    np.testing.assert_allclose(lefts, (0 - 318.6) / 517.3 * 2 + np.arange(2) / 30, atol=1e-4)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
