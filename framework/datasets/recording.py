@@ -121,7 +121,7 @@ class Recording(RGBDSequence):
     def open(self) -> Contents:
         """What `self.folder` holds. Raises DataError, naming the file, when that is no such recording."""
 
-    def frame_truth(self, index: int) -> FrameTruth | None:
+    def truth_in(self, index: int) -> FrameTruth | None:
         """The true instances in frame `index`, counted before any is chosen; None where nobody labelled them."""
         return None
 
@@ -142,7 +142,7 @@ class Recording(RGBDSequence):
             depth=self.metric_depth(index),
             camera=self.camera,
             T_world_camera=recorded.T_world_camera,
-            truth=self.frame_truth(index),
+            truth=self.truth_in(index),
         )
 
     def metric_depth(self, index: int) -> Float32:

@@ -59,7 +59,7 @@ class RgbdFolder(Recording):
         ]
         return Contents(camera, path, depth_scale, frames)
 
-    def frame_truth(self, index: int) -> FrameTruth | None:
+    def truth_in(self, index: int) -> FrameTruth | None:
         if not self._instances:
             return None
         path = self._instances[index]
@@ -85,7 +85,7 @@ class RgbdFolder(Recording):
             try:
                 if recorded.fault:
                     raise FrameError(recorded.fault)
-                depth, truth = self.metric_depth(index), self.frame_truth(index)
+                depth, truth = self.metric_depth(index), self.truth_in(index)
             except FrameError as error:
                 log.warning("ground truth: left out %s", error)
                 continue
