@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Bool, Camera, Detections, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
 
-RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| that is rounding of a published matrix, not a fault
+RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| that is rounding: published poses have six digits, lost ones R = 0
 EXACT_WITHIN = 1e-12  # such a rotation is as exact as float64 writes it, and stays as it is
 
 

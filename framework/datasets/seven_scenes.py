@@ -5,7 +5,7 @@
     chess/seq-01/frame-000000.pose.txt      T_world_depthcamera, four lines of four numbers, m
 
 Colour and depth are published unregistered and without calibration between the two cameras, of which only the depth
-camera's intrinsics are given. Without registration, masks miss their objects by up to 30 px.
+camera's intrinsics are given. Without registration, masks miss their objects by 30 px and more.
 """
 
 from __future__ import annotations
