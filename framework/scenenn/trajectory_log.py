@@ -11,10 +11,8 @@ import numpy as np
 from framework.atomic_files import written_whole
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
-from framework.geometry import nearest_rotation
+from framework.geometry import nearest_rigid
 
-RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| that is rounding: published poses have six digits, lost ones R = 0
-EXACT_WITHIN = 1e-12  # such a rotation is as exact as float64 writes it, and stays as it is
 LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
 BLOCK = 5  # lines of a frame
 HEADER = "frame frame frame+1"
@@ -62,18 +60,20 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
             )
         line_of[frame] = header.number
         matrix = _matrix(path, rows, at_end)
-        fault = CUT_OFF if matrix is None else _fault(matrix)
-        if matrix is None or fault:
-            unusable[frame] = fault
-        else:
-            poses[frame] = _rigid(matrix)
+        if matrix is None:
+            unusable[frame] = CUT_OFF
+            continue
+        try:
+            poses[frame] = nearest_rigid(matrix)
+        except DataError as error:
+            unusable[frame] = str(error)
     return TrajectoryLog(poses, unusable)
 
 
 def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
     """Writes T_world_camera (4, 4) of each frame, whole or not at all; `read_trajectory_log` gives the same back.
 
-    What is rigid within ROTATION_TOLERANCE but not within EXACT_WITHIN comes back as the nearest rigid transform.
+    What is rigid within ROTATION_TOLERANCE but not as exactly as float64 can comes back as the nearest rigid transform.
     Raises DataError when a frame's number is negative, its pose not rigid, or the disk does not take the file.
     """
     lines = []
@@ -127,33 +127,6 @@ def _numbers(words: list[str]) -> list[float]:
         return [float(word) for word in words]
     except ValueError:
         return []
-
-
-def _fault(matrix: Float64) -> str:
-    """Why these numbers (4, 4) are no pose; "" when they are one."""
-    if not np.isfinite(matrix).all():
-        return "the pose is not finite"
-    if not np.allclose(matrix[3], (0, 0, 0, 1)):
-        return "the last row of the pose is not 0 0 0 1"
-    error, determinant = _rotation_error(matrix), np.linalg.det(matrix[:3, :3])
-    if not error <= RIGID_WITHIN or determinant < 0:
-        return f"the pose is not rigid: |R R^T - I| is {error:.2g}, det R {determinant:.2g}"
-    return ""
-
-
-def _rigid(matrix: Float64) -> Float64:
-    """The rigid transform (4, 4) nearest to a matrix without fault."""
-    T_world_camera = np.eye(4)
-    T_world_camera[:3] = matrix[:3]
-    if _rotation_error(matrix) > EXACT_WITHIN:
-        T_world_camera[:3, :3] = nearest_rotation(matrix[:3, :3])
-    return T_world_camera
-
-
-def _rotation_error(matrix: Float64) -> float:
-    R = matrix[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return float(np.abs(R @ R.T - np.eye(3)).max())
 
 
 def _are_digits(words: list[str]) -> bool:
