@@ -81,7 +81,7 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
             if isinstance(received, InstanceMapError):
                 raise received
             yield received
-    except EOFError:
+    except (EOFError, OSError):
         player.join()
         raise DataError(f"it is damaged, OpenNI 2 crashed on it with status {player.exitcode}") from None
     finally:

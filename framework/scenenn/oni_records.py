@@ -21,6 +21,7 @@ VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # that OpenNI 2 plays, from and to
 FIRST_WIDE = (1, 0, 1, 0)  # from this version on, places in the file are 64 bits
 IMAGE_FIELDS = struct.Struct("<QI")  # time, us; number
 RECORD_MAGIC = b"NIR\0"
+LARGEST_NODE = 255  # recorders number them from 1; OpenNI allocates as many as the file says
 LARGEST_FIELDS = 2**20  # bytes; OpenNI has a buffer of 5.8 MB for them and does not look
 
 
@@ -137,7 +138,10 @@ def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
     header = file.read(FILE_HEADER.size)
     if len(header) < FILE_HEADER.size or not header.startswith(FILE_MAGIC):
         raise DataError(f"{path} is no OpenNI recording: it begins with {header[:4]!r}, expected {FILE_MAGIC!r}")
-    version: tuple[int, ...] = FILE_HEADER.unpack(header)[1:5]
+    _magic, *numbers, _time, largest_node = FILE_HEADER.unpack(header)
+    version = tuple(numbers)
+    if largest_node > LARGEST_NODE:
+        raise DataError(f"{path} is damaged: it says to have {largest_node} nodes, expected at most {LARGEST_NODE}")
     if not VERSIONS[0] <= version <= VERSIONS[1]:
         first, last, found = (".".join(map(str, one)) for one in (*VERSIONS, version))
         raise DataError(f"{path} has the format's version {found}; OpenNI 2 plays {first} to {last}")
@@ -152,7 +156,12 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
         file.seek(position)
         magic, kind, node, fields_size, payload_size, _undo = header.unpack(file.read(header.size))
         end = position + fields_size + payload_size
-        if magic != RECORD_MAGIC or not header.size <= fields_size <= LARGEST_FIELDS or end > size:
+        if (
+            magic != RECORD_MAGIC
+            or not header.size <= fields_size <= LARGEST_FIELDS
+            or end > size
+            or node > LARGEST_NODE
+        ):
             return
         yield _Record(kind, node, file.read(fields_size - header.size), position + fields_size, end)
         if kind == Record.END:
