@@ -97,7 +97,6 @@ def playable(contents: Contents, scratch: Path) -> Iterator[Path]:
                 file.write(place.pack(0))  # 0 = there is no table
             file.seek(contents.end)
             file.write(record_header.pack(RECORD_MAGIC, Record.END, 0, record_header.size, 0, 0))
-            file.truncate()
         yield copy
 
 
