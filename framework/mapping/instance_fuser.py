@@ -12,7 +12,6 @@ from itertools import combinations
 import numpy as np
 
 from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters, Pose
-from framework.errors import DataError
 from framework.interfaces import MapFuser
 from framework.mapping.association import (
     OverlapRule,
@@ -25,7 +24,7 @@ from framework.mapping.association import (
     match_one_to_one,
 )
 from framework.mapping.instance_list import Confirmation
-from framework.mapping.labeled_map import LabeledMap
+from framework.mapping.labeled_map import LabeledMap, require_same_classes
 from framework.parameters import check_bounds
 
 VOTES_ACROSS = 320  # pixels of an image row that vote in association: more cost time and tell the same
@@ -117,11 +116,7 @@ class InstanceFuser(MapFuser):
         """The first frame's label space becomes the map's."""
         if not self.scene.classes:
             self.scene.begin(classes)
-        elif self.scene.classes != classes:
-            raise DataError(
-                f"the map has {len(self.scene.classes)} classes and this frame's clusters have {len(classes)} "
-                "others; use one detector, or map them to one label space"
-            )
+        require_same_classes(self.scene.classes, classes)
 
     def _look_up(self, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the instances that the map has at the measured surface."""

@@ -73,14 +73,26 @@ def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
     return np.int32(0), np.int32(-1)
 
 
+@device
+def _color_of(color, voxel, out):
+    """The colour of a voxel, numbered as in a Surface, into `out` (3,)."""
+    red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
+    out[0], out[1], out[2] = red / 4, green / 4, blue / 4
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _color(color, voxels, colors):
+    for v in prange(len(voxels)):
+        _color_of(color, voxels[v], colors[v])
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _label(grid, evidence, counts, vertices, voxels, colors, instance_ids, class_ids):
     for chunk in prange(-(-len(voxels) // CHUNK)):
         blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         ids, shares = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
         for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(voxels))):
-            red, green, blue = unpack_color(grid.color[voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS])
-            colors[v, 0], colors[v, 1], colors[v, 2] = red / 4, green / 4, blue / 4
+            _color_of(grid.color, voxels[v], colors[v])
             instance, label = np.int32(0), np.int32(-1)
             if _corner_voxels(grid, vertices[v], blocks, numbers, shares):
                 instance, label = _elect(grid, evidence, counts, blocks, numbers, shares, ids)
@@ -102,3 +114,10 @@ def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: Surface
     instance_ids, class_ids = np.empty(count, np.int32), np.empty(count, np.int32)
     _label(grid, evidence, counts, surface.vertices, surface.voxels, colors, instance_ids, class_ids)
     return colors, instance_ids, class_ids
+
+
+def vertex_colors(grid: Grid, voxels: Int32) -> UInt8:
+    """(V, 3) RGB of the voxels nearest to vertices, numbered as in a Surface."""
+    colors = np.empty((len(voxels), 3), np.uint8)
+    _color(grid.color, voxels, colors)
+    return colors

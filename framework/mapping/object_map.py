@@ -1,0 +1,284 @@
+"""A map of objects with a volume each, before a background volume of everything.
+
+What differs from its models: Fusion++ (McCormac et al. 2018) gives an object 64^3 voxels whatever its size, resamples
+them as the object grows, integrates into it every frame that sees it, corrects the poses of its objects by loop
+closures, and has but a coarse background for tracking. MaskFusion (Runz et al. 2018) has surfels, only of what is under
+the masks, and tracks objects that move. Here all volumes have blocks of the same voxels, objects do not move, and an
+object's volume changes in the frames that detect it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import (
+    Array,
+    Bool,
+    Camera,
+    Float32,
+    Float64,
+    Frame,
+    Instance,
+    InstanceMesh,
+    Int32,
+    SurfaceView,
+    UInt8,
+    View,
+)
+from framework.errors import MapFullError
+from framework.interfaces import SceneMap
+from framework.mapping.evidence import Combine
+from framework.mapping.frustum import boxes_in_view
+from framework.mapping.instance_list import Confirmation, list_instances
+from framework.mapping.instance_table import InstanceTable
+from framework.mapping.integration import Integrator
+from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.meshing import Surface, SurfaceNets
+from framework.mapping.object_volume import FOREGROUND, GRID_ARRAYS, MaskCounts, ObjectVolume, fill_grid
+from framework.mapping.raycasting import cast_view, paint, render_near
+from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.vertex_labels import vertex_colors
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
+
+FORMAT = "object_volumes 1"  # of the saved file; a change of meaning counts it up
+OBJECT = "object_"  # before the names of the arrays that hold all objects' volumes, one after the other
+VOLUME_ARRAYS = (*GRID_ARRAYS, *MaskCounts._fields)
+
+
+class ObjectMap(SceneMap):
+    """The background, the objects' volumes by id, and the table of what is known of the objects beside them.
+
+    An object's classes are the mean of its detections' distributions. `mesh` and `instances` have the objects that
+    count; `render` and `instances_seen` the tentative ones too.
+    """
+
+    def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int, confirmation: Confirmation) -> None:
+        self.classes: tuple[str, ...] = ()
+        self.voxel_size = voxel_size  # m
+        self.sensor = sensor
+        self.max_blocks = max_blocks  # of all volumes together
+        self.confirmation = confirmation
+        self.table = InstanceTable(Combine.SUM, logarithmic=False)
+        self.background = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
+        self.volumes: dict[int, ObjectVolume] = {}
+        self._integrator = Integrator(self.background, sensor)
+
+    @property
+    def block_count(self) -> int:
+        """Of the background and of all objects."""
+        return self.background.block_count + sum(volume.block_count for volume in self.volumes.values())
+
+    @property
+    def voxel_count(self) -> int:
+        return self.block_count * BLOCK_VOXELS
+
+    @property
+    def byte_count(self) -> int:
+        return self.background.byte_count + sum(volume.byte_count for volume in self.volumes.values())
+
+    @property
+    def instance_count(self) -> int:
+        """Without the condition on their area, which takes a mesh."""
+        return int(self.confirmation.counts(self.table).sum())
+
+    def create(self, frame_index: int) -> int:
+        """The id of a new object, whose volume is empty."""
+        record = self.table.create(len(self.classes), frame_index)
+        self.volumes[record.id] = ObjectVolume(self.voxel_size, self.sensor, self.max_blocks)
+        return record.id
+
+    def remove(self, instance_id: int) -> None:
+        """Forgets an object."""
+        del self.table.records[instance_id], self.volumes[instance_id]
+        self._changed()
+
+    def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
+        """Adds `frame` to the background, and to the volumes of the objects whose `masks` (H, W) it has, by id.
+
+        Voxels within `band` m of the measured surface count whether they are under their object's mask. Raises
+        MapFullError when the block budget is reached.
+        """
+        seen = self._integrator.integrate(frame, T_world_camera, band)
+        if "_surface" in self.__dict__:
+            self._surface.changed(seen.blocks)
+        self._changed()
+        for instance_id, mask in masks.items():
+            self._integrate_object(self.volumes[instance_id], frame, T_world_camera, mask, band)
+            if self.block_count > self.max_blocks:
+                raise MapFullError(
+                    f"the map is full: more than {self.max_blocks} blocks in the background and "
+                    f"{len(self.volumes)} objects; raise fuser.max_blocks or fuser.voxel_size"
+                )
+
+    def _integrate_object(
+        self, volume: ObjectVolume, frame: Frame, T_world_camera: Float64, mask: Bool, band: float
+    ) -> None:
+        """Adds the part of the image in which the object's volume or its mask lies."""
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        u0, v0, u1, v1 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+        if volume.block_count:
+            box = self._boxes(frame.camera, T_world_camera, [volume])[0]
+            if box[0] < box[2] and box[1] < box[3]:
+                u0, v0, u1, v1 = min(u0, box[0]), min(v0, box[1]), max(u1, box[2]), max(v1, box[3])
+        volume.integrate(_cropped(frame, u0, v0, u1, v1), T_world_camera, mask[v0:v1, u0:u1], band)
+
+    def _boxes(self, camera: Camera, T_world_camera: Float64, volumes: list[ObjectVolume]) -> Int32:
+        """(M, 4) u0, v0, u1, v1: see boxes_in_view()."""
+        low, high = (np.array([getattr(volume, side) for volume in volumes]) for side in ("low", "high"))
+        return boxes_in_view(camera, T_world_camera, low, high, float(self.sensor.min_depth))
+
+    def _changed(self) -> None:
+        """What was derived from the map is out of date."""
+        self.__dict__.pop("_mesh", None)
+
+    def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
+        """(ceil(H / stride), ceil(W / stride)) the object at every stride-th reading of every stride-th row of `depth`
+        (H, W) m, 0 = none: of those whose volumes hold it, the one that it most probably belongs to.
+
+        Beside a test for each box around an object, the cost is that of the objects in view.
+        """
+        shape = tuple(-(-side // stride) for side in depth.shape)
+        instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))
+        filled = {key: volume for key, volume in self.volumes.items() if volume.block_count}
+        if not filled:
+            return instance_ids
+        view = pinhole(camera, T_world_camera)
+        boxes = self._boxes(camera, T_world_camera, list(filled.values()))
+        for (key, volume), (u0, v0, u1, v1) in zip(filled.items(), boxes.tolist(), strict=True):
+            if u0 < u1 and v0 < v1:
+                window = -(-v0 // stride), -(-u0 // stride), -(-v1 // stride), -(-u1 // stride)
+                volume.look_up(depth, view, stride, window, key, instance_ids, best)
+        return instance_ids
+
+    def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        """The background's surface, which is also that of the objects, with the objects that it belongs to."""
+        depth, normals = cast_view(self.background, self.sensor, camera, T_world_camera)
+        color = np.empty((*camera.shape, 3), np.uint8)
+        paint(self.background.grid, pinhole(camera, T_world_camera), depth, color)
+        instance_ids = self.instances_seen(camera, T_world_camera, depth, stride=1)
+        class_ids = self._class_of_ids()[instance_ids]
+        return View(camera, T_world_camera, depth, normals, color, instance_ids, class_ids)
+
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        return render_near(self.background, self.sensor, camera, T_world_camera, depth)
+
+    def _class_of_ids(self) -> Int32:
+        """(ids + 1,) the most likely class of each object; -1 for none."""
+        class_ids = np.full(self.table.last_id + 1, -1, np.int32)
+        for record in self.table.records.values():
+            class_ids[record.id] = record.class_evidence.argmax()
+        return class_ids
+
+    def mesh(self) -> InstanceMesh:
+        """The objects' surfaces, and the background's where it belongs to no object that counts.
+
+        Both were measured by the same readings and nearly coincide: were both kept, which of the two is nearer to a
+        true point would be chance. Where objects overlap, both have their surface.
+        """
+        return self._mesh
+
+    @cached_property
+    def _surface(self) -> SurfaceNets:
+        """The background's, made when a mesh is first asked for."""
+        return SurfaceNets(self.background)
+
+    @cached_property
+    def _mesh(self) -> InstanceMesh:
+        counts = self.confirmation.counts(self.table)
+        background = self._surface.extract()
+        free = np.ones(len(background.vertices), np.bool_)
+        parts: list[_Part] = []
+        for key, volume in self.volumes.items():
+            if not counts[key]:
+                continue
+            surface = volume.surface()
+            chosen = volume.foreground(surface.vertices)
+            if chosen.sum() < self.confirmation.min_vertices(self.voxel_size):
+                continue
+            parts.append(_part(surface, volume.voxels, chosen, key))
+            inside = np.flatnonzero(volume.encloses(background.vertices))
+            free[inside] &= ~volume.foreground(background.vertices[inside])
+        return self._joined([_part(background, self.background, free, 0), *parts])
+
+    def _joined(self, parts: list[_Part]) -> InstanceMesh:
+        firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
+        instance_ids = np.concatenate([np.full(len(part.vertices), part.instance_id, np.int32) for part in parts])
+        return InstanceMesh(
+            vertices=np.concatenate([part.vertices for part in parts]),
+            triangles=np.concatenate(
+                [part.triangles + np.int32(first) for first, part in zip(firsts, parts, strict=False)]
+            ),
+            colors=np.concatenate([part.colors for part in parts]),
+            instance_ids=instance_ids,
+            class_ids=self._class_of_ids()[instance_ids],
+            classes=self.classes,
+        )
+
+    def instances(self) -> Mapping[int, Instance]:
+        return list_instances(self.mesh(), self.table)
+
+    def save(self, path: Path) -> None:
+        volumes = [volume.arrays() for volume in self.volumes.values()]
+        empty = ObjectVolume(self.voxel_size, self.sensor, self.max_blocks).arrays()
+        grid, b = self.background.grid, self.background.block_count
+        header = {
+            "format": FORMAT,
+            "voxel_size": self.voxel_size,
+            "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
+            "max_blocks": self.max_blocks,
+            "confirmation": asdict(self.confirmation),
+            "classes": self.classes,
+            "blocks": {key: volume.block_count for key, volume in self.volumes.items()},
+            "table": plain_table(self.table),
+        }
+        arrays: dict[str, Array] = {
+            **{name: getattr(grid, name)[:b] for name in GRID_ARRAYS},
+            **{OBJECT + name: np.concatenate([empty[name], *(v[name] for v in volumes)]) for name in VOLUME_ARRAYS},
+        }
+        write_map(path, header, arrays)
+
+    @classmethod
+    def load(cls, path: Path) -> ObjectMap:
+        header, arrays = read_map(path, FORMAT, (*GRID_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
+        sensor = Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()})
+        scene = cls(header["voxel_size"], sensor, header["max_blocks"], Confirmation(**header["confirmation"]))
+        scene.classes = tuple(header["classes"])
+        scene.table = table_of(header["table"])
+        fill_grid(scene.background, arrays)
+        first = 0
+        for key, blocks in header["blocks"].items():
+            volume = ObjectVolume(scene.voxel_size, sensor, scene.max_blocks)
+            volume.fill({name: arrays[OBJECT + name][first : first + blocks] for name in VOLUME_ARRAYS})
+            scene.volumes[int(key)] = volume
+            first += blocks
+        return scene
+
+
+class _Part(NamedTuple):
+    """A surface that becomes a part of the mesh."""
+
+    vertices: Float32  # (V, 3) m, world
+    triangles: Int32  # (F, 3)
+    colors: UInt8  # (V, 3) RGB
+    instance_id: int  # 0 = the background
+
+
+def _part(surface: Surface, voxels: VoxelGrid, chosen: Bool, instance_id: int) -> _Part:
+    """The chosen (V,) vertices of a grid's surface, and the triangles between them."""
+    number = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
+    triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]
+    colors = vertex_colors(voxels.grid, surface.voxels[chosen])
+    return _Part(surface.vertices[chosen], number[triangles], colors, instance_id)
+
+
+def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:
+    """The part of a frame from pixel (u0, v0) to before (u1, v1)."""
+    camera = frame.camera
+    part = replace(camera, width=u1 - u0, height=v1 - v0, cx=camera.cx - u0, cy=camera.cy - v0)
+    return Frame(frame.index, frame.timestamp, frame.color[v0:v1, u0:u1], frame.depth[v0:v1, u0:u1], part)
