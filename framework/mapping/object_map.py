@@ -176,10 +176,11 @@ class ObjectMap(SceneMap):
         return class_ids
 
     def mesh(self) -> InstanceMesh:
-        """The objects' surfaces, and the background's where it belongs to no object that counts.
+        """The background's surface, with the object that it most probably belongs to, and the objects' own surfaces.
 
-        Both were measured by the same readings and nearly coincide: were both kept, which of the two is nearer to a
-        true point would be chance. Where objects overlap, both have their surface.
+        Both were measured by the same readings and nearly coincide: were the background's without a label there, which
+        of the two is nearer to a true point would be chance; were it left out, there would be seams, and holes where
+        an object's volume has seen too little. Where objects overlap, each has its surface.
         """
         return self._mesh
 
@@ -192,23 +193,27 @@ class ObjectMap(SceneMap):
     def _mesh(self) -> InstanceMesh:
         counts = self.confirmation.counts(self.table)
         background = self._surface.extract()
-        free = np.ones(len(background.vertices), np.bool_)
-        parts: list[_Part] = []
+        instance_ids = np.zeros(len(background.vertices), np.int32)
+        best = np.full(len(background.vertices), np.float32(FOREGROUND))
+        objects: list[_Part] = []
         for key, volume in self.volumes.items():
             if not counts[key]:
                 continue
             surface = volume.surface()
-            chosen = volume.foreground(surface.vertices)
+            chosen = volume.foreground_at(surface.vertices) > FOREGROUND
             if chosen.sum() < self.confirmation.min_vertices(self.voxel_size):
                 continue
-            parts.append(_part(surface, volume.voxels, chosen, key))
+            objects.append(_part(surface, volume.voxels, chosen, np.full(len(chosen), key, np.int32)))
             inside = np.flatnonzero(volume.encloses(background.vertices))
-            free[inside] &= ~volume.foreground(background.vertices[inside])
-        return self._joined([_part(background, self.background, free, 0), *parts])
+            probability = volume.foreground_at(background.vertices[inside])
+            better = probability > best[inside]
+            best[inside[better]], instance_ids[inside[better]] = probability[better], key
+        everything = np.ones(len(best), np.bool_)
+        return self._joined([_part(background, self.background, everything, instance_ids), *objects])
 
     def _joined(self, parts: list[_Part]) -> InstanceMesh:
         firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-        instance_ids = np.concatenate([np.full(len(part.vertices), part.instance_id, np.int32) for part in parts])
+        instance_ids = np.concatenate([part.instance_ids for part in parts])
         return InstanceMesh(
             vertices=np.concatenate([part.vertices for part in parts]),
             triangles=np.concatenate(
@@ -266,15 +271,15 @@ class _Part(NamedTuple):
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3)
     colors: UInt8  # (V, 3) RGB
-    instance_id: int  # 0 = the background
+    instance_ids: Int32  # (V,), 0 = none
 
 
-def _part(surface: Surface, voxels: VoxelGrid, chosen: Bool, instance_id: int) -> _Part:
+def _part(surface: Surface, voxels: VoxelGrid, chosen: Bool, instance_ids: Int32) -> _Part:
     """The chosen (V,) vertices of a grid's surface, and the triangles between them."""
     number = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
     triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]
     colors = vertex_colors(voxels.grid, surface.voxels[chosen])
-    return _Part(surface.vertices[chosen], number[triangles], colors, instance_id)
+    return _Part(surface.vertices[chosen], number[triangles], colors, instance_ids[chosen])
 
 
 def _cropped(frame: Frame, u0: int, v0: int, u1: int, v1: int) -> Frame:

@@ -199,11 +199,11 @@ class ObjectVolume:
         """(P,) whether points (P, 3) m lie in the box around the volume's blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
-    def foreground(self, points_world: Float32) -> Bool:
-        """(P,) whether points (P, 3) m of a surface are more probably the object's than not."""
+    def foreground_at(self, points_world: Float32) -> Float32:
+        """(P,) the probability that points (P, 3) m of a surface are the object's."""
         probability = np.empty(len(points_world), np.float32)
         _foreground_at(self.voxels.grid, self._counts, points_world, probability)
-        return np.asarray(probability > FOREGROUND)
+        return probability
 
     @cached_property
     def _nets(self) -> SurfaceNets:
