@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, View
+from framework.data import Camera, Float64, Frame, InstanceMesh, Int32, View
 from framework.mapping.association import look_up_instances
 from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_list import Confirmation

@@ -21,9 +21,7 @@ class TsdfFuser(MapFuser):
     min_depth: float = 0.2  # m, > 0
     max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
     label_band: float = 2.0  # voxels, >= 1: labels go to voxels within this distance of the measured surface
-    min_area: float = (
-        0.01  # m^2 of surface in the mesh, >= 0, for an instance to count: voxel_size^2 a vertex
-    )
+    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0, for an instance to count: voxel_size^2 a vertex
 
     def __post_init__(self) -> None:
         check_bounds(

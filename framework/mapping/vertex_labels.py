@@ -44,10 +44,8 @@ def keep_near(grid, blocks, numbers, shares):
     """Takes the shares (8,) from those of the voxels around a vertex that were not seen or are far from the surface."""
     near = np.float32(REACH) * grid.voxel_size
     for c in range(CORNERS):
-        block = blocks[c]
-        if block < 0 or grid.tsdf[block, numbers[c]] == UNSEEN:
-            shares[c] = 0
-        elif abs(grid.tsdf[block, numbers[c]]) * grid.tsdf_unit > near:
+        stored = grid.tsdf[blocks[c], numbers[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
+        if stored == UNSEEN or abs(stored) * grid.tsdf_unit > near:
             shares[c] = 0
 
 
