@@ -6,19 +6,9 @@ from abc import abstractmethod
 from collections.abc import Mapping
 
 from framework.data import Float64, Frame, Instance, Int32
-from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-
-
-def require_same_classes(known: tuple[str, ...], found: tuple[str, ...]) -> None:
-    """Raises DataError when a frame's clusters have another label space than the map's."""
-    if known != found:
-        raise DataError(
-            f"the map has {len(known)} classes and this frame's clusters have {len(found)} others; "
-            "use one detector, or map them to one label space"
-        )
 
 
 class LabeledMap(SceneMap):

@@ -11,14 +11,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, replace
-from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from framework.data import (
-    Array,
     Bool,
     Camera,
     Float32,
@@ -27,31 +25,30 @@ from framework.data import (
     Instance,
     InstanceMesh,
     Int32,
-    SurfaceView,
     UInt8,
     View,
 )
 from framework.errors import MapFullError
-from framework.interfaces import SceneMap
 from framework.mapping.evidence import Combine
 from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.integration import Integrator
 from framework.mapping.map_file import plain_table, read_map, table_of, write_map
-from framework.mapping.meshing import Surface, SurfaceNets
-from framework.mapping.object_volume import FOREGROUND, GRID_ARRAYS, MaskCounts, ObjectVolume, fill_grid
-from framework.mapping.raycasting import cast_view, paint, render_near
+from framework.mapping.meshing import Surface
+from framework.mapping.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume
+from framework.mapping.raycasting import render_surface
 from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.tsdf_map import BLOCK_ARRAYS, TsdfMap, saved_sensor
 from framework.mapping.vertex_labels import vertex_colors
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
 
 FORMAT = "object_volumes 1"  # of the saved file; a change of meaning counts it up
 OBJECT = "object_"  # before the names of the arrays that hold all objects' volumes, one after the other
-VOLUME_ARRAYS = (*GRID_ARRAYS, *MaskCounts._fields)
+NO_BLOCKS = np.zeros(0, np.int32)
 
 
-class ObjectMap(SceneMap):
+class ObjectMap(TsdfMap):
     """The background, the objects' volumes by id, and the table of what is known of the objects beside them.
 
     An object's classes are the mean of its detections' distributions. `mesh` and `instances` have the objects that
@@ -59,20 +56,17 @@ class ObjectMap(SceneMap):
     """
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int, confirmation: Confirmation) -> None:
+        super().__init__(voxel_size, sensor, max_blocks)
         self.classes: tuple[str, ...] = ()
-        self.voxel_size = voxel_size  # m
-        self.sensor = sensor
-        self.max_blocks = max_blocks  # of all volumes together
         self.confirmation = confirmation
         self.table = InstanceTable(Combine.SUM, logarithmic=False)
-        self.background = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
         self.volumes: dict[int, ObjectVolume] = {}
-        self._integrator = Integrator(self.background, sensor)
+        self._integrator = Integrator(self.voxels, sensor)
 
     @property
     def block_count(self) -> int:
         """Of the background and of all objects."""
-        return self.background.block_count + sum(volume.block_count for volume in self.volumes.values())
+        return self.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
 
     @property
     def voxel_count(self) -> int:
@@ -80,7 +74,7 @@ class ObjectMap(SceneMap):
 
     @property
     def byte_count(self) -> int:
-        return self.background.byte_count + sum(volume.byte_count for volume in self.volumes.values())
+        return self.voxels.byte_count + sum(volume.byte_count for volume in self.volumes.values())
 
     @property
     def instance_count(self) -> int:
@@ -90,13 +84,16 @@ class ObjectMap(SceneMap):
     def create(self, frame_index: int) -> int:
         """The id of a new object, whose volume is empty."""
         record = self.table.create(len(self.classes), frame_index)
-        self.volumes[record.id] = ObjectVolume(self.voxel_size, self.sensor, self.max_blocks)
+        self.volumes[record.id] = self._empty_volume()
         return record.id
+
+    def _empty_volume(self) -> ObjectVolume:
+        return ObjectVolume(self.voxel_size, self.sensor, self.voxels.max_blocks)
 
     def remove(self, instance_id: int) -> None:
         """Forgets an object."""
         del self.table.records[instance_id], self.volumes[instance_id]
-        self._changed()
+        self.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
         """Adds `frame` to the background, and to the volumes of the objects whose `masks` (H, W) it has, by id.
@@ -105,14 +102,12 @@ class ObjectMap(SceneMap):
         MapFullError when the block budget is reached.
         """
         seen = self._integrator.integrate(frame, T_world_camera, band)
-        if "_surface" in self.__dict__:
-            self._surface.changed(seen.blocks)
-        self._changed()
+        self.changed(seen.blocks)
         for instance_id, mask in masks.items():
             self._integrate_object(self.volumes[instance_id], frame, T_world_camera, mask, band)
-            if self.block_count > self.max_blocks:
+            if self.block_count > self.voxels.max_blocks:
                 raise MapFullError(
-                    f"the map is full: more than {self.max_blocks} blocks in the background and "
+                    f"the map is full: more than {self.voxels.max_blocks} blocks in the background and "
                     f"{len(self.volumes)} objects; raise fuser.max_blocks or fuser.voxel_size"
                 )
 
@@ -132,10 +127,6 @@ class ObjectMap(SceneMap):
         """(M, 4) u0, v0, u1, v1: see boxes_in_view()."""
         low, high = (np.array([getattr(volume, side) for volume in volumes]) for side in ("low", "high"))
         return boxes_in_view(camera, T_world_camera, low, high, float(self.sensor.min_depth))
-
-    def _changed(self) -> None:
-        """What was derived from the map is out of date."""
-        self.__dict__.pop("_mesh", None)
 
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
         """(ceil(H / stride), ceil(W / stride)) the object at every stride-th reading of every stride-th row of `depth`
@@ -158,15 +149,9 @@ class ObjectMap(SceneMap):
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """The background's surface, which is also that of the objects, with the objects that it belongs to."""
-        depth, normals = cast_view(self.background, self.sensor, camera, T_world_camera)
-        color = np.empty((*camera.shape, 3), np.uint8)
-        paint(self.background.grid, pinhole(camera, T_world_camera), depth, color)
-        instance_ids = self.instances_seen(camera, T_world_camera, depth, stride=1)
-        class_ids = self._class_of_ids()[instance_ids]
-        return View(camera, T_world_camera, depth, normals, color, instance_ids, class_ids)
-
-    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        return render_near(self.background, self.sensor, camera, T_world_camera, depth)
+        surface = render_surface(self.voxels, self.sensor, camera, T_world_camera)
+        instance_ids = self.instances_seen(camera, T_world_camera, surface.depth, stride=1)
+        return View(**vars(surface), instance_ids=instance_ids, class_ids=self._class_of_ids()[instance_ids])
 
     def _class_of_ids(self) -> Int32:
         """(ids + 1,) the most likely class of each object; -1 for none."""
@@ -175,22 +160,13 @@ class ObjectMap(SceneMap):
             class_ids[record.id] = record.class_evidence.argmax()
         return class_ids
 
-    def mesh(self) -> InstanceMesh:
+    def labeled_mesh(self) -> InstanceMesh:
         """The background's surface, with the object that it most probably belongs to, and the objects' own surfaces.
 
         Both were measured by the same readings and nearly coincide: were the background's without a label there, which
         of the two is nearer to a true point would be chance; were it left out, there would be seams, and holes where
         an object's volume has seen too little. Where objects overlap, each has its surface.
         """
-        return self._mesh
-
-    @cached_property
-    def _surface(self) -> SurfaceNets:
-        """The background's, made when a mesh is first asked for."""
-        return SurfaceNets(self.background)
-
-    @cached_property
-    def _mesh(self) -> InstanceMesh:
         counts = self.confirmation.counts(self.table)
         background = self._surface.extract()
         instance_ids = np.zeros(len(background.vertices), np.int32)
@@ -209,7 +185,7 @@ class ObjectMap(SceneMap):
             better = probability > best[inside]
             best[inside[better]], instance_ids[inside[better]] = probability[better], key
         everything = np.ones(len(best), np.bool_)
-        return self._joined([_part(background, self.background, everything, instance_ids), *objects])
+        return self._joined([_part(background, self.voxels, everything, instance_ids), *objects])
 
     def _joined(self, parts: list[_Part]) -> InstanceMesh:
         firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -229,38 +205,31 @@ class ObjectMap(SceneMap):
         return list_instances(self.mesh(), self.table)
 
     def save(self, path: Path) -> None:
-        volumes = [volume.arrays() for volume in self.volumes.values()]
-        empty = ObjectVolume(self.voxel_size, self.sensor, self.max_blocks).arrays()
-        grid, b = self.background.grid, self.background.block_count
+        voxels, arrays = self.saved_voxels()
         header = {
             "format": FORMAT,
-            "voxel_size": self.voxel_size,
-            "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
-            "max_blocks": self.max_blocks,
+            **voxels,
             "confirmation": asdict(self.confirmation),
             "classes": self.classes,
-            "blocks": {key: volume.block_count for key, volume in self.volumes.items()},
+            "objects": {key: volume.block_count for key, volume in self.volumes.items()},
             "table": plain_table(self.table),
         }
-        arrays: dict[str, Array] = {
-            **{name: getattr(grid, name)[:b] for name in GRID_ARRAYS},
-            **{OBJECT + name: np.concatenate([empty[name], *(v[name] for v in volumes)]) for name in VOLUME_ARRAYS},
-        }
+        parts = [self._empty_volume().arrays(), *(volume.arrays() for volume in self.volumes.values())]
+        arrays |= {OBJECT + name: np.concatenate([part[name] for part in parts]) for name in VOLUME_ARRAYS}
         write_map(path, header, arrays)
 
     @classmethod
     def load(cls, path: Path) -> ObjectMap:
-        header, arrays = read_map(path, FORMAT, (*GRID_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
-        sensor = Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()})
-        scene = cls(header["voxel_size"], sensor, header["max_blocks"], Confirmation(**header["confirmation"]))
+        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
+        confirmation = Confirmation(**header["confirmation"])
+        scene = cls(header["voxel_size"], saved_sensor(header["sensor"]), header["max_blocks"], confirmation)
         scene.classes = tuple(header["classes"])
         scene.table = table_of(header["table"])
-        fill_grid(scene.background, arrays)
+        scene.fill_voxels(arrays)
         first = 0
-        for key, blocks in header["blocks"].items():
-            volume = ObjectVolume(scene.voxel_size, sensor, scene.max_blocks)
+        for key, blocks in header["objects"].items():
+            volume = scene.volumes[int(key)] = scene._empty_volume()
             volume.fill({name: arrays[OBJECT + name][first : first + blocks] for name in VOLUME_ARRAYS})
-            scene.volumes[int(key)] = volume
             first += blocks
         return scene
 

@@ -23,22 +23,20 @@ from numba import njit, prange
 from framework.data import Array, Bool, Float32, Float64, Frame, Int32
 from framework.mapping.integration import Integrator
 from framework.mapping.meshing import Surface, SurfaceNets
-from framework.mapping.sensor import Pinhole, Sensor, seen_point
+from framework.mapping.raycasting import voxel_seen
+from framework.mapping.sensor import Pinhole, Sensor
+from framework.mapping.vertex_labels import CHUNK, CORNERS, corner_voxels, keep_near
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     BLOCK_VOXELS,
-    UNSEEN,
     Grid,
     VoxelGrid,
     device,
-    find_block,
     find_solid_blocks,
     grown,
 )
-from framework.mapping.voxel_walk import voxel_number
 
 FOREGROUND = 0.5  # probability above which a voxel is the object's
-REACH = 2.0  # voxels; those farther from the surface saw other pixels than it, and do not tell whose it is
 GRID_ARRAYS = ("block_coords", "tsdf", "weight", "color")  # of a grid, that are saved
 
 
@@ -47,6 +45,9 @@ class MaskCounts(NamedTuple):
 
     foreground: npt.NDArray[np.uint16]  # (B, 512) observations under a mask of the object
     observed: npt.NDArray[np.uint16]  # (B, 512) all of those in frames that had one; the last 2^16 are not counted
+
+
+VOLUME_ARRAYS = (*GRID_ARRAYS, *MaskCounts._fields)
 
 
 @device
@@ -92,51 +93,36 @@ def look_up_object(
 
     `window` holds the first row and column of (h, w) and those after the last; `view` T_world_camera.
     """
-    scale = np.float32(1.0) / grid.voxel_size
-    half = np.float32(0.5)
     top, left, bottom, right = window
     for row in prange(top, bottom):
         key = np.int64(-2)
         region = np.int32(-1)
         for column in range(left, right):
             z = depth[row * stride, column * stride]
-            if z <= np.float32(0.0):
-                continue
-            x, y, w = seen_point(view, column * stride, row * stride, z)
-            i = int(np.floor(x * scale + half))
-            j = int(np.floor(y * scale + half))
-            k = int(np.floor(w * scale + half))
-            block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
-            if block >= 0:
-                n = voxel_number(i, j, k)
-                probability = _probability(counts.foreground[block, n], counts.observed[block, n])
-                if probability > best[row, column]:
-                    best[row, column] = probability
-                    instance_ids[row, column] = instance_id
+            if z > np.float32(0.0):
+                block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
+                if block >= 0:
+                    probability = _probability(counts.foreground[block, n], counts.observed[block, n])
+                    if probability > best[row, column]:
+                        best[row, column] = probability
+                        instance_ids[row, column] = instance_id
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _foreground_at(grid, counts, points, probability):
     """Fills probability (P,) with that of the foreground at points (P, 3) m, from the counts of the voxels around."""
-    scale = np.float32(1.0) / grid.voxel_size
-    reach = np.float32(REACH) * grid.voxel_size / grid.tsdf_unit
-    for p in prange(points.shape[0]):
-        x, y, z = points[p, 0] * scale, points[p, 1] * scale, points[p, 2] * scale
-        i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-        x, y, z = x - i, y - j, z - k
-        key = np.int64(-2)
-        region = np.int32(-1)
-        foreground = observed = np.float32(0.0)
-        for c in range(8):
-            dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
-            block, key, region = find_block(grid, (i + dx) >> 3, (j + dy) >> 3, (k + dz) >> 3, key, region)
-            if block >= 0:
-                n = voxel_number(i + dx, j + dy, k + dz)
-                if grid.tsdf[block, n] != UNSEEN and abs(grid.tsdf[block, n]) <= reach:
-                    share = (x if dx else 1 - x) * (y if dy else 1 - y) * (z if dz else 1 - z)
-                    foreground += share * np.float32(counts.foreground[block, n])
-                    observed += share * np.float32(counts.observed[block, n])
-        probability[p] = _probability(foreground, observed)
+    for chunk in prange(-(-len(points) // CHUNK)):
+        blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
+        shares = np.empty(CORNERS, np.float32)
+        for p in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(points))):
+            corner_voxels(grid, points[p], blocks, numbers, shares)
+            keep_near(grid, blocks, numbers, shares)
+            foreground = observed = np.float32(0.0)
+            for c in range(CORNERS):
+                if shares[c] > 0:
+                    foreground += shares[c] * np.float32(counts.foreground[blocks[c], numbers[c]])
+                    observed += shares[c] * np.float32(counts.observed[blocks[c], numbers[c]])
+            probability[p] = _probability(foreground, observed)
 
 
 class ObjectVolume:
@@ -223,16 +209,11 @@ class ObjectVolume:
 
     def fill(self, arrays: dict[str, Array]) -> None:
         """Takes over what `arrays` of another volume gave, into one that is empty."""
-        fill_grid(self.voxels, arrays)
+        self.voxels.allocate(np.asarray(arrays["block_coords"], np.int32))
+        for name in GRID_ARRAYS:
+            getattr(self.voxels.grid, name)[: self.block_count] = arrays[name]
+        find_solid_blocks(self.voxels.grid, self.block_count)
         self._grow()
         for name, counts in self._counts._asdict().items():
             counts[: self.block_count] = arrays[name]
         self._measure()
-
-
-def fill_grid(voxels: VoxelGrid, arrays: dict[str, Array]) -> None:
-    """Fills an empty grid with GRID_ARRAYS of another one."""
-    voxels.allocate(np.asarray(arrays["block_coords"], np.int32))
-    for name in GRID_ARRAYS:
-        getattr(voxels.grid, name)[: voxels.block_count] = arrays[name]
-    find_solid_blocks(voxels.grid, voxels.block_count)

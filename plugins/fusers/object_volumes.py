@@ -7,14 +7,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
-from framework.interfaces import MapFuser
 from framework.mapping.association import OverlapRule, Overlaps, count_overlaps, require_pixels_inside
 from framework.mapping.instance_fuser import VOTES_ACROSS
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceRecord
-from framework.mapping.labeled_map import require_same_classes
 from framework.mapping.object_map import ObjectMap
-from framework.mapping.sensor import Sensor
+from framework.mapping.tsdf_fuser import VoxelHashingFuser, require_same_classes
 from framework.parameters import check_bounds
 
 
@@ -26,7 +24,7 @@ def existence(record: InstanceRecord) -> float:
 
 
 @dataclass
-class ObjectVolumes(MapFuser):
+class ObjectVolumes(VoxelHashingFuser):
     """A TSDF for each object, with the probability of each voxel to be of the object, before one of everything.
 
     A detection belongs to the object that it overlaps most with, several may belong to one, and an object's masks of a
@@ -34,15 +32,6 @@ class ObjectVolumes(MapFuser):
     same_class=true`. How the maps differ from the originals': framework/mapping/object_map.py.
     """
 
-    voxel_size: float = 0.01  # m, > 0: of the background and of all objects
-    truncation: float = 4.0  # voxels, >= 1: the width of the band at depth 0
-    truncation_slope: float = 0.01  # m more for each m of depth, >= 0: as in our own map
-    min_depth: float = 0.2  # m, > 0
-    max_depth: float = 5.0  # m, > min_depth
-    max_weight: float = 200.0  # observations, 1 to 255: how slowly an old surface gives way
-    full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
-    max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0, in all volumes together
-    mask_band: float = 2.0  # voxels, >= 1: masks count for voxels within this distance of the measured surface
     overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap
     overlap_rule: OverlapRule = OverlapRule.IOU  # what an overlap is counted over
     same_class: bool = False  # whether their likeliest classes must be the same
@@ -50,37 +39,19 @@ class ObjectVolumes(MapFuser):
     create_points: int = 50  # pixels, >= 1: and this many; an object is seen, or missed, with this many in view
     min_existence: float = 0.1  # in [0, 1]: an object that exists with less probability is forgotten
     min_observations: int = 3  # frames, >= 1: before that an object is tentative, as in our own map
-    min_area: float = 0.01  # m^2 of its surface in the mesh, >= 0: likewise
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_bounds(
             self,
-            voxel_size=(1e-4, 1.0),
-            truncation=(1.0, 100.0),
-            truncation_slope=(0.0, 1.0),
-            min_depth=(1e-3, 100.0),
-            max_depth=(self.min_depth, 1000.0),
-            max_weight=(1.0, 255.0),
-            full_weight_depth=(1e-3, 1000.0),
-            max_blocks=(1, 2**31 // 512),
-            mask_band=(1.0, self.truncation),
             overlap=(0.0, 1.0),
             create_score=(0.0, 1.0),
             create_points=(1, 2**31),
             min_existence=(0.0, 1.0),
             min_observations=(1, 2**31),
-            min_area=(0.0, 1000.0),
-        )
-        sensor = Sensor(
-            truncation=np.float32(self.truncation * self.voxel_size),
-            truncation_slope=np.float32(self.truncation_slope),
-            min_depth=np.float32(self.min_depth),
-            max_depth=np.float32(self.max_depth),
-            max_weight=np.float32(self.max_weight),
-            full_weight_depth=np.float32(self.full_weight_depth),
         )
         confirmation = Confirmation(self.min_observations, min_confidence=0.0, min_area=self.min_area)
-        self.scene: ObjectMap = ObjectMap(self.voxel_size, sensor, self.max_blocks, confirmation)
+        self.scene: ObjectMap = ObjectMap(self.voxel_size, self.sensor, self.max_blocks, confirmation)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self.scene.classes = self.scene.classes or clusters.classes
@@ -89,7 +60,7 @@ class ObjectVolumes(MapFuser):
         overlaps = self._look_up(frame, pose.T_world_camera, clusters)
         instance_ids = self._associate(overlaps, clusters, frame)
         masks = _masks(clusters, instance_ids, frame.depth.shape)
-        self.scene.integrate(frame, pose.T_world_camera, masks, self.mask_band * self.voxel_size)
+        self.scene.integrate(frame, pose.T_world_camera, masks, self.label_band * self.voxel_size)
         self._observe(overlaps, clusters, instance_ids, frame)
         self._forget()
 
