@@ -121,7 +121,8 @@ class ObjectMap(TsdfMap):
             box = self._boxes(frame.camera, T_world_camera, [volume])[0]
             if box[0] < box[2] and box[1] < box[3]:
                 u0, v0, u1, v1 = min(u0, box[0]), min(v0, box[1]), max(u1, box[2]), max(v1, box[3])
-        volume.integrate(_cropped(frame, u0, v0, u1, v1), T_world_camera, mask[v0:v1, u0:u1], band)
+        part = np.ascontiguousarray(mask[v0:v1, u0:u1])
+        volume.integrate(_cropped(frame, u0, v0, u1, v1), T_world_camera, part, band)
 
     def _boxes(self, camera: Camera, T_world_camera: Float64, volumes: list[ObjectVolume]) -> Int32:
         """(M, 4) u0, v0, u1, v1: see boxes_in_view()."""
