@@ -283,6 +283,18 @@ def test_overlapping_objects_both_have_their_surface(frames: list[Frame]) -> Non
     assert len(second) > 20
 
 
+def test_where_objects_overlap_the_more_probable_one_is_seen_and_of_equal_ones_the_first(frames: list[Frame]) -> None:
+    frame, scene = frames[0], new_fuser().scene
+    T = frame.T_world_camera
+    assert T is not None
+    mask = masks_of(frame)[0]
+    first, second = scene.create(0), scene.create(0)
+    for ids, expected in [((first, second), first), ((second,), second), ((first,), first)]:
+        scene.integrate(frame, T, dict.fromkeys(ids, mask), 2 * VOXEL)
+        seen = scene.instances_seen(frame.camera, T, frame.depth, 2)
+        assert set(seen[mask[::2, ::2]]) == {expected}
+
+
 def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame], tmp_path: Path) -> None:
     default = numba.get_num_threads()
     if default < 2:
