@@ -137,12 +137,11 @@ class ObjectMap(TsdfMap):
         """
         shape = tuple(-(-side // stride) for side in depth.shape)
         instance_ids, best = np.zeros(shape, np.int32), np.full(shape, np.float32(FOREGROUND))
-        filled = {key: volume for key, volume in self.volumes.items() if volume.block_count}
-        if not filled:
+        if not self.volumes:
             return instance_ids
         view = pinhole(camera, T_world_camera)
-        boxes = self._boxes(camera, T_world_camera, list(filled.values()))
-        for (key, volume), (u0, v0, u1, v1) in zip(filled.items(), boxes.tolist(), strict=True):
+        boxes = self._boxes(camera, T_world_camera, list(self.volumes.values()))
+        for (key, volume), (u0, v0, u1, v1) in zip(self.volumes.items(), boxes.tolist(), strict=True):
             if u0 < u1 and v0 < v1:
                 window = -(-v0 // stride), -(-u0 // stride), -(-v1 // stride), -(-u1 // stride)
                 volume.look_up(depth, view, stride, window, key, instance_ids, best)

@@ -2,8 +2,8 @@
 
 After Fusion++ (McCormac et al. 2018): a voxel counts the observations in which a mask of the object lay over it and
 those in which none did. Its foreground probability is the mean of the Beta distribution that they make of the uniform
-one, and the object's surface is where that is above 1/2. So a mask that bleeds now and then does no harm; one that
-always bleeds does.
+one, and the object's surface is where that is above 1/2. So a mask that bleeds now and then does no harm where the same
+place is seen again later; one that always bleeds does.
 
 All that is measured in the volume's blocks is integrated, masked or not, and separated by that probability only: the
 distances at an object's outline are as good as elsewhere.
@@ -44,7 +44,7 @@ class MaskCounts(NamedTuple):
     """What masks said of each voxel."""
 
     foreground: npt.NDArray[np.uint16]  # (B, 512) observations under a mask of the object
-    observed: npt.NDArray[np.uint16]  # (B, 512) all of those in frames that had one; the last 2^16 are not counted
+    observed: npt.NDArray[np.uint16]  # (B, 512) all of those in frames that had a mask of it; 65535 at most
 
 
 VOLUME_ARRAYS = (*GRID_ARRAYS, *MaskCounts._fields)

@@ -61,6 +61,7 @@ class ObjectVolumes(VoxelHashingFuser):
         instance_ids = self._associate(overlaps, clusters, frame)
         masks = _masks(clusters, instance_ids, frame.depth.shape)
         self.scene.integrate(frame, pose.T_world_camera, masks, self.label_band * self.voxel_size)
+        self._take_back_empty(instance_ids)
         self._observe(overlaps, clusters, instance_ids, frame)
         self._forget()
 
@@ -81,8 +82,7 @@ class ObjectVolumes(VoxelHashingFuser):
             instance_ids[:] = np.where(shares.max(axis=1) > self.overlap, overlaps.instance_ids[best], 0)
         may_create = (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         for k in np.flatnonzero((instance_ids == 0) & may_create):
-            if self._in_range(clusters.pixels[clusters.cluster == k], frame):
-                instance_ids[k] = self.scene.create(frame.index)
+            instance_ids[k] = self.scene.create(frame.index)
         return instance_ids
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
@@ -92,10 +92,12 @@ class ObjectVolumes(VoxelHashingFuser):
         known = np.array([self.scene.table.records[k].class_evidence.argmax() for k in instance_ids.tolist()])
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])
 
-    def _in_range(self, pixels: Int32, frame: Frame) -> bool:
-        """Whether any of the pixels (P, 2) can be integrated: an object without voxels is never seen again."""
-        depth = frame.depth[pixels[:, 1], pixels[:, 0]]
-        return bool(((depth > self.min_depth) & (depth < self.max_depth)).any())
+    def _take_back_empty(self, instance_ids: Int32) -> None:
+        """Removes new objects of which no reading was in range: without voxels they are never seen again."""
+        for instance_id in set(instance_ids[instance_ids > 0].tolist()):
+            if not self.scene.volumes[instance_id].block_count:
+                self.scene.remove(instance_id)
+                instance_ids[instance_ids == instance_id] = 0
 
     def _observe(self, overlaps: Overlaps, clusters: PointClusters, instance_ids: Int32, frame: Frame) -> None:
         """Brings the table up to date with what this frame saw, and what it should have seen."""
