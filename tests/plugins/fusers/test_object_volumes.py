@@ -292,7 +292,7 @@ def test_where_objects_overlap_the_more_probable_one_is_seen_and_of_equal_ones_t
     for ids, expected in [((first, second), first), ((second,), second), ((first,), first)]:
         scene.integrate(frame, T, dict.fromkeys(ids, mask), 2 * VOXEL)
         seen = scene.instances_seen(frame.camera, T, frame.depth, 2)
-        assert set(seen[mask[::2, ::2]]) == {expected}
+        assert (seen[mask[::2, ::2]] == expected).mean() > 0.9, expected
 
 
 def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame], tmp_path: Path) -> None:
