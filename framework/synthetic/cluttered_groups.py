@@ -11,14 +11,14 @@ from framework.synthetic.groups import (
     against_wall,
     bed_group,
     beside,
-    couch_group,
     put_on,
     size,
+    with_low_table,
 )
 from framework.synthetic.piece import Furniture, Rng
 
 PILLOWS = 0.68  # m, from the wall to where a bed is free to lie on
-BACKREST = 0.48  # m, from the wall to where a couch is free to sit on
+BACKREST = 0.50  # m, from the wall to where a couch is free to sit on
 BORDER = 0.06  # m, of a bed or a couch on which nothing lies
 ARM = 0.24  # m, the widest arm of a couch
 SINK = 0.012  # m, how deep things lie in what is soft
@@ -33,19 +33,19 @@ def cluttered_bed_group(rng: Rng) -> Group:
     things = [
         soft_things.blanket(rng, rng.uniform(0.75, 0.95) * min(size(bed)[0], 1.2), rng.uniform(0.55, 0.7)),
         fixtures.backpack(rng).tilted(np.pi / 2),
+        tables.book_pile(rng),
         soft_things.clothes(rng),
         soft_things.throw_cushion(rng),
-        tables.book_pile(rng),
-        soft_things.throw_cushion(rng),
         tables.book(rng),
+        soft_things.throw_cushion(rng),
     ]
-    _scatter(group, bed, low[:2] + (BORDER, PILLOWS), high[:2] - BORDER, rng, things)
+    _scatter(group, [bed], low[:2] + (BORDER, PILLOWS), high[:2] - BORDER, rng, things)
     return group
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
     """A couch with its low table, on which cushions, a blanket, a bag and books lie."""
-    group = couch_group(rng)
+    group = with_low_table(seating.bare_couch(rng), rng)
     _clutter_couch(group, rng)
     return group
 
@@ -53,7 +53,7 @@ def cluttered_couch_group(rng: Rng) -> Group:
 def cluttered_couch(rng: Rng) -> Group:
     """The same couch without a table."""
     group = Group("couch")
-    couch = seating.couch(rng)
+    couch = seating.bare_couch(rng)
     group.add(couch, y=against_wall(couch))
     _clutter_couch(group, rng)
     return group
@@ -63,34 +63,44 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
     couch = group.pieces[0]
     low, high = couch.bounds()
     low_free, high_free = low[:2] + (ARM, BACKREST), high[:2] - (ARM, BORDER)
-    seat = _height(_vertices([couch]), low_free, high_free) - SINK
-    for x in np.linspace(low_free[0] + 0.3, high_free[0] - 0.3, 2):  # leaning on the back
-        leaning = soft_things.throw_cushion(rng).tilted(np.pi / 2 + 0.35)
-        group.add(leaning, x + rng.uniform(-0.08, 0.08), low_free[1] + 0.06, seat, rng.uniform(-0.15, 0.15))
+    side = 1 if rng.uniform() < 0.5 else -1
+    seat = _height([couch], low_free, high_free) - SINK
+    leaning = soft_things.throw_cushion(rng).tilted(np.pi / 2 + 0.35)
+    x = (high_free[0] if side > 0 else low_free[0]) - side * size(leaning)[0] / 2
+    leaning = group.add(leaning, x, low_free[1] + 0.04, seat, rng.uniform(-0.1, 0.1))
     things = [
-        soft_things.blanket(rng, rng.uniform(0.55, 0.75), rng.uniform(0.34, 0.40)),
+        soft_things.blanket(rng, rng.uniform(0.45, 0.65), rng.uniform(0.34, 0.40)),
         fixtures.backpack(rng).tilted(np.pi / 2),
-        tables.book(rng),
-        soft_things.throw_cushion(rng),
         tables.book_pile(rng),
+        soft_things.throw_cushion(rng),
+        tables.book(rng),
+        soft_things.clothes(rng),
     ]
-    _scatter(group, couch, low_free + (0.0, 0.06), high_free, rng, things)
+    _scatter(group, [couch, leaning], low_free, high_free, rng, things)
 
 
-def _scatter(group: Group, support: Furniture, low: Float64, high: Float64, rng: Rng, things: list[Furniture]) -> None:
-    """Lays things on `support` between the corners `low` and `high` (2,), m, on each other only for want of room."""
-    lying = [support]
+def _scatter(
+    group: Group, lying: list[Furniture], low: Float64, high: Float64, rng: Rng, things: list[Furniture]
+) -> None:
+    """Lays things on the first piece of `lying`, between the corners `low` and `high` (2,), m.
+
+    They lie beside the other pieces and beside each other, but on blankets. What finds no place is left out.
+    """
+    lying = [*lying]
     for thing in things:
-        places = [_random_place(thing, low, high, rng) for _ in range(PLACES)]
-        overlaps = [sum(_overlap(place, other) for other in lying[1:]) for place in places]
-        place = places[int(np.argmin(overlaps))]
-        box_low, box_high = place.bounds()
-        z = _height(_vertices(lying), box_low[:2], box_high[:2])
-        lying.append(group.add(place, z=z - SINK))
+        for _ in range(PLACES):
+            place = _random_place(thing, low, high, rng)
+            box_low, box_high = place.bounds()
+            if any(_overlap(place, other) for other in lying[1:] if other.kind != "blanket"):
+                continue
+            z = _height(lying, np.maximum(box_low[:2], low), np.minimum(box_high[:2], high))
+            lying.append(group.add(place, z=z - SINK))
+            break
 
 
 def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Furniture:
-    turned = thing.placed(0.0, 0.0, 0.0, rng.uniform(-0.5, 0.5) + np.pi * int(rng.integers(2)))
+    """`thing` lengthwise or across, somewhere between the corners, or amid them where it is too large for that."""
+    turned = thing.placed(0.0, 0.0, 0.0, np.pi / 2 * int(rng.integers(4)) + rng.uniform(-0.3, 0.3))
     turned_low, turned_high = turned.bounds()
     middle = (turned_low + turned_high)[:2] / 2
     free = np.maximum((high - low - (turned_high - turned_low)[:2]) / 2, 0)
@@ -98,19 +108,15 @@ def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Fu
     return turned.placed(float(x), float(y))
 
 
-def _overlap(piece: Furniture, other: Furniture) -> float:
-    """The area (m2) that two pieces' boxes share, seen from above."""
+def _overlap(piece: Furniture, other: Furniture) -> bool:
+    """Whether two pieces' boxes share ground, seen from above."""
     (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
-    shared = np.minimum(high, other_high)[:2] - np.maximum(low, other_low)[:2]
-    return float(np.prod(np.maximum(shared, 0)))
+    return bool((np.minimum(high, other_high)[:2] > np.maximum(low, other_low)[:2]).all())
 
 
-def _vertices(pieces: list[Furniture]) -> Float64:
-    return np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
-
-
-def _height(vertices: Float64, low: Float64, high: Float64) -> float:
-    """The greatest height among the vertices (V, 3) between the corners `low` and `high` (2,), m."""
+def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
+    """The height (m) of what is uppermost between the corners `low` and `high` (2,)."""
+    vertices = np.concatenate([solid.vertices for piece in pieces for solid, _ in piece.parts])
     within = ((vertices[:, :2] >= low) & (vertices[:, :2] <= high)).all(axis=1)
     return float(vertices[within, 2].max())
 

@@ -78,8 +78,12 @@ def bed_group(rng: Rng) -> Group:
 
 
 def couch_group(rng: Rng) -> Group:
+    return with_low_table(seating.couch(rng), rng)
+
+
+def with_low_table(couch: Furniture, rng: Rng) -> Group:
+    """A couch with a rug and a low table before it."""
     group = Group("couch")
-    couch = seating.couch(rng)
     couch = group.add(couch, y=against_wall(couch))
     front = couch.bounds()[1][1]
     low_table = tables.coffee_table(rng)

@@ -20,10 +20,10 @@ def throw_cushion(rng: Rng) -> Furniture:
 
 
 def blanket(rng: Rng, width: float, depth: float) -> Furniture:
-    """A thrown-down blanket, with creases up to 4 cm high."""
+    """A thrown-down blanket, with creases up to 3 cm high."""
     piece = Furniture("blanket", None)
     sheet = rounded_box(width, depth, 0.03, 0.012, 2, WEAVE)
-    piece.add(_crumpled(sheet, rng, 0.04, 0.05).moved(z=0.015), palette.patterned_cloth(rng))
+    piece.add(_crumpled(sheet, rng, 0.03, 0.05).moved(z=0.015), palette.patterned_cloth(rng))
     return piece
 
 
@@ -31,9 +31,9 @@ def clothes(rng: Rng) -> Furniture:
     """Two garments in a heap."""
     piece = Furniture("clothes", None)
     for k in range(2):
-        sheet = rounded_box(rng.uniform(0.42, 0.55), rng.uniform(0.34, 0.42), 0.07, 0.03, 3, WEAVE)
-        heap = _crumpled(sheet, rng, 0.05, 0.06).turned("z", rng.uniform(-0.7, 0.7))
-        piece.add(heap.moved(rng.uniform(-0.06, 0.06), rng.uniform(-0.06, 0.06), 0.035 + 0.05 * k), palette.cloth(rng))
+        sheet = rounded_box(rng.uniform(0.42, 0.55), rng.uniform(0.34, 0.42), 0.035, 0.016, 2, WEAVE)
+        heap = _crumpled(sheet, rng, 0.05, 0.08).turned("z", rng.uniform(-0.7, 0.7))
+        piece.add(heap.moved(rng.uniform(-0.06, 0.06), rng.uniform(-0.06, 0.06), 0.018 + 0.04 * k), palette.cloth(rng))
     return piece
 
 
