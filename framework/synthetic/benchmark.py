@@ -10,7 +10,6 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
-
 import numpy as np
 
 from framework.data import Camera, Float64, Int32

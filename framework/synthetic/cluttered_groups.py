@@ -39,7 +39,7 @@ def cluttered_bed_group(rng: Rng) -> Group:
         tables.book(rng),
         soft_things.throw_cushion(rng),
     ]
-    _scatter(group, [bed], low[:2] + (BORDER, PILLOWS), high[:2] - BORDER, rng, things)
+    _scatter(group, [bed], low[:2] + np.array([BORDER, PILLOWS]), high[:2] - BORDER, rng, things)
     return group
 
 
@@ -62,7 +62,7 @@ def cluttered_couch(rng: Rng) -> Group:
 def _clutter_couch(group: Group, rng: Rng) -> None:
     couch = group.pieces[0]
     low, high = couch.bounds()
-    low_free, high_free = low[:2] + (ARM, BACKREST), high[:2] - (ARM, BORDER)
+    low_free, high_free = low[:2] + np.array([ARM, BACKREST]), high[:2] - np.array([ARM, BORDER])
     side = 1 if rng.uniform() < 0.5 else -1
     seat = _height([couch], low_free, high_free) - SINK
     leaning = soft_things.throw_cushion(rng).tilted(np.pi / 2 + 0.35)

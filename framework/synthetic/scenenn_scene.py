@@ -87,6 +87,8 @@ class SceneNNScene:
 
     def __init__(self, folder: Path, spec: SceneSpec, recording: Recording) -> None:
         self.folder, self.recording = folder, recording
+        for kind in ("image", "depth"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
         self.camera = recording.camera
         self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
         scene = plan_scene(spec, self._stream, recording.frames)
