@@ -41,9 +41,9 @@ from framework.synthetic.renderer import depth_and_ids
 from framework.synthetic.room import Room, furnish_with
 
 SMALLEST = (4.2, 3.8)  # m, width and depth of the smallest room tried
-ATTEMPTS = 4  # scenes drawn, of which the walk that shows most is kept
+ATTEMPTS = 6  # scenes drawn, of which the walk that shows most is kept
 JUDGED_VIEWS = 30  # of a walk
-WELL_SEEN = 10  # px of an object in one of these views
+WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px of an object in one of these views; share of the views that show as many
 SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # what they are looked at with: a Kinect's field of view
 
 MakeGroup = Callable[[Rng], Group]
@@ -171,7 +171,7 @@ def _draw_scene(spec: SceneSpec, frames: int, rng: Rng) -> tuple[Scene, tuple[fl
 
     path = plan_path(room.layout, frames, labels, set(wanted), rng)
     views = [labels(path.pose(k)) for k in range(0, frames, -(-frames // JUDGED_VIEWS))]
-    seen = [i for i in wanted if max(np.count_nonzero(view == i) for view in views) >= WELL_SEEN]
+    seen = [i for i in wanted if np.mean([np.count_nonzero(view == i) >= WELL_SEEN for view in views]) >= LONG_SEEN]
     classes = len({wanted[i] for i in seen}) / len(set(wanted.values()))
     return Scene(room, path, rng), (classes, len(seen) / len(wanted))
 
