@@ -31,6 +31,7 @@ class PlyMesh:
     vertices: Float32  # (V, 3) m
     triangles: Int32  # (F, 3)
     properties: Mapping[str, Array]  # per vertex, (V,), other scalar properties by name, in the file's type
+    comments: tuple[str, ...]  # of the header, in order
 
 
 def read_ply(path: Path) -> PlyMesh:
@@ -52,7 +53,7 @@ def read_ply(path: Path) -> PlyMesh:
     vertices = _vertices(path, tables["vertex"])
     triangles = _triangles(path, tables["face"], len(vertices)) if "face" in tables else np.empty((0, 3), np.int32)
     properties = {name: values for name, values in tables["vertex"].scalars.items() if name not in AXES}
-    return PlyMesh(vertices, triangles, properties)
+    return PlyMesh(vertices, triangles, properties, header.comments)
 
 
 def write_ply(

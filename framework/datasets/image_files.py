@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from framework.data import Array, UInt8
+from framework.data import Array, UInt8, UInt16
 from framework.datasets.image_header import check_image
 from framework.errors import FrameError
 
@@ -20,7 +20,7 @@ def read_color(path: Path) -> UInt8:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def read_uint16(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
+def read_uint16(path: Path) -> UInt16:
     """The (H, W) uint16 values of a PNG file. Raises FrameError when it is damaged or of another type."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:

@@ -42,6 +42,7 @@ class Header:
 
     format: str  # one of FORMATS
     elements: tuple[Element, ...]  # in the file's order
+    comments: tuple[str, ...]  # without the word `comment`
     lines: int
     size: int  # bytes, the line end_header included
 
@@ -54,14 +55,17 @@ def parse_header(path: Path, data: bytes) -> Header:
     lines = _header_lines(path, data)
     format_name = ""
     elements: list[Element] = []
+    comments: list[str] = []
     for number, line in enumerate(lines, start=1):
         words = line.decode("latin-1").split()
         try:
             match words:
                 case ["ply"] if number == 1:
                     pass
-                case [] | ["comment" | "obj_info", *_] | ["end_header"]:
+                case [] | ["obj_info", *_] | ["end_header"]:
                     pass
+                case ["comment", *_]:
+                    comments.append(line.decode("latin-1").strip().removeprefix("comment").lstrip())
                 case ["format", name, "1.0"] if name in FORMATS and not format_name:
                     format_name = name
                 case ["element", name, rows]:
@@ -74,7 +78,7 @@ def parse_header(path: Path, data: bytes) -> Header:
             raise DataError(f"{path}, line {number}: {error}") from error
     if not format_name:
         raise DataError(f"{path}, line {len(lines)}: the header has no line 'format', one of {', '.join(FORMATS)}, 1.0")
-    header = Header(format_name, tuple(elements), len(lines), sum(map(len, lines)))
+    header = Header(format_name, tuple(elements), tuple(comments), len(lines), sum(map(len, lines)))
     _check_size(path, header, len(data) - header.size)
     return header
 
