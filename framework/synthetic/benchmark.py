@@ -143,7 +143,8 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int) -> Scene:
 
     Raises DataError when in none of them the furniture fits.
     """
-    best, most_shown = None, (-1.0, -1.0)
+    best: Scene | None = None
+    most_shown = (-1.0, -1.0)
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([*stream, attempt])
         try:
@@ -152,7 +153,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int) -> Scene:
             continue
         if shown > most_shown:
             best, most_shown = scene, shown
-        if shown == (1, 1):
+        if min(shown) == 1:
             break
     if best is None:
         raise DataError(f"the {spec.role}: its furniture does not fit; choose another seed")

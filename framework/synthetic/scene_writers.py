@@ -52,20 +52,22 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Recordin
         # the scene that it has in memory.
         spawn = multiprocessing.get_context("spawn")
         pools = [stack.enter_context(ProcessPoolExecutor(1, spawn, _begin_process)) for _ in range(jobs)]
-        running: dict[Future[int], tuple[ProcessPoolExecutor, _Scene]] = {}
-        idle: list[tuple[ProcessPoolExecutor, _Scene | None]] = [(pool, None) for pool in pools]
+        running: dict[Future[int], ProcessPoolExecutor] = {}
+        last: dict[ProcessPoolExecutor, _Scene] = {}
+        idle = pools
         while True:
-            for pool, last in idle:
-                scene = _choose(scenes, last)
+            for pool in idle:
+                scene = _choose(scenes, last.get(pool))
                 if scene is not None:
-                    running[pool.submit(_write, scene.folder, scene.spec, recording, scene.take())] = pool, scene
+                    running[pool.submit(_write, scene.folder, scene.spec, recording, scene.take())] = pool
+                    last[pool] = scene
             if not running:
                 return
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             idle = [running.pop(future) for future in ended]
-            for future, (_, scene) in zip(ended, idle, strict=True):
-                bar.update(_result(future, scene.folder))
-                scene.running -= 1
+            for future, pool in zip(ended, idle, strict=True):
+                bar.update(_result(future, last[pool].folder))
+                last[pool].running -= 1
 
 
 def _begin(root: Path, recording: Recording) -> None:

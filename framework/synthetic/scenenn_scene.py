@@ -166,4 +166,4 @@ def trajectory_file(folder: Path) -> Path:
 def _write_png(path: Path, image: Array) -> None:
     _, data = cv2.imencode(".png", image, PNG)
     with written_whole(path) as temporary:
-        temporary.write_bytes(data)
+        temporary.write_bytes(data.tobytes())
