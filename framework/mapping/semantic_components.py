@@ -12,8 +12,8 @@ from framework.data import Float64, Int32, UInt8
 from framework.mapping.class_evidence import ClassEvidence, best_class
 from framework.mapping.evidence import NO_CLASS
 from framework.mapping.meshing import Surface
-from framework.mapping.vertex_labels import CHUNK, CORNERS, corner_voxels, keep_near, majority
-from framework.mapping.voxel_grid import BLOCK_VOXELS, Grid, device, unpack_color
+from framework.mapping.vertex_labels import CHUNK, CORNERS, color_of, corner_voxels, keep_near, majority
+from framework.mapping.voxel_grid import BLOCK_VOXELS, Grid, device
 from framework.refinement.union_find import root, unite
 
 
@@ -33,8 +33,7 @@ def _label(grid, evidence, log_missed, vertices, voxels, colors, class_ids):
         blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         labels, shares = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
         for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(voxels))):
-            red, green, blue = unpack_color(grid.color[voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS])
-            colors[v, 0], colors[v, 1], colors[v, 2] = red / 4, green / 4, blue / 4
+            color_of(grid.color, voxels[v], colors[v])
             class_ids[v] = -1
             if corner_voxels(grid, vertices[v], blocks, numbers, shares):
                 class_ids[v] = _elect(grid, evidence, log_missed, blocks, numbers, shares, labels)

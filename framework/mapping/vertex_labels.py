@@ -89,7 +89,7 @@ def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
 
 
 @device
-def _color_of(color, voxel, out):
+def color_of(color, voxel, out):
     """The colour of a voxel, numbered as in a Surface, into `out` (3,)."""
     red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
     out[0], out[1], out[2] = red / 4, green / 4, blue / 4
@@ -98,7 +98,7 @@ def _color_of(color, voxel, out):
 @njit(cache=True, nogil=True, parallel=True)
 def _color(color, voxels, colors):
     for v in prange(len(voxels)):
-        _color_of(color, voxels[v], colors[v])
+        color_of(color, voxels[v], colors[v])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -107,7 +107,7 @@ def _label(grid, evidence, counts, vertices, voxels, colors, instance_ids, class
         blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         ids, shares = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
         for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(voxels))):
-            _color_of(grid.color, voxels[v], colors[v])
+            color_of(grid.color, voxels[v], colors[v])
             instance, label = np.int32(0), np.int32(-1)
             if corner_voxels(grid, vertices[v], blocks, numbers, shares):
                 instance, label = _elect(grid, evidence, counts, blocks, numbers, shares, ids)
