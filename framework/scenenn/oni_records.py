@@ -6,7 +6,7 @@ import shutil
 import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -60,7 +60,8 @@ class Contents:
     end: int  # bytes of whole records
     cut_off: bool  # whether what follows them is no record, though the recording goes on
     largest_node: int
-    seek_tables: tuple[struct.Struct, tuple[int, ...]] = field(repr=False)  # how and where their places are noted
+    wide: bool  # whether places in the file have 64 bits, else 32
+    table_notes: tuple[int, ...]  # where the places of the tables for seeking are noted
 
 
 def read_contents(path: Path) -> Contents:
@@ -84,15 +85,14 @@ def playable(contents: Contents, scratch: Path) -> Iterator[Path]:
     if not contents.cut_off:
         yield contents.path
         return
-    place, notes = contents.seek_tables
-    record_header = struct.Struct("<4s4I" + place.format[-1])
+    place, record_header = _layouts(contents.wide)
     with TemporaryDirectory(prefix=".", dir=scratch) as folder:
         copy = Path(folder) / "mended.oni"
         shutil.copyfile(contents.path, copy)
         with copy.open("r+b") as file:
             file.seek(LARGEST_NODE_AT)  # a recorder that was killed has not noted it
             file.write(struct.pack("<I", contents.largest_node))
-            for note in notes:
+            for note in contents.table_notes:
                 file.seek(note)
                 file.write(place.pack(0))  # 0 = there is no table
             file.seek(contents.end)
@@ -111,11 +111,11 @@ class _Record:
 
 def _read_contents(path: Path, file: BinaryIO) -> Contents:
     wide = _read_version(path, file) >= FIRST_WIDE
-    place = struct.Struct("<Q" if wide else "<I")
+    place, record_header = _layouts(wide)
     streams: dict[Stream, Images] = {}
     notes = []
     end, cut_off, largest_node = FILE_HEADER.size, True, 0
-    for record in _records(file, struct.Struct("<4s4I" + place.format[-1])):
+    for record in _records(file, record_header):
         end, cut_off = record.end, record.kind != Record.END
         largest_node = max(largest_node, record.node)
         if record.kind in (Record.NODE_ADDED_1_0_0_4, Record.NODE_ADDED_1_0_0_5, Record.NODE_ADDED):
@@ -130,7 +130,13 @@ def _read_contents(path: Path, file: BinaryIO) -> Contents:
         if stream not in streams or not streams[stream].count:
             where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
             raise DataError(f"{path} has no {stream.name.lower()} image{where}; it needs depth and color")
-    return Contents(path, streams, end, cut_off, largest_node, (place, tuple(notes)))
+    return Contents(path, streams, end, cut_off, largest_node, wide, tuple(notes))
+
+
+def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
+    """Of a place in the file, and of what a record begins with: magic, kind, node, two sizes, a place."""
+    place = "Q" if wide else "I"
+    return struct.Struct(f"<{place}"), struct.Struct(f"<4s4I{place}")
 
 
 def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:

@@ -59,7 +59,7 @@ def test_a_recording_that_was_cut_off_anywhere_is_mended_to_its_whole_records(tm
             mended = read_contents(played)
             assert not mended.cut_off
             assert mended.streams == contents.streams
-            positions = [struct.unpack_from("<Q", played.read_bytes(), at)[0] for at in mended.seek_tables[1]]
+            positions = [struct.unpack_from("<Q", played.read_bytes(), at)[0] for at in mended.table_notes]
             assert positions == [0, 0] if wide else positions == []
         assert not any(scratch.iterdir())
     assert counts == {2, 3, 4, 5}
