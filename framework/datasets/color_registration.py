@@ -18,7 +18,7 @@ LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Where the colour of a pixel of the depth camera comes from. Raises DataError when that is too much of an image."""
+    """Where the colour of a pixel of the depth camera comes from. Raises DataError where that would be too large."""
 
     color: Camera
     depth: Camera
@@ -27,8 +27,8 @@ class ColorRegistration:
         width, height = self._fine * self.depth.width, self._fine * self.depth.height
         if width * height > MOST_PIXELS or max(width, height, *self.color.shape) > LONGEST_SIDE:
             raise DataError(
-                f"colour of fx = {self.color.fx:g} px and {self.color.width}x{self.color.height} px cannot be moved into "
-                f"a depth camera of fx = {self.depth.fx:g} px and {self.depth.width}x{self.depth.height} px"
+                f"colour of {self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px cannot be moved "
+                f"into a depth camera of {self.depth.width}x{self.depth.height} px and fx = {self.depth.fx:g} px"
             )
 
     @property

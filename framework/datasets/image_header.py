@@ -16,7 +16,7 @@ JPEG_SCAN = 0xDA  # the marker SOS: the picture begins
 
 
 def check_image(name: Path | str, data: bytes) -> None:
-    """Raises FrameError, naming the byte of `name`, unless `data` is a whole PNG or JPEG file with a picture of a usual size.
+    """Raises FrameError, naming the byte, unless `data` is a whole PNG or JPEG file with a picture of a usual size.
 
     OpenCV decodes a JPEG that ends too early without a word (seen in 4.x) and allocates whatever a header claims.
     """

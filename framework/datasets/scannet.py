@@ -7,8 +7,8 @@
     scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
                                         optional: the mesh, its segments, and the objects made of these
-    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or above: which class is meant by what
-                                        the annotators wrote
+    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or the one above: which class is meant by
+                                        what the annotators wrote
 
 Colour (1296x968) is moved into the depth camera (640x480), which is that of the frames.
 """
@@ -18,6 +18,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,9 +31,10 @@ from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, Recor
 from framework.datasets.scannet_annotation import LABEL_TABLE, read_label_table, read_labeled_mesh
 from framework.datasets.sens_file import SensFile, SensFrame, open_sens
 from framework.errors import DataError, FrameError
-from framework.geometry import rotation_angle
+from framework.geometry import inverse, rotation_angle
 from framework.matrix_file import PrintedMatrix, read_matrix
 
+MESH, SEGMENTS, OBJECTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"
 DEPTH_SCALE = 1000.0  # units a metre, of exported depth
 COLOR_SIZE = (1296, 968)  # px; exported colour may be smaller, its intrinsics are still those of this size
 NEAR = 2.0  # m, where what is left of the parallax is told
@@ -56,7 +58,7 @@ class ScanNet(Recording):
         self._mesh = self._optional_mesh()
         if self._mesh is None and self.frame_truth:
             raise DataError(
-                f"dataset.frame_truth needs {self.folder / self.name}_vh_clean_2.ply and its two .json files"
+                f"dataset.frame_truth needs a labelled mesh: {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
             )
         self.annotation = "ScanNet v2" if self._mesh else ""
         sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
@@ -81,17 +83,15 @@ class ScanNet(Recording):
 
     def _optional_mesh(self) -> LabeledMesh | None:
         """The labelled mesh; None, with a word in the log where only some are missing, without all of its files."""
-        endings = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")
-        mesh, segs, aggregation = paths = [self.folder / f"{self.name}{ending}" for ending in endings]
+        mesh, segs, aggregation = paths = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
         missing = [path for path in paths if not path.exists()]
         if 0 < len(missing) < len(paths):
             log.warning("no true instances: %s is missing", missing[0])
         if missing:
             return None
-        tables = [
-            path for path in (self.root / LABEL_TABLE, self.folder.resolve().parents[1] / LABEL_TABLE) if path.exists()
-        ]
-        return read_labeled_mesh(mesh, segs, aggregation, read_label_table(tables[0]) if tables else {})
+        tables = [parent / LABEL_TABLE for parent in self.folder.resolve().parents[:2]]
+        nyu40 = next((read_label_table(table) for table in tables if table.exists()), {})
+        return read_labeled_mesh(mesh, segs, aggregation, nyu40)
 
 
 def _sens_contents(path: Path) -> Contents:
@@ -101,7 +101,7 @@ def _sens_contents(path: Path) -> Contents:
         if not _fits(camera):
             raise DataError(f"{path}: {name} intrinsics do not belong to images of {camera.width}x{camera.height} px")
     _warn_of_parallax(path, header.color_extrinsics, header.depth_extrinsics, header.depth_camera)
-    registration = ColorRegistration(header.color_camera, header.depth_camera)
+    registration = _registration(path, header.color_camera, header.depth_camera)
     frames = [
         RecordedFrame.posed(RegisteredImages(frame, registration), time, frame.camera_to_world.pose)
         for frame, time in zip(file.frames, _times(path, file.frames), strict=True)
@@ -120,7 +120,7 @@ def _lost_frames(path: Path, file: SensFile, frames: Sequence[RecordedFrame]) ->
 def _times(path: Path, frames: Sequence[SensFrame]) -> list[float]:
     """Seconds of each frame: of its depth image, or at 30 Hz where these do not grow."""
     times = [frame.depth_time / 1e6 for frame in frames]
-    if all(a < b for a, b in zip(times, times[1:], strict=False)):
+    if all(a < b for a, b in pairwise(times)):
         return times
     log.info("%s: the times do not grow from frame to frame; frames are taken to come at %g Hz", path, FRAME_RATE)
     return [k / FRAME_RATE for k in range(len(frames))]
@@ -134,8 +134,8 @@ def _exported_contents(folder: Path) -> Contents:
     color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *_first_size(colors.values(), read_color))
     extrinsics = [intrinsic / f"extrinsic_{name}.txt" for name in ("color", "depth")]
     if all(path.exists() for path in extrinsics):
-        _warn_of_parallax(intrinsic, *(read_matrix(path) for path in extrinsics), depth_camera)
-    registration = ColorRegistration(color_camera, depth_camera)
+        _warn_of_parallax(intrinsic, read_matrix(extrinsics[0]), read_matrix(extrinsics[1]), depth_camera)
+    registration = _registration(intrinsic, color_camera, depth_camera)
     # a frame of which one image is missing is there: reading it says which
     frames = []
     for k in sorted(colors.keys() | depths.keys()):
@@ -175,27 +175,36 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
     """The camera of exported colour, which the SensReader may have made smaller without touching the intrinsics."""
-    if not _fits(read_matrix(path).camera(*COLOR_SIZE)):
+    camera = read_matrix(path).camera(*COLOR_SIZE)
+    if _fits(read_matrix(path).camera(width, height)) or not _fits(camera):
         return _camera(path, width, height)
-    camera = _camera(path, *COLOR_SIZE)
     u, v = width / camera.width, height / camera.height
     # pixel centres are at integers
     return Camera(width, height, u * camera.fx, v * camera.fy, u * (camera.cx + 0.5) - 0.5, v * (camera.cy + 0.5) - 0.5)
 
 
+def _registration(source: Path, color: Camera, depth: Camera) -> ColorRegistration:
+    try:
+        return ColorRegistration(color, depth)
+    except DataError as error:
+        raise DataError(f"{source}: {error}") from error
+
+
 def _fits(camera: Camera) -> bool:
     """Whether the intrinsics can be those of images of this size: no camera looks so far past their middle."""
-    return (
-        abs(camera.cx - camera.width / 2) <= camera.width / 4
-        and abs(camera.cy - camera.height / 2) <= camera.height / 4
-    )
+    u, v = camera.cx / camera.width, camera.cy / camera.height
+    return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
 
 
 def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
     """Says by how much colour is shifted where the two cameras do not have the same extrinsics."""
-    T_color_depth = np.linalg.inv(color.pose()) @ depth.pose()
+    try:
+        T_color_depth = inverse(color.pose()) @ depth.pose()
+    except DataError:
+        log.warning("%s: the extrinsics are no rigid motion; the two cameras are taken to be at one place", source)
+        return
     baseline, angle = float(np.linalg.norm(T_color_depth[:3, 3])), rotation_angle(T_color_depth[:3, :3])
-    shift = camera.fx * (baseline / NEAR + abs(angle))
+    shift = camera.fx * (baseline / NEAR + angle)
     if shift > SAME_WITHIN:
         log.warning(
             "%s: colour and depth camera are %.0f mm and %.2f degrees apart, which is not applied: colour is shifted by"
