@@ -47,9 +47,9 @@ log = logging.getLogger(__name__)
 class ScanNet(Recording):
     """A scan of ScanNet v2, from its `.sens` file where there is one, otherwise from exported images.
 
-    Extrinsics between the two cameras are not applied: ScanNet publishes identities, its depth being registered to
-    colour already; a warning tells what others would matter. Truth is the labelled mesh, all of it, whatever frames
-    are chosen.
+    Extrinsics between the two cameras are not applied: its authors say that depth is registered to colour already, and
+    publish identities; a warning tells by how many pixels colour is shifted where a recording has others. Truth is the
+    labelled mesh, all of it, whatever frames are chosen.
     """
 
     frame_truth: bool = False  # whether the labelled mesh is rendered into each frame, as some detectors need it
@@ -143,14 +143,15 @@ def _exported_contents(folder: Path) -> Contents:
             colors.get(k, folder / "color" / f"{k}.jpg"),
             depths.get(k, folder / "depth" / f"{k}.png"),
         )
-        frames.append(_exported_frame(RegisteredImages(files, registration), folder / "pose", k))
+        pose = folder / "pose" / f"{files.depth_name.stem}.txt"
+        frames.append(_exported_frame(RegisteredImages(files, registration), pose, k))
     return Contents(depth_camera, intrinsic / "intrinsic_depth.txt", DEPTH_SCALE, frames)
 
 
-def _exported_frame(images: RegisteredImages, poses: Path, k: int) -> RecordedFrame:
-    if not poses.is_dir():
+def _exported_frame(images: RegisteredImages, pose: Path, k: int) -> RecordedFrame:
+    if not pose.parent.is_dir():
         return RecordedFrame(images, k / FRAME_RATE)
-    return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(poses / f"{k}.txt").pose())
+    return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(pose).pose())
 
 
 def _first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:

@@ -148,6 +148,18 @@ def test_a_missing_file_is_the_fault_of_its_frame(tmp_path: Path, name: str) -> 
     assert name.rpartition(".")[0] in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
+def test_frames_may_be_missing_and_their_names_padded(tmp_path: Path) -> None:
+    written = shots(4)
+    write_exported(tmp_path / SCENE, written)
+    for k in range(4):
+        for path in sorted((tmp_path / SCENE).glob(f"[cdp]*/{k}.*")):
+            path.rename(path.with_stem(f"{100 * k:06d}")) if k % 2 else path.unlink()
+    frames = list(ScanNet(tmp_path, SCENE))
+    assert [(frame.index, frame.timestamp) for frame in frames] == [(0, 100 / 30), (1, 10)]
+    np.testing.assert_array_equal(frames[1].depth, written[3].depth.astype(np.float32) / np.float32(1000))
+    np.testing.assert_allclose(frames[1].T_world_camera, written[3].T_world_camera, atol=1e-6)
+
+
 def test_without_poses_none_are_known(tmp_path: Path) -> None:
     write_exported(tmp_path / SCENE, shots(1))
     (tmp_path / SCENE / "pose/0.txt").unlink()
