@@ -57,8 +57,8 @@ def test_intrinsics_are_a_pinhole_camera_or_refused_with_their_place() -> None:
     for row, column, value in ((0, 1, 0.1), (2, 0, 1), (2, 2, 2), (0, 0, np.nan), (3, 3, 0)):
         wrong = K.copy()
         wrong[row, column] = value
-        with pytest.raises(DataError, match="^here: expected intrinsics"):
+        with pytest.raises(DataError, match=r"^here: expected intrinsics"):
             PrintedMatrix("here", wrong).camera(640, 480)
     K[0, 0] = -585
-    with pytest.raises(DataError, match="^here: Camera: fx, fy must be positive"):
+    with pytest.raises(DataError, match=r"^here: Camera: fx, fy must be positive"):
         PrintedMatrix("here", K).camera(640, 480)

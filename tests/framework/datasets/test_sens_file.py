@@ -92,6 +92,14 @@ def test_a_wrong_field_of_the_header_is_named_by_its_byte(path: Path, byte: int,
     assert "\n" not in str(caught.value)
 
 
+def test_more_frames_than_anyone_records_are_not_believed_of_a_large_file_either(path: Path) -> None:
+    path.write_bytes(sens(shots(1), count=MOST_FRAMES + 1))
+    with path.open("r+b") as file:
+        file.truncate((MOST_FRAMES + 100) * FRAME.size)
+    with pytest.raises(DataError, match=f"{MOST_FRAMES + 1} frames cannot be in a file"):
+        open_sens(path)
+
+
 def test_a_cut_file_keeps_the_frames_before_the_cut(path: Path) -> None:
     content = sens(shots())
     last = starts(path, content)[2]
