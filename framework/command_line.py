@@ -8,12 +8,15 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 
+from hydra._internal.core_plugins.basic_launcher import BasicLauncherConf
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
@@ -64,7 +67,6 @@ class Jobs:
     """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and counts the failed."""
 
     failed: int = 0
-    process: int = field(default_factory=os.getpid)
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
         """`job`, with its faults in the log: one line for a known error, the traceback for others and with `debug`."""
@@ -76,8 +78,8 @@ class Jobs:
             except Exception as error:
                 known = isinstance(error, KNOWN_ERRORS)
                 _log_error(one_line(error), error if config.get("debug") or not known else None)
-                if os.getpid() != self.process:  # a worker of a parallel launcher: Hydra carries the error to where
-                    raise  # somebody counts
+                if _in_worker():  # Hydra carries the error, if it can be pickled, to where the sweep was started
+                    raise InstanceMapError(f"a run failed: {one_line(error)}") from None
                 self.failed += 1
 
         return reported_job
@@ -88,6 +90,12 @@ class Jobs:
             command()
         if self.failed:
             sys.exit(EXIT_FAILED)
+
+
+def _in_worker() -> bool:
+    """Whether a job runs in another process than the sweep: in one of a launcher that is not Hydra's own."""
+    own = HydraConfig.get()
+    return own.mode == RunMode.MULTIRUN and own.launcher._target_ != BasicLauncherConf._target_
 
 
 def one_line(error: BaseException) -> str:

@@ -287,7 +287,9 @@ def _same(records: Sequence[Record]) -> str:
 
 
 def _machine(record: Record) -> str:
-    return f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
+    cores = f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
+    threads = record.config.get("threads")
+    return f"{cores}, threads={threads}" if threads else cores
 
 
 def _counted(words: Iterable[str]) -> str:
