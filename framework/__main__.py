@@ -24,7 +24,7 @@ def job(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
-    with locked(directory):
+    with locked(directory, wait=config.resume):  # where the sweep was killed and not its workers, they go on
         if config.resume and is_recorded(directory, config):
             return
         from framework.run import run  # here, so that a misspelt name is answered before the heavy libraries load

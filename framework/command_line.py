@@ -113,10 +113,17 @@ def one_line(error: BaseException) -> str:
     return _joined(str(error)) or type(error).__name__
 
 
+_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
+"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
+
+
 def _no_such_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return _joined(str(error))
+    if group == "hydra/launcher" and name in _EXTRAS:
+        extra = _EXTRAS[name]
+        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
     options = list(error.options or ())
     close = get_close_matches(name, options, n=1)
     suggestion = f"; did you mean {close[0]}?" if close else "."

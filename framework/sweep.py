@@ -49,8 +49,10 @@ def sweep_in(directory: Path, with_table: bool) -> Iterator[None]:
     """
     from framework.reports.tables import write_tables  # here: workers import this module, and make no tables
 
-    # `kill` ends a sweep like Ctrl-C, so that no worker is left behind
+    # `kill` ends a sweep like Ctrl-C: no worker is left behind
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    # joblib ends its workers without their help, and Python's own clean-up warns of that
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
     with locked(directory):
         try:
             yield
@@ -59,9 +61,9 @@ def sweep_in(directory: Path, with_table: bool) -> Iterator[None]:
                 with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
                     print(write_tables(directory))
             if _is_of_a_launcher(error):
+                told = textwrap.shorten(one_line(error), 300)
                 raise InstanceMapError(
-                    f"the sweep ended early, and the same command goes on with it; the launcher says: "
-                    f"{textwrap.shorten(one_line(error), 300)}"
+                    f"the sweep ended early, and the same command goes on with it: {told}"
                 ) from error
             raise
         if with_table:
