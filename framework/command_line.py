@@ -13,10 +13,8 @@ from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 
-from hydra._internal.core_plugins.basic_launcher import BasicLauncherConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
@@ -95,7 +93,8 @@ class Jobs:
 def _in_worker() -> bool:
     """Whether a job runs in another process than the sweep: in one of a launcher that is not Hydra's own."""
     own = HydraConfig.get()
-    return own.mode == RunMode.MULTIRUN and own.launcher._target_ != BasicLauncherConf._target_
+    of_sweep = not OmegaConf.is_missing(own.job, "num")
+    return of_sweep and not str(own.launcher._target_).endswith(".BasicLauncher")
 
 
 def one_line(error: BaseException) -> str:
