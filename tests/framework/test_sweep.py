@@ -27,9 +27,9 @@ RUNS = {f"row={row},seed={seed}" for row in ("all", "half") for seed in (1, 3)}
 PATIENCE_S = 180
 
 
-def begin(directory: Path, *arguments: str) -> subprocess.Popen[str]:
-    """The fake experiment, with its own process group: what a terminal makes of a command."""
-    fakes = ["--config-dir", str(CHECKOUT / "tests" / "fake_conf"), "experiment=fake_ablation"]
+def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation") -> subprocess.Popen[str]:
+    """The fake experiment or another sweep, with its own process group: what a terminal makes of a command."""
+    fakes = ["--config-dir", str(CHECKOUT / "tests" / "fake_conf"), sweep]
     clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
     environment = clean | {"PYTHONPATH": str(CHECKOUT), "RAY_AUTH_MODE": "disabled"}  # else Ray writes into the home
     return subprocess.Popen(
@@ -134,6 +134,18 @@ def test_a_killed_sweep_goes_on_to_the_same_table(
         assert (tmp_path / PLACE / name).read_bytes() == (whole[0] / PLACE / name).read_bytes()
 
 
+def test_a_sweep_without_an_experiment_has_one_place_and_tells_what_failed(tmp_path: Path) -> None:
+    """Its place is named after the time, which workers must not read anew."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    fakes = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+    done = end(begin(tmp_path, *fakes, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith("error: a run failed: dataset tests.corner_room.CornerRoom: frames")
+    [place] = (tmp_path / "multirun").iterdir()
+    assert len(list(place.glob("*dataset.frames=*/instancemap.log"))) == 2
+    assert not list(place.glob("*launcher*"))
+
+
 @pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Signals) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -171,8 +183,8 @@ def test_two_sweeps_do_not_share_a_place(tmp_path: Path) -> None:
     with locked(tmp_path / PLACE):
         done = end(begin(tmp_path))
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr.count("\n") == 1
-    assert f"error: {PLACE} is in use by process {os.getpid()} on " in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert f"error: {tmp_path / PLACE} is in use by process {os.getpid()} on " in done.stderr
     assert not (tmp_path / PLACE / "multirun.yaml").exists()
 
 
