@@ -31,6 +31,7 @@ Float32 = npt.NDArray[np.float32]
 Float64 = npt.NDArray[np.float64]
 Int32 = npt.NDArray[np.int32]
 UInt8 = npt.NDArray[np.uint8]
+UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
 ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| that still counts as rigid: published poses carry 4 digits

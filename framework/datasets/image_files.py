@@ -7,11 +7,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from framework.data import Array, UInt8
+from framework.data import Array, UInt8, UInt16
+from framework.datasets.image_header import check_image
 from framework.errors import FrameError
-
-JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
-PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"IEND\xaeB`\x82"
 
 
 def read_color(path: Path) -> UInt8:
@@ -22,7 +20,7 @@ def read_color(path: Path) -> UInt8:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
-def read_uint16(path: Path) -> np.ndarray[tuple[int, ...], np.dtype[np.uint16]]:
+def read_uint16(path: Path) -> UInt16:
     """The (H, W) uint16 values of a PNG file. Raises FrameError when it is damaged or of another type."""
     image = _decode(path, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
@@ -36,7 +34,7 @@ def _decode(path: Path, flags: int) -> Array:
         data = path.read_bytes()
     except OSError as error:
         raise FrameError(f"{path} could not be read: {error.strerror or error}") from error
-    _check_whole(path, data)
+    check_image(path, data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -44,18 +42,3 @@ def _decode(path: Path, flags: int) -> Array:
     if image is None:
         raise FrameError(f"{path} could not be decoded: the file is damaged")
     return np.asarray(image)
-
-
-def _check_whole(path: Path, data: bytes) -> None:
-    """OpenCV decodes a JPEG that ends too early without a word (seen in 4.x), so the end is looked at first."""
-    if not data:
-        raise FrameError(f"{path} is empty")
-    tail = data[-64:].rstrip(b"\0")  # some cameras pad their files with zeros
-    if data.startswith(JPEG_START):
-        whole = tail.endswith(JPEG_END)
-    elif data.startswith(PNG_START):
-        whole = tail.endswith(PNG_END)
-    else:
-        raise FrameError(f"{path} is neither a JPEG nor a PNG file")
-    if not whole:
-        raise FrameError(f"{path} is truncated: it ends after {len(data)} bytes without its end marker")

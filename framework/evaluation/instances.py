@@ -77,17 +77,23 @@ class PredictedInstances:
     def of_map(
         cls, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: Sequence[str]
     ) -> PredictedInstances:
-        """All `instances` of a map with its `mesh`; `classes` name the columns of their class probabilities.
+        """All `instances` of a map with its `mesh`; `classes` name the columns of their class probabilities."""
+        ids = sorted(instances)
+        names = [classes[int(instances[key].class_probabilities.argmax())] for key in ids]
+        return cls.on_mesh(mesh, ids, [instances[key].confidence for key in ids], names)
 
-        Vertices of ids that `instances` does not list (tentative ones) are of no instance.
-        """
-        ids = np.array(sorted(instances), np.int64)
+    @classmethod
+    def on_mesh(
+        cls, mesh: InstanceMesh, ids: Sequence[int], confidences: Sequence[float], class_names: Sequence[str]
+    ) -> PredictedInstances:
+        """What is claimed about each of the `ids`; vertices of other ids, tentative ones, are of no instance."""
+        listed = np.array(ids, np.int64)
         return cls(
             points_world=mesh.vertices,
-            instance_ids=np.where(np.isin(mesh.instance_ids, ids), mesh.instance_ids, 0).astype(np.int32),
-            ids=ids,
-            confidences=np.array([instances[int(k)].confidence for k in ids], np.float64),
-            class_names=tuple(classes[int(instances[int(k)].class_probabilities.argmax())] for k in ids),
+            instance_ids=np.where(np.isin(mesh.instance_ids, listed), mesh.instance_ids, 0).astype(np.int32),
+            ids=listed,
+            confidences=np.array(confidences, np.float64),
+            class_names=tuple(class_names),
         )
 
 
@@ -125,7 +131,18 @@ class InstanceEvaluation:
         return float(np.mean([score.ap for score in scores.values()])) if scores else float("nan")
 
     def metrics(self) -> dict[str, float]:
-        """Flat metric names as in design.md; empty where nothing could be evaluated."""
+        """The figures by their names in metrics.json, in [0, 1] or counts; empty where nothing could be evaluated.
+
+        `instances.`... over the classes with a true instance, or for one of them with `.<class>` behind it:
+
+        - `ap50`, `ap25`: AP at IoU 0.5 and 0.25; `ap`: the mean over IOU_THRESHOLDS. Each also by class.
+        - `ap50_agnostic`, `ap25_agnostic`: AP with all classes taken for one.
+        - `mean_iou`: the best overlap of each true instance with a prediction of whatever class, averaged.
+        - `precision50`, `recall50`, `f1_50`: at IoU 0.5, of all predictions and all true instances together.
+        - `pq50`: the panoptic quality of each class at IoU 0.5, averaged.
+        - `true_count`: true instances that count, also by class; `ignored_count`: predictions that are neither right
+          nor wrong at IoU 0.5.
+        """
         if self.overall is None:
             return {}
         tp, fp, truths = self.overall.true_positives, self.overall.false_positives, self.overall.truths
@@ -140,11 +157,14 @@ class InstanceEvaluation:
             "instances.recall50": tp / truths,
             "instances.f1_50": 2 * tp / (tp + fp + truths),
             "instances.pq50": float(np.mean([score.panoptic_quality for score in self.by_class[0.5].values()])),
-            "instances.true_count": float(truths),
-            "instances.ignored_count": float(self.overall.ignored),
+            "instances.true_count": truths,
+            "instances.ignored_count": self.overall.ignored,
         }
         for name, score in self.by_class[0.5].items():
             flat[f"instances.ap50.{name}"] = score.ap
+            flat[f"instances.ap25.{name}"] = self.by_class[0.25][name].ap
+            flat[f"instances.ap.{name}"] = float(np.mean([self.by_class[t][name].ap for t in IOU_THRESHOLDS]))
+            flat[f"instances.true_count.{name}"] = score.truths
         return flat
 
 

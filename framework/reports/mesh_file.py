@@ -1,4 +1,4 @@
-"""The map's surface as a binary PLY file."""
+"""The map's surface as a binary PLY file, written and read back."""
 
 from __future__ import annotations
 
@@ -6,18 +6,15 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.atomic_files import written_whole
-from framework.data import InstanceMesh
+from framework.data import Array, InstanceMesh
+from framework.errors import DataError
+from framework.ply import read_ply, write_ply
 
-_VERTEX = np.dtype(
-    [
-        *((axis, "<f4") for axis in ("x", "y", "z")),
-        *((channel, "u1") for channel in ("red", "green", "blue")),
-        ("instance", "<i4"),
-        ("class", "<i4"),
-    ]
-)
-_FACE = np.dtype([("count", "u1"), ("vertex_indices", "<i4", (3,))])
+CHANNELS = ("red", "green", "blue")
+TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
+"""The properties of a vertex beside its place."""
+
+CLASSES = "classes "  # begins the comment that names the classes
 
 
 def write_mesh(path: Path, mesh: InstanceMesh) -> None:
@@ -25,33 +22,33 @@ def write_mesh(path: Path, mesh: InstanceMesh) -> None:
 
     `class` is an index into the comment line `classes`, -1 = none.
     """
-    vertices = np.empty(len(mesh.vertices), _VERTEX)
-    for column, axis in enumerate(("x", "y", "z")):
-        vertices[axis] = mesh.vertices[:, column]
-    for column, channel in enumerate(("red", "green", "blue")):
-        vertices[channel] = mesh.colors[:, column]
-    vertices["instance"] = mesh.instance_ids
-    vertices["class"] = mesh.class_ids
-    faces = np.empty(len(mesh.triangles), _FACE)
-    faces["count"] = 3
-    faces["vertex_indices"] = mesh.triangles
-    header = "\n".join(
-        [
-            "ply",
-            "format binary_little_endian 1.0",
-            "comment InstanceMap; metres; instance 0 = none; class -1 = none, else an index into:",
-            f"comment classes {','.join(mesh.classes)}",
-            f"element vertex {len(vertices)}",
-            *(f"property float {axis}" for axis in ("x", "y", "z")),
-            *(f"property uchar {channel}" for channel in ("red", "green", "blue")),
-            "property int instance",
-            "property int class",
-            f"element face {len(faces)}",
-            "property list uchar int vertex_indices",
-            "end_header\n",
-        ]
+    properties: dict[str, Array] = {
+        **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
+        "instance": mesh.instance_ids,
+        "class": mesh.class_ids,
+    }
+    comments = (
+        "InstanceMap; metres; instance 0 = none; class -1 = none, else an index into:",
+        f"{CLASSES}{','.join(mesh.classes)}",
     )
-    with written_whole(path) as temporary, temporary.open("wb") as file:
-        file.write(header.encode("ascii", "replace"))
-        vertices.tofile(file)
-        faces.tofile(file)
+    write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
+
+
+def read_mesh(path: Path) -> InstanceMesh:
+    """The mesh that `write_mesh` wrote, exactly. Raises DataError, naming the file, for anything else."""
+    ply = read_ply(path)
+    for name, kind in TYPES.items():
+        if name not in ply.properties or ply.properties[name].dtype != kind:
+            raise DataError(f"{path} is not a run's mesh: its vertices have no property {name!r} of {np.dtype(kind)}")
+    told = [comment for comment in ply.comments if f"{comment} ".startswith(CLASSES)]
+    if len(told) != 1:
+        raise DataError(f"{path} is not a run's mesh: expected one line 'comment {CLASSES}...', found {len(told)}")
+    names = told[0][len(CLASSES) :]
+    return InstanceMesh(
+        vertices=ply.vertices,
+        triangles=ply.triangles,
+        colors=np.stack([ply.properties[channel] for channel in CHANNELS], axis=1).astype(np.uint8),
+        instance_ids=ply.properties["instance"].astype(np.int32),
+        class_ids=ply.properties["class"].astype(np.int32),
+        classes=tuple(names.split(",")) if names else (),
+    )

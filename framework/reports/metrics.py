@@ -6,14 +6,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from framework.data import Instance, InstanceMesh
+from framework.data import Instance, InstanceMesh, SceneTruth
 from framework.evaluation import instances, trajectory
-from framework.evaluation.instances import PredictedInstances
+from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
 
 Metrics = dict[str, float | int | str | bool | None]
 
+MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, told for both transfers
 STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
 
 
@@ -62,7 +63,23 @@ def instance_metrics(
     truth = sequence.scene_truth()
     if truth is None:
         return count
-    return count | instances.evaluate(PredictedInstances.of_map(mesh, found, classes), truth).metrics()
+    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, sequence.annotation)
+
+
+def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:
+    """The figures of `InstanceEvaluation.metrics`, and the main ones of the other transfer as `instances.to_map.`...
+
+    `annotation_release` names the release of the truth, None = there is but one.
+    """
+    figures = instances.evaluate(predictions, truth).metrics()
+    to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
+    told = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
+    return {**figures, **told, "annotation_release": annotation or None}
+
+
+def is_evaluation(key: str) -> bool:
+    """Whether a key of metrics.json is one that `evaluation_metrics` writes."""
+    return key == "annotation_release" or (key.startswith("instances.") and key != "instances.count")
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 import re
@@ -16,6 +15,7 @@ from omegaconf.errors import OmegaConfBaseException
 from yaml import YAMLError
 
 from framework.errors import DataError
+from framework.reports.json_file import read_json
 from framework.reports.provenance import code_version, config_hash
 
 CONFIG = "config.yaml"
@@ -41,6 +41,11 @@ class Record:
     def commit(self) -> str:
         return commit_of(self.metrics)
 
+    @property
+    def annotation(self) -> str:
+        """Which release of the true instances the run was compared with; "" = the dataset does not say."""
+        return str(self.metrics.get("annotation_release") or "")
+
 
 @dataclass(frozen=True)
 class Incomplete:
@@ -64,7 +69,7 @@ def read_record(directory: Path) -> Record:
 
     Raises DataError, naming the file, when one cannot be read or the two are not of the same run.
     """
-    metrics, config = _read_json(directory / METRICS), read_yaml(directory / CONFIG)
+    metrics, config = _read_flat(directory / METRICS), read_yaml(directory / CONFIG)
     if metrics.get("config_hash") != config_hash(config):
         raise DataError(f"{directory / METRICS} is not of the config beside it: config_hash differs; run it again")
     try:
@@ -128,11 +133,8 @@ def read_yaml(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def _read_json(path: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(path.read_text("utf-8"))
-    except (OSError, ValueError, RecursionError) as error:
-        raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
+def _read_flat(path: Path) -> dict[str, Any]:
+    content = read_json(path)
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold an object, found {type(content).__name__}")
     if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
@@ -151,7 +153,7 @@ def _why_incomplete(directory: Path) -> str:
     """In words. A job's fault is the last line of its log, but for a traceback."""
     if (directory / PARTIAL_METRICS).exists():
         try:
-            return f"partial: {_read_json(directory / PARTIAL_METRICS).get('partial')}"
+            return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"
         except DataError as error:
             return str(error)
     try:

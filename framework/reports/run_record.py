@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import csv
-import json
 import logging
-import math
 import resource
 import sys
 from collections import Counter
@@ -20,9 +18,10 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.atomic_files import written_whole
 from framework.build import STAGES
-from framework.data import Box, Instance, InstanceMesh
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
+from framework.reports.instances_file import write_instances
+from framework.reports.json_file import write_json
 from framework.reports.mesh_file import write_mesh
 from framework.reports.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
 from framework.reports.overview import write_overview
@@ -87,9 +86,9 @@ class RunRecord:
         labels = {key: (name or "object", instances[key].confidence) for key, name in names.items()}
         write_overview(self.directory / "overview.png", mesh, labels, poses, title)
         if result.stopped_by is None:
-            _write_json(self.directory / METRICS, metrics)
+            write_json(self.directory / METRICS, metrics)
         else:
-            _write_json(self.directory / PARTIAL_METRICS, {"partial": reason(result.stopped_by), **metrics})
+            write_json(self.directory / PARTIAL_METRICS, {"partial": reason(result.stopped_by), **metrics})
         self._announce(title, Counter(name or "object" for name in names.values()), result)
         return metrics
 
@@ -124,36 +123,6 @@ def reason(stopped_by: BaseException) -> str:
     return str(stopped_by) or "interrupted by Ctrl-C"
 
 
-def write_instances(
-    path: Path, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: tuple[str, ...]
-) -> None:
-    """Writes the objects as a list, by id. `vertices` is how many of the mesh's vertices carry the id; lengths in m."""
-    _write_json(
-        path,
-        [
-            {
-                "id": instance.id,
-                "class": class_name(instance, classes),
-                "confidence": round(float(instance.confidence), 6),
-                "class_probabilities": dict(
-                    zip(classes, np.round(instance.class_probabilities.astype(float), 6).tolist(), strict=True)
-                ),
-                "observations": int(instance.observations),
-                "first_frame": int(instance.first_frame),
-                "last_frame": int(instance.last_frame),
-                "centroid": mesh.vertices[instance.vertices].mean(axis=0).tolist() if len(instance.vertices) else None,
-                "aabb": {
-                    "min": (instance.aabb.center - instance.aabb.extent / 2).tolist(),
-                    "max": (instance.aabb.center + instance.aabb.extent / 2).tolist(),
-                },
-                "obb": _box(instance.obb),
-                "vertices": len(instance.vertices),
-            }
-            for _, instance in sorted(instances.items())
-        ],
-    )
-
-
 def write_timings(path: Path, result: RunResult) -> None:
     """Writes how long each stage took for each frame, in the order in which it happened."""
     with written_whole(path) as temporary, temporary.open("w", newline="") as file:
@@ -172,21 +141,3 @@ def _reset_peak_memory() -> None:
     """Forgets the peak of what this process did before: an earlier job of a sweep may have needed more."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5")
-
-
-def _box(box: Box) -> dict[str, list[float] | list[list[float]]]:
-    return {"center": box.center.tolist(), "extent": box.extent.tolist(), "rotation": box.rotation.tolist()}
-
-
-def _write_json(path: Path, content: Any) -> None:
-    with written_whole(path) as temporary:
-        temporary.write_text(json.dumps(_finite(content), indent=2, allow_nan=False) + "\n")
-
-
-def _finite(content: Any) -> Any:
-    """NaN is not JSON: a figure that is not defined, such as the AP of a class that is not there, is null."""
-    if isinstance(content, Mapping):
-        return {key: _finite(value) for key, value in content.items()}
-    if isinstance(content, list):
-        return [_finite(value) for value in content]
-    return None if isinstance(content, float) and not math.isfinite(content) else content

@@ -16,13 +16,15 @@ from omegaconf import OmegaConf
 
 from framework.data import Frame, InstanceMesh, Pose
 from framework.errors import DataError, MapFullError
+from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
 from framework.interfaces import SceneMap
 from framework.journal import RunResult
 from framework.pipeline import Pipeline
 from framework.reports import provenance, run_record
+from framework.reports.instances_file import write_instances
 from framework.reports.mesh_file import write_mesh
-from framework.reports.metrics import pose_source, run_metrics
-from framework.reports.run_record import RunRecord, headline, write_instances
+from framework.reports.metrics import instance_metrics, pose_source, run_metrics
+from framework.reports.run_record import RunRecord, headline
 from framework.trajectory_file import read_tum
 from tests.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
 
@@ -70,6 +72,7 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
         *("frames", "frames_lost", "frames_skipped", "fps", "map.voxels", "map.bytes", "peak_rss_bytes", "pose_source"),
         *(f"stage_ms.{stage}.{figure}" for stage in stages for figure in ("median", "p95")),
         *("instances.count", "instances.ap50", "instances.ap25", "instances.ap50.chair", "instances.ap50.couch"),
+        *("instances.ap25.chair", "instances.ap.chair", "instances.true_count.chair", "annotation_release"),
         *("instances.ap50_agnostic", "instances.mean_iou", "trajectory.ate_rmse_m", "trajectory.rpe_rmse_m"),
         *("seed", "config_hash", "git_commit", "environment.python", "environment.torch", "environment.cpus"),
     }
@@ -77,6 +80,21 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
     assert metrics["trajectory.ate_rmse_m"] == pytest.approx(0, abs=1e-9)
     assert (metrics["seed"], metrics["choice.detector"], metrics["choice.fuser"]) == (3, "simulated", None)
     assert metrics["peak_rss_bytes"] > 2**24
+
+
+@pytest.mark.parametrize(("annotation", "release"), [("second", "second"), ("", None)])
+def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, annotation: str, release: str) -> None:
+    scene = mapped(room).scene
+    room.annotation = annotation
+    metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES)
+    predictions = PredictedInstances.of_map(scene.mesh(), scene.instances(), CLASSES)
+    to_truth, to_map = (evaluate(predictions, room.scene_truth(), transfer=way).metrics() for way in Transfer)
+    assert to_map["instances.mean_iou"] != to_truth["instances.mean_iou"]
+    assert metrics.pop("annotation_release") == release
+    assert metrics.pop("instances.count") == 2
+    for name in ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou"):
+        assert metrics.pop(f"instances.to_map.{name}") == to_map[f"instances.{name}"]
+    assert metrics == to_truth
 
 
 def test_without_ground_truth_there_is_no_evaluation(record: RunRecord, room: CornerRoom) -> None:

@@ -1,0 +1,208 @@
+"""What the readers of recordings share: a reader says what there is, and this chooses frames and reads their images."""
+
+from __future__ import annotations
+
+import logging
+import math
+from abc import abstractmethod
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+
+from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
+from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
+from framework.datasets.image_files import read_color, read_uint16
+from framework.errors import ConfigError, DataError, FrameError
+from framework.interfaces import RGBDSequence
+
+FRAME_RATE = 30.0  # Hz, for the timestamps of recordings without any
+NO_READING = 65535  # uint16 that several sensors write instead of 0
+
+log = logging.getLogger(__name__)
+
+
+class StoredImages(Protocol):
+    """The two images of a frame, registered to each other and not read yet. Reading raises FrameError."""
+
+    @property
+    def color_name(self) -> Path | str:
+        """For messages: the file, and where in it."""
+
+    @property
+    def depth_name(self) -> Path | str:
+        """Likewise."""
+
+    def color(self) -> UInt8:
+        """(H, W, 3) RGB."""
+
+    def depth(self) -> UInt16:
+        """(H, W) in the recording's units; 0 or 65535 = no reading."""
+
+
+@dataclass(frozen=True)
+class ImageFiles:
+    """Images in files of their own, JPEG or PNG."""
+
+    color_name: Path
+    depth_name: Path
+
+    def color(self) -> UInt8:
+        return read_color(self.color_name)
+
+    def depth(self) -> UInt16:
+        return read_uint16(self.depth_name)
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """One frame of a recording, images not read yet."""
+
+    images: StoredImages
+    timestamp: float  # s
+    T_world_camera: Float64 | None = None  # (4, 4), None = not known
+    fault: str = ""  # why the frame cannot be used, as where its pose is no pose; "" = it can
+
+    @classmethod
+    def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
+        """The frame with what `pose` returns; the DataError that it raises where there is no pose is its fault."""
+        try:
+            return cls(images, timestamp, pose())
+        except DataError as error:
+            return cls(images, timestamp, fault=str(error))
+
+
+@dataclass(frozen=True)
+class Contents:
+    """All that a recording holds, before any frame is chosen."""
+
+    camera: Camera
+    camera_source: Path | str  # what says so, for messages
+    depth_scale: float  # units a metre
+    frames: Sequence[RecordedFrame]
+
+
+@dataclass
+class Recording(RGBDSequence):
+    """An RGB-D video on disk. A subclass says what is there (`open`), and what is known of the truth.
+
+    Faults of the whole recording raise DataError when it is opened; faults of one frame raise FrameError when that
+    frame is read, so that the pipeline counts it and goes on.
+    """
+
+    root: Path  # the folder, or the folder of the scenes
+    scene: str = ""  # sub-folder of root; "" = root itself
+    start: int = 0  # first frame
+    stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
+    stride: int = 1  # take every stride-th frame
+    share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
+    seed: int = 0  # of the share
+    max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
+
+    def __post_init__(self) -> None:
+        check_selection(self.start, self.stop, self.stride, self.share)
+        if not (math.isfinite(self.max_depth) and self.max_depth >= 0):
+            raise ConfigError(f"dataset.max_depth must be 0 (keep all) or positive metres, found {self.max_depth}")
+        self.root = Path(self.root).expanduser()
+        self.folder = self.root / self.scene
+        if not self.folder.is_dir():
+            raise DataError(f"dataset.root: the folder {self.folder} does not exist")
+        self.name = self.folder.resolve().name
+        self.contents = self.open()
+        self.camera = self.contents.camera
+        self.chosen = choose_frames(
+            len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
+        )
+        self._check_first_image()
+
+    @abstractmethod
+    def open(self) -> Contents:
+        """What `self.folder` holds. Raises DataError, naming the file, when that is no such recording."""
+
+    def truth_in(self, index: int) -> FrameTruth | None:
+        """The true instances in frame `index`, counted before any is chosen; None where nobody labelled them."""
+        return None
+
+    def __len__(self) -> int:
+        return len(self.chosen)
+
+    def __getitem__(self, k: int) -> Frame:
+        index = self.chosen[k]
+        recorded = self.contents.frames[index]
+        if recorded.fault:
+            raise FrameError(f"frame {index}: {recorded.fault}")
+        color = recorded.images.color()
+        self.check_size(recorded.images.color_name, color.shape)
+        return Frame(
+            index=index,
+            timestamp=recorded.timestamp,
+            color=color,
+            depth=self.metric_depth(index),
+            camera=self.camera,
+            T_world_camera=recorded.T_world_camera,
+            truth=self.truth_in(index),
+        )
+
+    def metric_depth(self, index: int) -> Float32:
+        """(H, W) m, 0 = no reading. Raises FrameError."""
+        images = self.contents.frames[index].images
+        raw = images.depth()
+        self.check_size(images.depth_name, raw.shape)
+        depth = raw.astype(np.float32)
+        depth /= np.float32(self.contents.depth_scale)
+        depth[raw == NO_READING] = 0
+        if self.max_depth:
+            depth[depth > self.max_depth] = 0
+        return depth
+
+    def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
+        """Raises FrameError unless an image has the camera's size."""
+        if shape[:2] != self.camera.shape:
+            raise FrameError(f"{name} is {_size(shape)}, but {self._expected_size()}")
+
+    def _expected_size(self) -> str:
+        source = self.contents.camera_source
+        return f"{source} says {_size(self.camera.shape)}; colour, depth and camera must agree"
+
+    def _check_first_image(self) -> None:
+        """A first image of the wrong size means that all are: better said at once than by skipping every frame."""
+        images = self.contents.frames[self.chosen[0]].images
+        for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
+            try:
+                shape = read().shape
+            except FrameError:
+                continue  # damaged or of a wrong type: counted when the frame is read
+            if shape[:2] != self.camera.shape:
+                raise DataError(f"{name} is {_size(shape)}, but {self._expected_size()}")
+
+
+def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """The folder's images by the number in which their names end, in the order of these numbers.
+
+    Raises DataError when there is none, a name has no number, or two have the same.
+    """
+    if not folder.is_dir():
+        raise DataError(f"the folder {folder} is missing")
+    files: dict[int, Path] = {}
+    for path in _images(folder, suffixes):
+        digits = path.stem[len(path.stem.rstrip("0123456789")) :]
+        if not digits:
+            raise DataError(f"{path}: the file name must end in the frame's number, like 000000{path.suffix}")
+        if int(digits) in files:
+            raise DataError(f"{path} and {files[int(digits)].name} have the same frame number {int(digits)}")
+        files[int(digits)] = path
+    if not files:
+        raise DataError(f"{folder} holds no image ({', '.join(suffixes)})")
+    return dict(sorted(files.items()))
+
+
+def _images(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() in suffixes and not path.name.startswith("."):
+            yield path
+
+
+def _size(shape: tuple[int, ...]) -> str:
+    return f"{shape[1]}x{shape[0]}"

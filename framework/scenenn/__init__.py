@@ -1,0 +1,1 @@
+"""The files of SceneNN: one module a format, tolerant in reading and strict in writing."""

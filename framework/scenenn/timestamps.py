@@ -1,0 +1,46 @@
+"""SceneNN's timestamp.txt: a line a frame, its number (from 1) and when colour and depth were taken, microseconds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+
+from framework.atomic_files import written_whole
+from framework.errors import DataError
+
+MICROSECONDS = 1e6  # a second
+
+
+def read_timestamps(path: Path) -> Mapping[int, float]:
+    """When each image was taken, s, by its number: the time of its depth, which is what is mapped.
+
+    Raises DataError, naming file and line, when a line does not hold a number and two times, or has an earlier number.
+    """
+    try:
+        lines = path.read_text("utf-8").splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} could not be read as text: {error}") from error
+    times: dict[int, float] = {}
+    for number, line in enumerate(lines, start=1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            image, _color, depth = int(words[0]), *map(float, words[1:])
+        except ValueError as error:
+            raise DataError(f"{path}, line {number}: expected `number colour_us depth_us`, found {line!r}") from error
+        if not math.isfinite(depth):
+            raise DataError(f"{path}, line {number}: the time is not finite")
+        if image in times:
+            raise DataError(f"{path}, line {number}: image {image} is there twice")
+        times[image] = depth / MICROSECONDS
+    return times
+
+
+def write_timestamps(path: Path, times: Mapping[int, float]) -> None:
+    """Writes the time in s of each image, by its number, for colour and depth alike; whole or not at all."""
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for number, time in times.items():
+            microseconds = round(time * MICROSECONDS)
+            file.write(f"{number} {microseconds} {microseconds}\n")
