@@ -108,7 +108,7 @@ def test_the_figures_of_the_other_transfer_can_be_printed(stored: Path, command)
     true = metrics_of(stored)
     write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
     assert command(stored, "--transfer", "to_map", "--dry-run")[1].startswith(
-        f"{stored}: instances.to_map.ap25 0.250 -> {true['instances.to_map.ap25']:.3f}, 1 other"
+        f"{stored}: AP25 to map 0.250 -> {true['instances.to_map.ap25']:.3f}, 1 other"
     )
 
 
