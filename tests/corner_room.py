@@ -78,6 +78,7 @@ class CornerRoom(RGBDSequence):
     unreadable: int = -1  # this frame raises FrameError; -1 = none
     truth: bool = True  # whether poses and instances are known
     slow_s: float = 0.0  # how long reading a frame takes
+    scene: str = ""  # any name: all are the same room
     start: int = 0
     stop: int = -1  # -1 = to the end
     stride: int = 1

@@ -1,39 +1,75 @@
-"""Rows of runs side by side: means with their spread, and differences paired run by run."""
+"""What a table compares: the records below a directory as rows, the row that the others are compared with, and what a
+table shows of them.
+"""
 
 from __future__ import annotations
 
-import math
-import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeGuard
+from functools import cached_property
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.errors import ConfigError
-from framework.reports.provenance import WITHOUT_EFFECT
-from framework.reports.records import Record
+from framework.command_line import CONF
+from framework.errors import ConfigError, DataError
+from framework.reports.published import NOTHING_PUBLISHED, Published, read_published
+from framework.reports.records import Incomplete, Record, find_records, read_yaml
+from framework.reports.rows import Row, Run, natural, rows_of
 
-CHOICE = "choice."  # starts the keys of metrics.json that say which option was chosen of a config group
-CONFIDENCE = 0.95
-
-Run = tuple[str, ...]  # what a run has under the keys that are averaged over: ("3",) is seed 3
+SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
+DEFAULT_CHOICE = CONF / "parts" / "experiment.yaml"
 
 
 @dataclass(frozen=True)
 class TableChoice:
-    """What a table shows: the block `table` of an experiment."""
+    """What a table shows: the block `table` of an experiment.
+
+    A line is a row and a column a figure, averaged over the runs that differ in `over` alone. With `across`, a column
+    is a value of that key, such as a sequence, and a line ends with their mean; with `by`, lines stand in groups, one
+    for each of its values.
+    """
 
     over: list[str] = field(default_factory=lambda: ["seed"])  # keys of the config; averaged over, paired by
+    across: str | None = None  # key of the config with a column for each value; None = columns are figures
+    by: str | None = None  # key of the config with a group of lines for each value; None = a line is all of a row
     base: str | None = None  # name of the row that the others are compared with; None = the first
-    columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one
+    columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `across`, just one
+    names: dict[str, str] = field(default_factory=dict)  # what rows are called in the table; others go by their name
+    published: str | None = None  # section of published.yaml, whose numbers stand below; None = none
 
     def __post_init__(self) -> None:
         for name in ("over", "columns"):
             if not getattr(self, name):
                 raise ConfigError(f"table.{name} must name at least one key")
+        if self.across and self.by:
+            raise ConfigError(
+                f"table.across={self.across} and table.by={self.by} are two layouts: one of them must be null"
+            )
+        if self.apart in self.over:
+            raise ConfigError(f"table.over has {self.apart}, whose values table.{self.layout} shows one by one")
+        if self.across and len(self.columns) > 1:
+            raise ConfigError(
+                f"table.columns must name one figure, the one that stands across {self.across}, found "
+                f"{len(self.columns)}; table.by={self.across} shows several"
+            )
+        if self.published and read_published(self.published).layout != self.layout:
+            raise ConfigError(
+                f"table.published={self.published} has numbers for a table with another layout: "
+                f"{read_published(self.published).layout}, found {self.layout}"
+            )
+
+    @property
+    def layout(self) -> str:
+        """`across`, `by` or `rows`."""
+        return "across" if self.across else "by" if self.by else "rows"
+
+    @property
+    def apart(self) -> str | None:
+        """The key whose values are shown one by one, as columns or as groups of lines."""
+        return self.across or self.by
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
@@ -45,141 +81,98 @@ class TableChoice:
         except OmegaConfBaseException as error:
             first_line = str(error).partition("\n")[0]
             raise ConfigError(f"table: {first_line}") from error
-        return cls(list(checked.over), checked.base, list(checked.columns))
+        content = OmegaConf.to_container(checked)
+        assert isinstance(content, dict)
+        return cls(**{str(key): value for key, value in content.items()})
 
 
 @dataclass(frozen=True)
-class Mean:
-    """A mean over runs. NaN where nothing is known: the mean of no run, the deviation of one."""
+class Comparison:
+    """All that a table says, before it is written in one format or another."""
 
-    value: float
-    deviation: float  # sample standard deviation, with n - 1
-    count: int
+    title: str
+    choice: TableChoice
+    rows: list[Row]  # in their order, each with a run or more
+    overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
+    incomplete: list[Incomplete]
+    superseded: int  # records of runs that have a later one
+    root: Path  # what the names of runs are relative to
 
     @classmethod
-    def of(cls, values: Iterable[float]) -> Mean:
-        sample = np.array(list(values), np.float64)
-        value = float(sample.mean()) if len(sample) else math.nan
-        deviation = float(sample.std(ddof=1)) if len(sample) > 1 else math.nan
-        return cls(value, deviation, len(sample))
+    def below(cls, directory: Path) -> Comparison:
+        """From the records at and below `directory`, as the experiment that ran there says, else as all do.
 
-    @property
-    def error(self) -> float:
-        """The standard error of the mean."""
-        return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
-
-    @property
-    def is_not_zero(self) -> bool:
-        """Whether 0 lies outside of the mean's interval of confidence, by Student's t."""
-        if self.count < 2:
-            return False
-        from scipy.stats import t
-
-        return abs(self.value) > self.error * float(t.ppf((1 + CONFIDENCE) / 2, self.count - 1))
-
-
-@dataclass(frozen=True)
-class Row:
-    """Runs that differ in nothing but the keys that are averaged over."""
-
-    name: str
-    records: Mapping[Run, Record]
-
-    @property
-    def pose_source(self) -> str:
-        return "/".join(sorted({str(record.metrics.get("pose_source")) for record in self.records.values()}))
-
-    def values(self, column: str) -> dict[Run, float]:
-        """The runs' figures, without those that are not defined."""
-        found = {run: record.metrics.get(column) for run, record in self.records.items()}
-        return {run: float(value) for run, value in found.items() if _is_number(value)}
-
-    def mean(self, column: str) -> Mean:
-        return Mean.of(self.values(column).values())
-
-    def difference(self, base: Row, column: str) -> Mean:
-        """The mean over the runs that both rows have of this row's figure less the base's.
-
-        Runs of one seed have the same room and the same detections: most of what varies between seeds cancels.
+        Raises DataError when there is no complete record, or when the experiment's config cannot be read.
         """
-        own, others = self.values(column), base.values(column)
-        return Mean.of(own[run] - others[run] for run in own if run in others)
+        if not directory.is_dir():
+            raise DataError(f"{directory} is not a folder with records of runs")
+        sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
+        choice = TableChoice.of(sweep.get("table") or read_yaml(DEFAULT_CHOICE)["table"])
+        overrides = sweep.get("rows") or {}
+        records, incomplete = find_records(directory)
+        if not records:
+            why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
+            raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
+        rows = rows_of(records, [*choice.over, choice.apart] if choice.apart else choice.over, overrides)
+        superseded = len(records) - sum(len(row.records) for row in rows)
+        return cls(directory.resolve().name, choice, rows, overrides, incomplete, superseded, directory)
 
+    @property
+    def base_name(self) -> str:
+        return self.choice.base or next(iter(self.overrides), self.rows[0].name)
 
-def rows_of(records: Sequence[Record], over: Sequence[str], order: Sequence[str] = ()) -> list[Row]:
-    """The rows that `records` make: those named in `order` first, the others by name.
+    @property
+    def base_called(self) -> str:
+        return self.choice.names.get(self.base_name, self.base_name)
 
-    A row is what an experiment calls `row`, else what was chosen: the stages' options and the parameters in which the
-    records differ, other than the keys `over` and what follows them, as dataset.seed follows seed.
-    Of two records of the same run, the later one counts.
-    """
-    told = [_Told.of(record, over) for record in sorted(records, key=lambda record: record.written)]
-    own = _following(told, over)
-    stages = _differing([(one.row, one.choices) for one in told])
-    of_stages = [((one.row, *map(one.choices.get, stages)), one.parameters) for one in told]
-    parameters = [key for key in _differing(of_stages) if key not in own]
-    rows: dict[str, dict[Run, Record]] = {}
-    for one in told:
-        shown = [f"{key}={one.choices[key]}" for key in stages if key in one.choices]
-        shown += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters]
-        name = ", ".join([one.row, *shown] if one.row else shown)
-        rows.setdefault(name or "all runs", {})[one.run] = one.record
-    place = {name: k for k, name in enumerate(order)}
-    # what a row of an experiment is split into stands where it does
-    names = sorted(rows, key=lambda name: (place.get(name.partition(",")[0], len(place)), name))
-    return [Row(name, dict(sorted(rows[name].items(), key=lambda item: _natural(item[0])))) for name in names]
+    @property
+    def noun(self) -> str:
+        """What is shown one by one, in a word: `scene` for dataset.scene."""
+        return (self.choice.apart or "").rpartition(".")[2]
 
+    def base_of(self, row: Row) -> Row | None:
+        """The row that `row` is compared with, of the same poses and the like; None for that one, and without it."""
+        named = [other for other in self.rows if other.name == self.base_name]
+        bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
+        return bases[0] if bases and bases[0] is not row else None
 
-@dataclass(frozen=True)
-class _Told:
-    """What a record says about the row and the run that it belongs to."""
+    @property
+    def has_base(self) -> bool:
+        return any(self.base_name in (row.name, row.system) for row in self.rows)
 
-    record: Record
-    row: str
-    run: Run
-    choices: Mapping[str, Any]  # by stage
-    parameters: Mapping[str, Any]  # by dotted key
+    @property
+    def compared(self) -> list[tuple[Row, Row]]:
+        """The rows that have one to be compared with, and that one."""
+        pairs = ((row, self.base_of(row)) for row in self.rows)
+        return [(row, base) for row, base in pairs if base is not None]
 
-    @classmethod
-    def of(cls, record: Record, over: Sequence[str]) -> _Told:
-        parameters = dict(_leaves({key: value for key, value in record.config.items() if key not in WITHOUT_EFFECT}))
-        choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
-        run = tuple(str(parameters.get(key)) for key in over)
-        return cls(record, str(record.config.get("row") or ""), run, choices, parameters)
+    @property
+    def records(self) -> list[Record]:
+        return [record for row in self.rows for record in row.records.values()]
 
+    @cached_property
+    def published(self) -> Published:
+        return read_published(self.choice.published) if self.choice.published else NOTHING_PUBLISHED
 
-def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
+    @cached_property
+    def sequences(self) -> list[str]:
+        """The values that are shown one by one: those of published tables first, and those of the runs."""
+        found = {run[-1] for row in self.rows for run in row.records} if self.choice.apart else set()
+        order = sorted(found, key=lambda value: natural((value,)))
+        return list(dict.fromkeys([*self.published.sequences, *order]))
 
+    def called(self, row: Row, without: str = "") -> str:
+        """What a row is called, without the part of its name that says which `without` it has."""
+        named = self.choice.names.get(row.system, row.system)
+        variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
+        return ", ".join([named, *variant] if named else variant) or row.name
 
-def _following(told: Sequence[_Told], over: Sequence[str]) -> set[str]:
-    """The keys `over`, and those whose value is that of one of them in every record."""
-    found = set(over)
-    for key in {key for one in told for key in one.parameters}:
-        for k in range(len(over)):
-            if all(str(one.parameters[key]) == one.run[k] for one in told if key in one.parameters):
-                found.add(key)
-    return found
-
-
-def _differing(told: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
-    """The keys that have several values in one group, in their order; `told` are groups with keys and values."""
-    seen: dict[Any, dict[str, set[str]]] = {}
-    for group, values in told:
-        for key, value in values.items():
-            seen.setdefault(group, {}).setdefault(key, set()).add(repr(value))
-    differing = {key for keys in seen.values() for key, values in keys.items() if len(values) > 1}
-    return [key for key in dict.fromkeys(key for _, values in told for key in values) if key in differing]
-
-
-def _natural(run: Run) -> tuple[tuple[float, str], ...]:
-    """Seeds in their order as numbers, other words after them."""
-    return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)
-
-
-def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
+    def missing(self) -> Iterator[tuple[Row, list[Run]]]:
+        """The runs that a row should have, as other rows have runs with their seeds and of their sequences."""
+        runs = [run for row in self.rows for run in row.records]
+        if self.choice.apart:
+            seeds, sequences = (dict.fromkeys(run[:-1] for run in runs), dict.fromkeys(run[-1] for run in runs))
+            runs = [(*seed, sequence) for seed in seeds for sequence in sequences]
+        for row in self.rows:
+            if missing := sorted(set(runs) - set(row.records), key=natural):
+                yield row, missing

@@ -41,6 +41,11 @@ class Record:
     def commit(self) -> str:
         return commit_of(self.metrics)
 
+    @property
+    def annotation(self) -> str:
+        """Which release of the true instances the run was compared with; "" = the dataset does not say."""
+        return str(self.metrics.get("annotation_release") or "")
+
 
 @dataclass(frozen=True)
 class Incomplete:

@@ -85,6 +85,18 @@ def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path)
     assert "frames_lost.mean" not in table(out)["half"]
 
 
+def test_a_column_is_a_sequence(tmp_path: Path) -> None:
+    """Names with zeros in front stay names; what the table looks like is in no directory's name."""
+    done = start(tmp_path, "experiment=fake_scenes", "table.over=[seed]")
+    assert done.returncode == 0, done.stderr
+    lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
+    assert "| system | poses | 011 | 078 | mean |" in lines
+    assert "| Rival | ground truth | **2.00** | **2.00** | **2.00** |" in lines
+    assert "| Rival | ground truth | -1.000 | -1.000 | -1.000 ± 0.000 * | 2 |" in lines
+    out = tmp_path / "outputs" / "fake_scenes"
+    assert (out / "dataset.scene=078,row=rival,seed=1,tracker=fake" / "metrics.json").exists()
+
+
 # What a job is made of
 
 

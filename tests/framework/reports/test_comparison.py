@@ -1,137 +1,11 @@
-"""Rows, means and paired differences, by hand."""
+"""What a table shows, and what it refuses to."""
 
 from __future__ import annotations
 
-import math
-from pathlib import Path
-from typing import Any
-
-import numpy as np
 import pytest
-from scipy import stats
 
 from framework.errors import ConfigError
-from framework.reports.comparison import Mean, Row, TableChoice, rows_of
-from framework.reports.records import Record
-
-AP = "instances.ap50"
-
-
-def record(config: dict[str, Any], ap: object = 0.5, written: float = 0.0, **choices: str) -> Record:
-    metrics = {AP: ap, "pose_source": "tracked", **{f"choice.{stage}": name for stage, name in choices.items()}}
-    return Record(Path("somewhere"), metrics, config, written)
-
-
-def row(name: str, **figures: object) -> Row:
-    return Row(name, {(run.removeprefix("seed"),): record({}, figure) for run, figure in figures.items()})
-
-
-def names(records: list[Record], *order: str, over: tuple[str, ...] = ("seed",)) -> dict[str, list[tuple[str, ...]]]:
-    return {row.name: list(row.records) for row in rows_of(records, over, order)}
-
-
-def test_mean_and_sample_standard_deviation() -> None:
-    mean = Mean.of([1.0, 2.0, 6.0])
-    assert (mean.value, mean.count) == (3.0, 3)
-    assert mean.deviation == pytest.approx(math.sqrt((4 + 1 + 9) / 2))
-    assert mean.error == pytest.approx(mean.deviation / math.sqrt(3))
-
-
-def test_what_one_run_or_none_cannot_say_is_nan() -> None:
-    one, none = Mean.of([4.0]), Mean.of([])
-    assert (one.value, one.count, none.count) == (4.0, 1, 0)
-    assert all(map(math.isnan, (one.deviation, one.error, none.value, none.deviation, none.error)))
-    assert not one.is_not_zero
-    assert not none.is_not_zero
-
-
-def test_differences_are_paired() -> None:
-    """Rooms differ by 0.5, rows by 0.1: only the pairs can tell."""
-    base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
-    difference = other.difference(base, AP)
-    assert difference.count == 2
-    assert difference.value == pytest.approx(0.1)
-    assert difference.error == pytest.approx(0, abs=1e-12)
-    assert other.mean(AP).value == pytest.approx(0.3)
-
-
-def test_figures_that_are_not_defined_are_left_out() -> None:
-    told = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
-    assert told.values(AP) == {("0",): 0.4, ("5",): 1.0}
-    assert told.mean("no.such.key").count == 0
-    assert told.difference(row("b", seed0=None), AP).count == 0
-
-
-def test_the_star_is_the_paired_t_test() -> None:
-    rng = np.random.default_rng(0)
-    stars = []
-    for _ in range(40):
-        a = rng.normal(0, 1, 5)
-        b = a + rng.normal(0.6, 0.5, 5)
-        mean = Mean.of(b - a)
-        assert mean.is_not_zero == (stats.ttest_rel(b, a).pvalue < 0.05)
-        stars.append(mean.is_not_zero)
-    assert 5 < sum(stars) < 35
-
-
-def test_rows_are_the_experiments_and_runs_are_seeds_in_order() -> None:
-    records = [record({"row": name, "seed": seed}) for name in ("b", "a") for seed in (10, 9, 1)]
-    runs = [("1",), ("9",), ("10",)]
-    assert names(records, "b", "none", "a") == {"b": runs, "a": runs}
-    assert list(names(records, "b", "none", "a")) == ["b", "a"]
-
-
-def test_what_follows_the_seed_makes_no_row() -> None:
-    records = [
-        record({"seed": seed, "dataset": {"seed": seed}, "detector": {"seed": seed, "shift": 1.5}}) for seed in range(3)
-    ]
-    assert names(records) == {"all runs": [("0",), ("1",), ("2",)]}
-
-
-def test_a_parameter_that_only_looks_like_the_seed_makes_rows() -> None:
-    records = [record({"seed": seed, "dataset": {"start": start}}) for seed in (0, 1) for start in (0, 1)]
-    runs = [("0",), ("1",)]
-    assert names(records) == {"dataset.start=0": runs, "dataset.start=1": runs}
-
-
-def test_without_an_experiment_rows_are_what_was_chosen() -> None:
-    """A refiner's own parameters differ from another's, and are no row of their own."""
-    parameters: dict[str, dict[str, Any]] = {"kmeans": {"centers": 5}, "gmm": {"steps": 8, "floor": 0.1}}
-    records = [
-        record({"seed": seed, "refiner": node}, refiner=name, fuser="bayes")
-        for name, node in parameters.items()
-        for seed in (0, 1)
-    ]
-    records.append(record({"seed": 0, "refiner": {"steps": 9, "floor": 0.1}}, refiner="gmm", fuser="bayes"))
-    assert names(records) == {
-        "refiner=gmm, refiner.steps=8": [("0",), ("1",)],
-        "refiner=gmm, refiner.steps=9": [("0",)],
-        "refiner=kmeans": [("0",), ("1",)],
-    }
-
-
-def test_an_experiments_row_is_split_where_the_command_line_changed_more() -> None:
-    records = [record({"row": name, "seed": 0, "fuser": {"voxel": voxel}}) for name in "ba" for voxel in (0.02, 0.05)]
-    split = [f"{name}, fuser.voxel={voxel}" for name in "ba" for voxel in (0.02, 0.05)]
-    assert list(names(records, "b", "a")) == split
-
-
-def test_rows_can_be_averaged_over_anything() -> None:
-    records = [record({"seed": seed, "dataset": {"scene": scene}}) for seed in (0, 1) for scene in "xy"]
-    assert names(records, over=("dataset.scene",)) == {"seed=0": [("x",), ("y",)], "seed=1": [("x",), ("y",)]}
-    assert len(names(records, over=("dataset.scene", "seed"))["all runs"]) == 4
-
-
-@pytest.mark.parametrize("backwards", [False, True])
-def test_of_two_records_of_one_run_the_later_counts(backwards: bool) -> None:
-    records = [record({"seed": 0}, ap, written) for ap, written in ((0.1, 1.0), (0.9, 2.0))]
-    [one] = rows_of(records[::-1] if backwards else records, ["seed"])
-    assert one.mean(AP).value == 0.9
-
-
-def test_what_an_experiment_says_about_itself_makes_no_row() -> None:
-    records = [record({"seed": seed, "debug": bool(seed), "table": {"base": str(seed)}}) for seed in (0, 1)]
-    assert list(names(records)) == ["all runs"]
+from framework.reports.comparison import TableChoice
 
 
 @pytest.mark.parametrize(
@@ -139,6 +13,17 @@ def test_what_an_experiment_says_about_itself_makes_no_row() -> None:
     [
         ({"columns": []}, "table.columns must name at least one key"),
         ({"over": [], "columns": ["fps"]}, "table.over must name at least one key"),
+        (
+            {"across": "dataset.scene", "by": "dataset.scene", "columns": ["fps"]},
+            "two layouts: one of them must be null",
+        ),
+        ({"across": "seed", "columns": ["fps"]}, "table.over has seed, whose values table.across shows one by one"),
+        ({"by": "seed", "columns": ["fps"]}, "table.over has seed, whose values table.by shows one by one"),
+        ({"across": "dataset.scene", "columns": ["fps", "frames"]}, "must name one figure, .* found 2; table.by="),
+        ({"published": "table4", "columns": ["fps"]}, "table.published must be null or one of table1, table2, table3"),
+        ({"published": "table3", "columns": ["fps"]}, "a table with another layout: across, found rows"),
+        ({"published": "table1", "by": "dataset.scene", "columns": ["fps"]}, "another layout: rows, found by"),
+        ({"names": ["ours"], "columns": ["fps"]}, "table: "),
         ({"colums": ["fps"]}, "colums"),
         ({"columns": "fps"}, "table: "),
         ([], "table must have keys and values"),

@@ -13,8 +13,9 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError
+from framework.reports.layouts import head
 from framework.reports.provenance import config_hash
-from framework.reports.tables import head, write_tables
+from framework.reports.tables import write_tables
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 TABLE = {"over": ["seed"], "base": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
@@ -97,6 +98,45 @@ def test_no_differences_without_the_base(sweep: Path) -> None:
     assert "less chain" not in text
     assert "- No differences: chain is no row with a complete run; table.base=ROW names another." in text
     assert text.count("| identity ") == 1
+
+
+def test_rows_go_by_the_names_that_they_are_given(sweep: Path) -> None:
+    table = TABLE | {"names": {"chain": "all of it"}}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
+    text = write_tables(sweep)
+    assert "| all of it |" in text
+    assert "| less all of it |" in text
+
+
+def test_published_run_times_stand_below(sweep: Path) -> None:
+    table = {"over": ["seed"], "columns": ["fps", "stage_ms.refine.median", "frames_lost"], "published": "table1"}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
+    text = write_tables(sweep)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[2] == "| row | runs | Hz | refine (ms) | frames lost | poses |"
+    assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
+    assert "| Voxblox++ (published) | – | not known | not known | not known | not known |" in lines
+    assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
+
+
+def test_a_split_row_is_compared_with_the_base_of_its_kind(tmp_path: Path) -> None:
+    """Rows that the command line split in two: voxels of one size are compared with each other."""
+    root = tmp_path / "x"
+    root.mkdir()
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": TABLE, "rows": ROWS})))
+    for voxel, better in ((1, 0.25), (2, 0.125)):
+        for row, ap in (("chain", 0.5), ("identity", 0.5 - better)):
+            directory = run(root, row, 0, ap, 1.0)
+            config = OmegaConf.load(directory / "config.yaml")
+            config.fuser = {"voxel": voxel}
+            OmegaConf.save(config, directory / "config.yaml")
+            metrics = json.loads((directory / "metrics.json").read_text())
+            metrics["config_hash"] = config_hash({str(k): v for k, v in OmegaConf.to_object(config).items()})
+            (directory / "metrics.json").write_text(json.dumps(metrics))
+            directory.rename(root / f"{row}{voxel}")
+    lines = [" ".join(line.split()) for line in write_tables(root).splitlines()]
+    assert "| identity, fuser.voxel=1 | 1 | -0.250 | +0.000 |" in lines
+    assert "| identity, fuser.voxel=2 | 1 | -0.125 | +0.000 |" in lines
 
 
 def test_a_figure_that_nobody_knows_is_a_dash(sweep: Path) -> None:

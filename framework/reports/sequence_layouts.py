@@ -1,0 +1,196 @@
+"""How a comparison over sequences is laid out: a column for each sequence, or a group of lines for each.
+
+Lines of the same poses stand together, and the highest figure among them is in bold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from framework.reports.comparison import Comparison
+from framework.reports.grid import Grid, decimals, figure
+from framework.reports.layouts import NOTHING, head, published_cell, published_name
+from framework.reports.published import NOT_KNOWN
+from framework.reports.rows import Mean, Row
+from framework.reports.sequences import SequenceMean, mean_by_sequence, mean_difference, mean_over_sequences
+
+MISSING = "missing"  # a figure that a run would have, of which there is no complete record
+
+
+@dataclass(frozen=True)
+class _Line:
+    words: list[str]
+    cells: list[str]
+    variant: tuple[str, ...] | None = None  # lines that share it compete for the highest; None = competes with none
+    figures: Sequence[float] = ()  # for each cell; NaN = does not compete
+
+
+def across_grid(comparison: Comparison) -> Grid:
+    """A column a sequence: each row's mean over seeds there, and the mean of these."""
+    [key] = comparison.choice.columns
+    sequences, seeds = comparison.sequences, _seeds(comparison)
+    means = {row.name: mean_by_sequence(row.values(key)) for row in comparison.rows}
+    overall = {row.name: mean_over_sequences(row.values(key)) for row in comparison.rows}
+    places = decimals(mean.value for found in means.values() for mean in found.values())
+    sections = [
+        [
+            _Line(
+                _words(comparison, row),
+                [
+                    *(_cell(row, means[row.name], sequence, seeds, places) for sequence in sequences),
+                    _mean_cell(overall[row.name], len(sequences), places),
+                ],
+                row.variant,
+                [*(_value(means[row.name], s) for s in sequences), _comparable(row, rows, overall)],
+            )
+            for row in rows
+        ]
+        for rows in _by_variant(comparison.rows)
+    ]
+    published = [
+        _Line(
+            [published_name(one), one.poses],
+            [
+                *(published_cell(one, (sequence,), places) for sequence in sequences),
+                NOT_KNOWN if one.values is None else NOTHING,  # a mean that nobody has published
+            ],
+        )
+        for one in comparison.published.rows
+    ]
+    return _grid(["system", "poses", *sequences, "mean"], [*sections, published], places)
+
+
+def by_grid(comparison: Comparison) -> Grid:
+    """A group of lines a sequence, each line a row with all of its figures; the last group are their means."""
+    keys, seeds = comparison.choice.columns, _seeds(comparison)
+    rows = [row for rows in _by_variant(comparison.rows) for row in rows]
+    means = {key: {row.name: mean_by_sequence(row.values(key)) for row in rows} for key in keys}
+    overall = {key: {row.name: mean_over_sequences(row.values(key)) for row in rows} for key in keys}
+    found_in = {key: len({sequence for found in means[key].values() for sequence in found}) for key in keys}
+    places = decimals(mean.value for of_key in means.values() for found in of_key.values() for mean in found.values())
+    begun = {run[-1] for row in rows for run in row.records}
+    sections: dict[str, list[_Line]] = {}
+    for sequence in comparison.sequences:
+        sections[sequence] = [
+            _Line(
+                _words(comparison, row),
+                [_cell(row, means[key][row.name], sequence, seeds, places) for key in keys],
+                row.variant,
+                [_value(means[key][row.name], sequence) for key in keys],
+            )
+            for row in (rows if sequence in begun else ())
+        ] + [
+            _Line([published_name(one), one.poses], [published_cell(one, (sequence, key), places) for key in keys])
+            for one in comparison.published.rows
+            if one.has(sequence)
+        ]
+    sections["mean"] = [
+        _Line(
+            _words(comparison, row),
+            [_mean_cell(overall[key][row.name], found_in[key], places) for key in keys],
+            row.variant,
+            [_comparable(row, rows, overall[key]) for key in keys],
+        )
+        for row in rows
+    ] + [
+        _Line([published_name(one), one.poses], [NOT_KNOWN] * len(keys))
+        for one in comparison.published.rows
+        if one.values is None
+    ]
+    titled = [
+        [replace(line, words=[title if k == 0 else "", *line.words]) for k, line in enumerate(section)]
+        for title, section in sections.items()
+    ]
+    return _grid([comparison.noun, "system", "poses", *map(head, keys)], titled, places)
+
+
+def difference_across_grid(comparison: Comparison) -> Grid:
+    """The base less each of the others, sequence by sequence, and the mean with its standard error."""
+    [key] = comparison.choice.columns
+    less = {row.name: base.less(row, key) for row, base in comparison.compared}
+    paired = {run[-1] for runs in less.values() for run in runs}
+    sequences = [sequence for sequence in comparison.sequences if sequence in paired]
+    places = decimals(value for runs in less.values() for value in runs.values())
+    sections = []
+    for rows in _by_variant([row for row, _ in comparison.compared]):
+        section = []
+        for row in rows:
+            means, mean = mean_by_sequence(less[row.name]), mean_difference(less[row.name])
+            cells = [figure(means[s].value, math.nan, places, True) if s in means else MISSING for s in sequences]
+            overall = figure(mean.value, mean.error, places, True) if mean.count else MISSING
+            cells += [f"{overall} *" if mean.is_not_zero else overall, str(len(less[row.name]))]
+            section.append(_Line(_words(comparison, row), cells))
+        sections.append(section)
+    return _grid([f"{comparison.base_called} less", "poses", *sequences, "mean", "pairs"], sections, places)
+
+
+def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], places: int) -> Grid:
+    lines: list[_Line] = []
+    bold: set[tuple[int, int]] = set()
+    groups: set[int] = set()
+    for section in sections:
+        if lines:
+            groups.add(len(lines))
+        bold |= {(len(lines) + k, len(line.words) + column) for k, line, column in _highest(section, places)}
+        lines += section
+    words = len(lines[0].words)
+    return Grid(heads, [[*line.words, *line.cells] for line in lines], words, frozenset(bold), frozenset(groups))
+
+
+def _highest(section: Sequence[_Line], places: int) -> Iterable[tuple[int, _Line, int]]:
+    """(place, line, column) of the figures that no rival's exceeds as it is printed; without a rival there is none."""
+    for k, line in enumerate(section):
+        if line.variant is None:
+            continue
+        rivals = [other.figures for other in section if other.variant == line.variant]
+        for column, value in enumerate(line.figures):
+            others = [round(figures[column], places) for figures in rivals if not math.isnan(figures[column])]
+            if len(others) > 1 and round(value, places) == max(others):
+                yield k, line, column
+
+
+def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
+    """The rows in groups of those that can be compared, in the order of each group's first."""
+    groups: dict[tuple[str, ...], list[Row]] = {}
+    for row in rows:
+        groups.setdefault(row.variant, []).append(row)
+    return list(groups.values())
+
+
+def _words(comparison: Comparison, row: Row) -> list[str]:
+    return [comparison.called(row, without="tracker"), row.poses]
+
+
+def _seeds(comparison: Comparison) -> int:
+    """How many runs a row should have in a sequence."""
+    return len({run[:-1] for row in comparison.rows for run in row.records})
+
+
+def _value(means: Mapping[str, Mean], sequence: str) -> float:
+    return means[sequence].value if sequence in means else math.nan
+
+
+def _comparable(row: Row, rows: Sequence[Row], means: Mapping[str, SequenceMean]) -> float:
+    """A row's mean; NaN for that of fewer sequences than a row has that it competes with."""
+    most = max(means[other.name].count for other in rows if other.variant == row.variant)
+    return means[row.name].value if means[row.name].count == most else math.nan
+
+
+def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, places: int) -> str:
+    """Mean ± deviation over seeds; with their number where a run is missing or has no such figure."""
+    if not any(run[-1] == sequence for run in row.records):
+        return MISSING
+    if sequence not in means:
+        return NOTHING
+    mean = means[sequence]
+    return _of(figure(mean.value, mean.deviation, places), mean.count, seeds)
+
+
+def _mean_cell(mean: SequenceMean, expected: int, places: int) -> str:
+    return _of(figure(mean.value, mean.deviation, places), mean.count, expected) if mean.count else NOTHING
+
+
+def _of(text: str, count: int, expected: int) -> str:
+    return text if count == expected else f"{text} ({count} of {expected})"
