@@ -1,4 +1,4 @@
-"""Colours for instances: far apart from each other where the objects are near to each other."""
+"""The colours of pictures; those of instances are far apart from each other where the objects are near."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import cv2
 import numpy as np
 
 from framework.data import Float64, UInt8
+
+PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
 
 NEAR_M = 0.8  # objects within about this distance are seen together, so their colours matter most to each other
 ALIKE = 22.0  # CIE76 colour difference within which two colours are taken for each other

@@ -18,7 +18,7 @@ PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
     *("hydra", "debug", "ahead", "detection_cache", "detection_cache_dir"),
-    *("row", "rows", "resume", "table"),  # of an experiment: what its runs are compared for
+    *("row", "rows", "resume", "table", "figure"),  # of an experiment: what its runs are compared for
 )
 """Keys of the config that change no result."""
 
