@@ -14,10 +14,10 @@ from tqdm import tqdm
 
 from framework.command_line import EXIT_FAILED, KNOWN_ERRORS, one_line, one_line_errors
 from framework.evaluation.instances import Transfer
+from framework.reports.layouts import head
 from framework.reports.metrics import MAIN_FIGURES
 from framework.reports.records import Record, find_records
 from framework.reports.reevaluation import Reevaluation, Truth, dataset_of
-from framework.reports.tables import head
 
 
 def main() -> None:

@@ -38,7 +38,8 @@ class CameraPath:
     def shades(self) -> UInt8:
         """(F, 3) RGB: blue at the beginning, orange at the end."""
         share = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
-        return np.rint((1 - share) * np.array(PATH_START) + share * np.array(PATH_END)).astype(np.uint8)
+        mixed = (1 - share) * np.array(PATH_START) + share * np.array(PATH_END)
+        return np.asarray(np.rint(mixed), np.uint8)
 
     def draw(self, image: Image.Image) -> None:
         """A line with dots at its ends; thin where something stands before it."""

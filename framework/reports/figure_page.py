@@ -1,0 +1,63 @@
+"""A page for a printed figure: places in millimetres, letters in points, small type below, and the two files."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from framework.atomic_files import written_whole
+
+COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of a journal's column, and of two
+TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0
+INK, FAINT_INK = "#20242a", "#787e86"
+INCH_MM = 25.4
+PNG_DPI = 200
+PDF_DPI = 300  # of the rasters in it
+NOTE_LINE_MM, NOTE_LETTER_MM = 2.35, 0.84  # of small type: a line's height, and a letter's width on average
+MARGIN_MM = 1.0
+
+
+class Page:
+    """A white page with a note at its foot. Places are mm from the lower left corner of what is above the note."""
+
+    def __init__(self, width: float, height: float, note: str) -> None:
+        lines = textwrap.wrap(note, int((width - 2 * MARGIN_MM) / NOTE_LETTER_MM))
+        self._foot = NOTE_LINE_MM * len(lines) + 2 * MARGIN_MM
+        self._size = width, height + self._foot
+        self.figure = Figure((self._size[0] / INCH_MM, self._size[1] / INCH_MM), facecolor="white")
+        self.text(MARGIN_MM, MARGIN_MM - self._foot, "\n".join(lines), fontsize=NOTE_PT, color=FAINT_INK, va="bottom")
+
+    def axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        """Axes without ticks, in a thin frame."""
+        x, y = self._share(left, bottom)
+        axes = self.figure.add_axes((x, y, width / self._size[0], height / self._size[1]))
+        axes.set_xticks([])
+        axes.set_yticks([])
+        for side in axes.spines.values():
+            side.set(color=FAINT_INK, linewidth=0.3)
+        return axes
+
+    def text(self, x: float, y: float, text: str, **style: Any) -> None:
+        self.figure.text(*self._share(x, y), text, **style)
+
+    def write(self, path: Path) -> list[Path]:
+        """Writes the page as `path`.png and `path`.pdf, and returns these; the same page gives the same bytes."""
+        png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
+        with written_whole(png) as temporary:
+            self.figure.savefig(temporary, dpi=PNG_DPI)
+        with written_whole(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # letters that can be searched
+            self.figure.savefig(temporary, dpi=PDF_DPI, metadata={"CreationDate": None})
+        return [png, pdf]
+
+    def _share(self, x: float, y: float) -> tuple[float, float]:
+        return x / self._size[0], (y + self._foot) / self._size[1]
+
+
+def say_inside(axes: Axes, text: str) -> None:
+    """Writes why there is nothing else in the axes."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=TEXT_PT, color=FAINT_INK)
