@@ -7,9 +7,13 @@ import math
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
+from scipy.spatial.transform import Rotation
 
 from framework.data import Bool, Camera, Detections, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
+
+RIGID_WITHIN = 1e-2  # largest entry of |R R^T - I| that is rounding: published poses have six digits, lost ones R = 0
+EXACT_WITHIN = 1e-12  # such a rotation is as exact as float64 writes it, and stays as it is
 
 
 def inverse(T_a_b: Float64) -> Float64:
@@ -61,6 +65,35 @@ def nearest_rotation(R: Float64) -> Float64:
     """The rotation nearest to a (3, 3) matrix in the Frobenius norm (orthogonal Procrustes)."""
     U, _, Vt = np.linalg.svd(R)
     return np.asarray(U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt)
+
+
+def nearest_rigid(matrix: Float64) -> Float64:
+    """The rigid motion that a published (4, 4) matrix means: without its rotation's rounding errors.
+
+    Raises DataError, which only says why, when it means none.
+    """
+    if not np.isfinite(matrix).all():
+        raise DataError("the pose is not finite")
+    if not np.allclose(matrix[3], (0, 0, 0, 1)):
+        raise DataError("the last row of the pose is not 0 0 0 1")
+    R = matrix[:3, :3]
+    with np.errstate(all="ignore"):  # numbers of any size come from files
+        error, determinant = float(np.abs(R @ R.T - np.eye(3)).max()), float(np.linalg.det(R))
+    if not (error <= RIGID_WITHIN and determinant > 0):
+        raise DataError(f"the pose is not rigid: |R R^T - I| is {error:.2g}, det R {determinant:.2g}")
+    T = np.eye(4)
+    T[:3, :3] = R if error <= EXACT_WITHIN else nearest_rotation(R)
+    T[:3, 3] = matrix[:3, 3]
+    return T
+
+
+def interpolate(T_world_a: Float64, T_world_b: Float64, share: float) -> Float64:
+    """The pose (4, 4) a `share` in [0, 1] of the way from a to b: evenly along a line and about one axis (slerp)."""
+    R_a, R_b = T_world_a[:3, :3], T_world_b[:3, :3]
+    T = np.eye(4)
+    T[:3, :3] = R_a @ Rotation.from_rotvec(share * Rotation.from_matrix(R_a.T @ R_b).as_rotvec()).as_matrix()
+    T[:3, 3] = (1 - share) * T_world_a[:3, 3] + share * T_world_b[:3, 3]
+    return T
 
 
 def project(camera: Camera, points_camera: npt.NDArray[np.floating]) -> npt.NDArray[np.floating]:

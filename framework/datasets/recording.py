@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import math
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -64,6 +64,14 @@ class RecordedFrame:
     timestamp: float  # s
     T_world_camera: Float64 | None = None  # (4, 4), None = not known
     fault: str = ""  # why the frame cannot be used, as where its pose is no pose; "" = it can
+
+    @classmethod
+    def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
+        """The frame with what `pose` returns; the DataError that it raises where there is no pose is its fault."""
+        try:
+            return cls(images, timestamp, pose())
+        except DataError as error:
+            return cls(images, timestamp, fault=str(error))
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,7 @@ Files belong together by the number in their names; the numbers may start anywhe
 
 from __future__ import annotations
 
-import json
 import logging
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,12 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, FrameTruth, Int32, SceneTruth
+from framework.data import FrameTruth, Int32, SceneTruth
+from framework.datasets.camera_json import camera_of, read_json_object
 from framework.datasets.image_files import read_uint16
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
 from framework.errors import ConfigError, DataError, FrameError
 from framework.evaluation.scene_truth import LabeledDepth, fuse_scene_truth
 from framework.trajectory_file import TumLine, read_tum_lines
+
+CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,8 @@ class RgbdFolder(Recording):
         super().__post_init__()
 
     def open(self) -> Contents:
-        camera, depth_scale = _read_camera(self.folder / "camera.json")
+        path = self.folder / "camera.json"
+        camera, depth_scale = camera_of(path, _read_json(path), CAMERA_KEYS)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
@@ -55,7 +57,7 @@ class RgbdFolder(Recording):
             _recorded(ImageFiles(color[number], depth[number]), k, lines[k] if lines else None)
             for k, number in enumerate(color)
         ]
-        return Contents(camera, self.folder / "camera.json", depth_scale, frames)
+        return Contents(camera, path, depth_scale, frames)
 
     def truth_in(self, index: int) -> FrameTruth | None:
         if not self._instances:
@@ -106,46 +108,13 @@ class RgbdFolder(Recording):
 def _recorded(images: ImageFiles, index: int, line: TumLine | None) -> RecordedFrame:
     if line is None:
         return RecordedFrame(images, index / FRAME_RATE)
-    try:
-        return RecordedFrame(images, line.timestamp, line.pose())
-    except DataError as error:
-        return RecordedFrame(images, line.timestamp, fault=str(error))
+    return RecordedFrame.posed(images, line.timestamp, line.pose)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise DataError(f"{path} is missing; an RGB-D folder needs camera.json, color/ and depth/ (see README)")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
-    return content
-
-
-def _read_camera(path: Path) -> tuple[Camera, float]:
-    """The camera and the depth scale (units per metre)."""
-    content = _read_json(path)
-    values: dict[str, float] = {}
-    for key in ("width", "height", "fx", "fy", "cx", "cy", "depth_scale"):
-        if key not in content:
-            raise DataError(f"{path}: the key {key!r} is missing")
-        value = content[key]
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise DataError(f"{path}: {key} must be a number, found {value!r}")
-        values[key] = value
-    for key in ("width", "height"):
-        if values[key] != int(values[key]):
-            raise DataError(f"{path}: {key} must be a whole number of pixels, found {values[key]}")
-    if values["depth_scale"] <= 0:
-        raise DataError(f"{path}: depth_scale must be positive (depth units per metre), found {values['depth_scale']}")
-    width, height = int(values["width"]), int(values["height"])
-    try:
-        camera = Camera(width, height, values["fx"], values["fy"], values["cx"], values["cy"])
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
-    return camera, values["depth_scale"]
+    return read_json_object(path)
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:

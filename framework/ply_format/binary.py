@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import Array
 from framework.errors import DataError
-from framework.ply_format.header import Element, Header, Property
+from framework.ply_format.header import Element, Header, Property, shown
 from framework.ply_format.rows import Body, Int64, Rows, alike, no_rows, row_dtype, rows_of_columns, rows_of_table
 
 
@@ -24,17 +24,13 @@ class BinaryBody(Body):
         if not element.rows:
             return no_rows(element, "byte")
         row = row_dtype(element, self._first_lengths(element), self._order)
-        if row is None:
-            return self._walk(element)
         start = self._position
-        there = min(element.rows, (len(self._data) - start) // row.itemsize)
-        table = np.frombuffer(self._data, row, there, start)
-        if not alike(table):
-            return self._walk(element)
-        if there < element.rows:
-            raise self._truncated(element, there)
-        self._position += there * row.itemsize
-        return rows_of_table(element, table, "byte", range(start, self._position, row.itemsize))
+        if row is not None and start + element.rows * row.itemsize <= len(self._data):
+            table = np.frombuffer(self._data, row, element.rows, start)
+            if alike(table):
+                self._position += table.nbytes
+                return rows_of_table(element, table, "byte", range(start, self._position, row.itemsize))
+        return self._walk(element)
 
     def check_end(self) -> None:
         rest = self._data[self._position :]
@@ -73,7 +69,9 @@ class BinaryBody(Body):
             first, position = position, position + column.count.itemsize
             length = int.from_bytes(self._data[first:position], self._order, signed=column.count.kind == "i")
             if length < 0:
-                raise DataError(f"{self._path}, byte {first}: {element.name} {row} has a list of {length} numbers")
+                raise DataError(
+                    f"{self._path}, byte {first}: {shown(element.name)} {row} has a list of {length} numbers"
+                )
         position += length * column.dtype.itemsize
         if position > len(self._data):
             raise self._truncated(element, row)
@@ -88,6 +86,6 @@ class BinaryBody(Body):
 
     def _truncated(self, element: Element, row: int) -> DataError:
         return DataError(
-            f"{self._path}, byte {len(self._data)}: the file ends in {element.name} {row}, "
+            f"{self._path}, byte {len(self._data)}: the file ends in {shown(element.name)} {row}, "
             f"but its header announces {element.rows}"
         )

@@ -105,7 +105,7 @@ class TextBody(Body):
             if used < len(words):
                 raise ValueError(f"expected {used} numbers, found {len(words)}")
         except ValueError as error:
-            raise DataError(f"{self._path}, line {self._line}: {element.name} {row}: {error}") from error
+            raise DataError(f"{self._path}, line {self._line}: {shown(element.name)} {row}: {error}") from error
         return found
 
     def _go(self, place: tuple[int, int]) -> None:

@@ -22,6 +22,11 @@ HEADS = {
     "instances.ap50_agnostic": "AP50 agnostic",
     "instances.mean_iou": "mean IoU",
     "instances.count": "instances",
+    **{
+        f"instances.to_map.{key}": f"{name} to map"
+        for key, name in (("ap50", "AP50"), ("ap25", "AP25"), ("ap", "AP"), ("mean_iou", "mean IoU"))
+    },
+    "instances.to_map.ap50_agnostic": "AP50 agnostic, to map",
     "fps": "Hz",
     "frames_lost": "frames lost",
     "trajectory.ate_rmse_m": "ATE (m)",

@@ -20,7 +20,7 @@ from framework.atomic_files import written_whole
 from framework.data import Box, Float64
 from framework.errors import DataError
 
-LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 8 s and 1 GB
+LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 9 s and 0.5 GB
 LARGEST_ID = int(np.iinfo(np.int32).max)  # what a label of the mesh can be
 QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits
 NO_COLOR = (0, 0, 0)

@@ -11,27 +11,33 @@ from framework.data import Camera
 from framework.errors import DataError
 
 KEYS = ("fx", "fy", "cx", "cy")  # px
+SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px, whose middle is the centre where the file has none
+POSITIVE = {"fx", "fy", *SIZES.values()}
 LARGEST_FILE = 2**20  # bytes; such a file has some hundred
 
 
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
-    Comments (# or ;), section headers and other keys are left out. Raises DataError, naming file and line, when a key
-    is missing, there twice, or its value is no finite number, positive for fx and fy.
+    Comments (# or ;), section headers and other keys are left out. Without cx or cy, it is half of depth_width or
+    depth_height, as ethz-asl/scenenn_to_rosbag takes it. Raises DataError, naming file and line, when a key is
+    missing, there twice, or its value is no finite number, positive for focal lengths and sizes.
     """
     values: dict[str, float] = {}
     for number, line in enumerate(_lines(path), start=1):
         key, *found = re.split(r"\s*[=:]\s*|\s+", re.split("[#;]", line)[0].strip(), maxsplit=1)
-        if key not in KEYS:
+        if key not in POSITIVE and key not in KEYS:
             continue
         value = _number(found[0] if found else "")
-        if value is None or (key in ("fx", "fy") and value <= 0):
-            wanted = "a positive number" if key in ("fx", "fy") else "a number"
+        if value is None or (key in POSITIVE and value <= 0):
+            wanted = "a positive number" if key in POSITIVE else "a number"
             raise DataError(f"{path}, line {number}: {key} must be {wanted} of pixels, found {' '.join(found)[:40]!r}")
         if key in values:
             raise DataError(f"{path}, line {number}: {key} is there a second time")
         values[key] = value
+    for center, size in SIZES.items():
+        if center not in values and size in values:
+            values[center] = values[size] / 2
     missing = [key for key in KEYS if key not in values]
     if missing:
         raise DataError(f"{path} has no line with {missing[0]}; it must give {', '.join(KEYS)}")
@@ -40,11 +46,8 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
 
 def write_intrinsics(path: Path, camera: Camera) -> None:
     """Writes the camera's intrinsics, whole or not at all; `read_intrinsics` gives the same numbers back."""
-    values = {
-        "depth_width": camera.width,
-        "depth_height": camera.height,
-        **{key: getattr(camera, key) for key in KEYS},
-    }
+    sizes = {"depth_width": camera.width, "depth_height": camera.height}
+    values = sizes | {key: getattr(camera, key) for key in KEYS}
     with written_whole(path) as temporary:
         temporary.write_text("".join(f"{key} {value!r}\n" for key, value in values.items()), encoding="ascii")
 

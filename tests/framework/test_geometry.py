@@ -139,3 +139,46 @@ def test_lift_refuses_masks_of_another_size(room: CornerRoom) -> None:
     one = np.ones((1, 1), np.float32)
     with pytest.raises(DataError, match=r"frame 0: masks must be \(72, 96\), found \(1, 1\)"):
         geometry.lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("a",)), frame, Pose(np.eye(4)))
+
+
+@given(twists, arrays(np.float64, (3, 3), elements=st.floats(-1, 1, width=32)))
+def test_nearest_rigid_removes_the_rounding_of_a_published_pose(xi: np.ndarray, noise: np.ndarray) -> None:
+    T = geometry.exp_se3(xi)
+    rounded = T.copy()
+    rounded[:3, :3] += 1e-4 * noise
+    repaired = geometry.nearest_rigid(rounded)
+    np.testing.assert_allclose(repaired[:3, :3] @ repaired[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(repaired, T, atol=1e-3)
+    np.testing.assert_array_equal(repaired[:, 3], T[:, 3])
+
+
+def test_nearest_rigid_keeps_an_exact_pose_to_the_last_bit() -> None:
+    T = geometry.exp_se3(np.array([1.0, 2.0, 3.0, 0.4, -0.5, 0.6]))
+    np.testing.assert_array_equal(geometry.nearest_rigid(T), T)
+
+
+@pytest.mark.parametrize(
+    ("matrix", "why"),
+    [
+        (np.diag([1.0, 1.0, -1.0, 1.0]), "det R -1"),
+        (np.diag([1.0, 1.01, 1.0, 1.0]), "not rigid"),
+        (np.zeros((4, 4)), "last row"),
+        (np.diag([1.0, 1.0, 1.0, -1.0]), "last row"),
+        (np.full((4, 4), np.inf), "not finite"),
+        (np.array([[1e200, -1e200, 0, 0], [1e200, 1e200, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "not rigid"),
+    ],
+)
+def test_nearest_rigid_refuses_what_is_no_pose(matrix: np.ndarray, why: str) -> None:
+    with pytest.raises(DataError, match=why):
+        geometry.nearest_rigid(matrix)
+
+
+@given(twists, twists)
+def test_interpolate_starts_at_a_ends_at_b_and_moves_evenly(xi_a: np.ndarray, xi_b: np.ndarray) -> None:
+    T_a, T_b = geometry.exp_se3(xi_a), geometry.exp_se3(xi_b)
+    np.testing.assert_allclose(geometry.interpolate(T_a, T_b, 0), T_a, atol=1e-12)
+    np.testing.assert_allclose(geometry.interpolate(T_a, T_b, 1), T_b, atol=1e-7)  # half turns are ill-conditioned
+    third = geometry.interpolate(T_a, T_b, 1 / 3)
+    np.testing.assert_allclose(third[:3, 3], T_a[:3, 3] + (T_b - T_a)[:3, 3] / 3, atol=1e-12)
+    whole = geometry.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3])
+    assert geometry.rotation_angle(T_a[:3, :3].T @ third[:3, :3]) == pytest.approx(whole / 3, abs=1e-7)

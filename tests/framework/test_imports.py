@@ -12,7 +12,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = ["errors", "data", "geometry", "interfaces", "mapping", "journal", "pipeline", "reports"]
 """From the ground up: a module imports nothing from a layer above its own; modules not named here stand beside."""
 
-OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "defusedxml"}
+OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas"}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
 
 

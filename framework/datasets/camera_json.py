@@ -1,0 +1,56 @@
+"""The camera of a recording as a JSON object, whose keys each format names in its own way."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from framework.data import Camera
+from framework.errors import DataError
+
+
+def read_json_object(path: Path) -> dict[str, Any]:
+    """The JSON object that a file holds. Raises DataError, naming the file, when it holds none."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path} is not valid JSON: {error}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
+    return content
+
+
+def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
+    """The camera and the depth scale (units per metre) that `content` of the file `path` gives.
+
+    `keys` are the names of width, height, fx, fy, cx, cy and of the depth scale. Raises DataError, naming the file and
+    the key, when a value is missing or cannot be.
+    """
+    values = [_number(path, content, key) for key in keys]
+    for key, value in zip(keys[:2], values[:2], strict=True):
+        if value != int(value):
+            raise DataError(f"{path}: {key} must be a whole number of pixels, found {value}")
+    width, height, fx, fy, cx, cy, depth_scale = values
+    if depth_scale <= 0:
+        raise DataError(f"{path}: {keys[-1]} must be positive (depth units per metre), found {depth_scale}")
+    try:
+        return Camera(int(width), int(height), fx, fy, cx, cy), depth_scale
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from error
+
+
+def _number(path: Path, content: Mapping[str, Any], key: str) -> float:
+    if key not in content:
+        raise DataError(f"{path}: the key {key!r} is missing")
+    value = content[key]
+    try:
+        if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
+            return float(value)
+    except OverflowError:  # a whole number beyond the range of float
+        pass
+    raise DataError(f"{path}: {key} must be a number, found {str(value)[:40]!r}")

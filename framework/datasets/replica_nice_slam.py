@@ -1,0 +1,65 @@
+"""Replica as NICE-SLAM distributes it (Straub et al., 2019; Zhu et al., CVPR 2022): renders of eight scanned rooms.
+
+    cam_params.json                     of all scenes: {"camera": {"w", "h", "fx", "fy", "cx", "cy", "scale"}}
+    room0/results/frame000000.jpg       8-bit colour, from 0
+    room0/results/depth000000.png       uint16 along z, `scale` units a metre
+    room0/traj.txt                      line k: T_world_camera of frame k, 16 numbers row by row, m
+
+The camera's axes are x right, y down, z forward: NICE-SLAM turns them for its own use when it reads them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from framework.data import Camera
+from framework.datasets.camera_json import camera_of, read_json_object
+from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
+from framework.errors import DataError
+from framework.matrix_file import read_matrix_lines
+
+CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+
+
+@dataclass
+class ReplicaNiceSlam(Recording):
+    """A scene of Replica in NICE-SLAM's layout: exact depth and poses, and no instances."""
+
+    def open(self) -> Contents:
+        path = self.folder.parent / "cam_params.json"
+        camera, depth_scale = _read_camera(path)
+        color = numbered_images(self.folder / "results", (".jpg",))
+        depth = numbered_images(self.folder / "results", (".png",))
+        poses = read_matrix_lines(self.folder / "traj.txt")
+        numbers = sorted(color.keys() | depth.keys())
+        if numbers[-1] >= len(poses):
+            raise DataError(
+                f"{self.folder / 'traj.txt'} holds {len(poses)} poses, but results/ has a frame {numbers[-1]}, "
+                "counted from 0: one line a frame is needed"
+            )
+        # a frame of which one image is missing is there: reading it says which
+        frames = [
+            RecordedFrame.posed(
+                ImageFiles(
+                    color.get(k, self.folder / "results" / f"frame{k:06d}.jpg"),
+                    depth.get(k, self.folder / "results" / f"depth{k:06d}.png"),
+                ),
+                k / FRAME_RATE,
+                poses[k].pose,
+            )
+            for k in numbers
+        ]
+        return Contents(camera, path, depth_scale, frames)
+
+
+def _read_camera(path: Path) -> tuple[Camera, float]:
+    """The camera and the depth scale (units per metre)."""
+    if not path.is_file():
+        raise DataError(
+            f"{path} is missing: it lies beside the scenes' folders, of which dataset.scene=room0 names one"
+        )
+    camera = read_json_object(path).get("camera")
+    if not isinstance(camera, dict):
+        raise DataError(f'{path} must hold {{"camera": {{{", ".join(CAMERA_KEYS)}}}}}')
+    return camera_of(path, camera, CAMERA_KEYS)

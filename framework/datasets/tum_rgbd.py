@@ -1,0 +1,184 @@
+"""TUM RGB-D (Sturm et al., IROS 2012): Kinect videos with poses from motion capture.
+
+    rgb.txt, depth.txt      a line an image, `timestamp filename`, s; `#` begins a comment
+    rgb/, depth/            8-bit colour and uint16 depth along z, registered to colour, 5000 units a metre; 0 = none
+    groundtruth.txt         optional; TUM format, T_world_camera of the colour camera, about 100 poses a second
+
+The published correction factors of depth are in the images already. Lens distortion is ignored: in freiburg1 and
+freiburg2 half of the pixels are off by 5 px or more, the corners by 37 and 27 px; freiburg3 has none.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Camera, Float64
+from framework.datasets.recording import Contents, ImageFiles, RecordedFrame, Recording
+from framework.errors import ConfigError, DataError
+from framework.geometry import interpolate
+from framework.parameters import require
+from framework.trajectory_file import TumLine, read_tum_lines
+
+DEPTH_SCALE = 5000.0  # units a metre
+
+log = logging.getLogger(__name__)
+
+
+class Intrinsics(Enum):
+    """Which of the published calibrations of the colour camera holds."""
+
+    AUTO = "by the folder's name"
+    FREIBURG1 = "freiburg1"
+    FREIBURG2 = "freiburg2"
+    FREIBURG3 = "freiburg3"
+    ROS_DEFAULT = "ROS default"
+
+
+# https://vision.in.tum.de/data/datasets/rgbd-dataset/file_formats, "Calibration of the color camera"
+CAMERAS: Mapping[Intrinsics, Camera] = {
+    Intrinsics.FREIBURG1: Camera(640, 480, 517.3, 516.5, 318.6, 255.3),
+    Intrinsics.FREIBURG2: Camera(640, 480, 520.9, 521.0, 325.1, 249.7),
+    Intrinsics.FREIBURG3: Camera(640, 480, 535.4, 539.2, 320.1, 247.6),
+    Intrinsics.ROS_DEFAULT: Camera(640, 480, 525.0, 525.0, 319.5, 239.5),
+}
+
+
+@dataclass
+class TumRgbd(Recording):
+    """A sequence of TUM RGB-D, or a recording in its layout by a camera with the same intrinsics.
+
+    Colour and depth belong together by time: the closest pairs first, each image once. The true pose is interpolated
+    between the two around the time of the colour image, and not known where the nearest is farther than
+    `max_difference`.
+    """
+
+    intrinsics: Intrinsics = Intrinsics.AUTO
+    max_difference: float = 0.02  # s, in (0, 1], between colour and its depth, and colour and the nearest pose
+
+    def __post_init__(self) -> None:
+        require(0 < self.max_difference <= 1, "dataset.max_difference", self.max_difference, "in (0, 1] s")
+        super().__post_init__()
+
+    def open(self) -> Contents:
+        intrinsics = _named(self.name) if self.intrinsics is Intrinsics.AUTO else self.intrinsics
+        color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
+        pairs = associate(_times(color), _times(depth), self.max_difference)
+        if not pairs:
+            raise DataError(
+                f"{self.folder}: no image of rgb.txt has one of depth.txt within dataset.max_difference "
+                f"({self.max_difference:g} s)"
+            )
+        if len(pairs) < len(color):
+            log.info("%s: %d of %d colour images have no depth image", self.name, len(color) - len(pairs), len(color))
+        truth = Trajectory.read(self.folder / "groundtruth.txt", self.max_difference)
+        frames = [_recorded(color[i], depth[j], truth) for i, j in pairs]
+        return Contents(CAMERAS[intrinsics], f"dataset.intrinsics={intrinsics.name}", DEPTH_SCALE, frames)
+
+
+@dataclass(frozen=True)
+class ListedImage:
+    """A line of rgb.txt or depth.txt."""
+
+    timestamp: float  # s
+    path: Path
+
+
+def _times(images: Sequence[ListedImage]) -> list[float]:
+    return [image.timestamp for image in images]
+
+
+@dataclass(frozen=True)
+class Trajectory:
+    """True poses, to be asked for any time."""
+
+    lines: Sequence[TumLine]  # in order of time; some may be no pose
+    timestamps: Float64  # (L,) s, of the lines
+    max_difference: float  # s
+
+    @classmethod
+    def read(cls, path: Path, max_difference: float) -> Trajectory:
+        """The trajectory of a file, empty where there is none."""
+        lines = sorted(read_tum_lines(path), key=lambda line: line.timestamp) if path.exists() else []
+        return cls(lines, np.array([line.timestamp for line in lines]), max_difference)
+
+    def at(self, timestamp: float) -> Float64 | None:
+        """T_world_camera (4, 4), None where it is not known. Raises DataError when a line that it needs is no pose."""
+        after = int(np.searchsorted(self.timestamps, timestamp, side="right"))
+        around = range(max(after - 1, 0), min(after + 1, len(self.lines)))
+        if not any(abs(self.timestamps[k] - timestamp) <= self.max_difference for k in around):
+            return None
+        a, b = self.lines[around[0]], self.lines[around[-1]]
+        if a is b or a.timestamp == timestamp:
+            return a.pose()
+        return interpolate(a.pose(), b.pose(), (timestamp - a.timestamp) / (b.timestamp - a.timestamp))
+
+
+def associate(first: Sequence[float], second: Sequence[float], max_difference: float) -> list[tuple[int, int]]:
+    """Index pairs of the times (s) that belong together, in the order of `first`'s times.
+
+    The closest pair comes first, then the closest of what is left, as in the benchmark's own associate.py.
+    """
+    order = np.argsort(second, kind="stable")
+    times = np.asarray(second, np.float64)[order]
+    lows = np.searchsorted(times, np.subtract(first, max_difference))
+    highs = np.searchsorted(times, np.add(first, max_difference), side="right")
+    candidates = sorted(
+        (abs(first[i] - times[k]), i, int(order[k]))
+        for i, (low, high) in enumerate(zip(lows, highs, strict=True))
+        for k in range(low, high)
+    )
+    partner: dict[int, int] = {}
+    taken: set[int] = set()
+    for _, i, j in candidates:
+        if i not in partner and j not in taken:
+            partner[i] = j
+            taken.add(j)
+    return sorted(partner.items(), key=lambda pair: first[pair[0]])
+
+
+def _recorded(color: ListedImage, depth: ListedImage, truth: Trajectory) -> RecordedFrame:
+    images = ImageFiles(color.path, depth.path)
+    return RecordedFrame.posed(images, color.timestamp, lambda: truth.at(color.timestamp))
+
+
+def _named(folder: str) -> Intrinsics:
+    found = re.search(r"freiburg[123]", folder)
+    if not found:
+        raise ConfigError(
+            f"dataset.intrinsics: the folder's name {folder} has no freiburg1, freiburg2 or freiburg3 in it; "
+            "choose FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT"
+        )
+    return Intrinsics(found[0])
+
+
+def _read_list(path: Path) -> list[ListedImage]:
+    """The images that a list names. Raises DataError, naming file and line, when one is not `timestamp filename`."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise DataError(f"{path} is missing: it lists the images' times, a line each: timestamp filename") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} could not be read as text: {error}") from error
+    listed = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")]
+    if not listed:
+        raise DataError(f"{path} lists no image")
+    return [_listed(path, n, line) for n, line in listed]
+
+
+def _listed(path: Path, number: int, line: str) -> ListedImage:
+    words = line.split(maxsplit=1)
+    try:
+        timestamp = float(words[0])
+    except ValueError:
+        timestamp = math.nan
+    if len(words) < 2 or not math.isfinite(timestamp) or "\0" in line:
+        raise DataError(f"{path}, line {number}: expected `timestamp filename`, found {line.strip()!r}")
+    return ListedImage(timestamp, path.parent / words[1].strip())

@@ -1,0 +1,61 @@
+"""4x4 matrices in text files, as datasets publish poses: one a file (four lines of four numbers), or one a line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Float64
+from framework.errors import DataError
+from framework.geometry import nearest_rigid
+
+
+@dataclass(frozen=True)
+class PrintedMatrix:
+    """A matrix as it stands in a file; whether its numbers are a pose is only told when that is asked for."""
+
+    where: str  # file, and line where it has many
+    values: Float64  # (4, 4), may be NaN
+
+    def pose(self) -> Float64:
+        """The rigid (4, 4) motion that it means. Raises DataError, naming the place, when it is none."""
+        try:
+            return nearest_rigid(self.values)
+        except DataError as error:
+            raise DataError(f"{self.where}: {error}") from error
+
+
+def read_matrix(path: Path) -> PrintedMatrix:
+    """The matrix of a file. Raises DataError, naming file and line, unless it holds four lines of four numbers."""
+    lines = _lines(path)
+    if len(lines) != 4:
+        raise DataError(f"{path}: expected 4 lines of 4 numbers, found {len(lines)} lines")
+    return PrintedMatrix(str(path), np.array([_numbers(f"{path}, line {n}", words, 4) for n, words in lines]))
+
+
+def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
+    """The matrix of each line. Raises DataError, naming file and line, when one does not hold 16 numbers."""
+    places = [(f"{path}, line {n}", words) for n, words in _lines(path)]
+    return [PrintedMatrix(where, np.array(_numbers(where, words, 16)).reshape(4, 4)) for where, words in places]
+
+
+def _lines(path: Path) -> list[tuple[int, list[str]]]:
+    """The words of each line that is not empty, with its number in the file, from 1."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise DataError(f"{path} does not exist") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} could not be read as text: {error}") from error
+    return [(n, line.split()) for n, line in enumerate(lines, start=1) if line.strip()]
+
+
+def _numbers(where: str, words: list[str], count: int) -> list[float]:
+    if len(words) != count:
+        raise DataError(f"{where}: expected {count} numbers, found {len(words)}")
+    try:
+        return [float(word) for word in words]
+    except ValueError as error:
+        raise DataError(f"{where}: expected {count} numbers: {error}") from error

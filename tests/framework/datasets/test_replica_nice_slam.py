@@ -1,0 +1,137 @@
+"""Replica in NICE-SLAM's layout, sound and with every fault."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Camera
+from framework.datasets.replica_nice_slam import ReplicaNiceSlam
+from framework.errors import DataError
+from tests.recordings import fault_of, mapped, opened, write_color, write_depth
+
+CAMERA = {"w": 24, "h": 16, "fx": 12.0, "fy": 12.0, "cx": 11.5, "cy": 7.5, "scale": 6553.5}
+SHAPE = (16, 24)
+FRAMES = 3
+
+
+def write_camera(root: Path, **changes: Any) -> None:
+    (root / "cam_params.json").write_text(json.dumps({"camera": CAMERA | changes}, indent=4))
+
+
+def pose_at(k: int) -> np.ndarray:
+    """A turn to the right about the vertical of the camera, away from the origin."""
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = Rotation.from_rotvec([0, 0.3 * k, 0]).as_matrix()
+    T_world_camera[:3, 3] = 1, 2, 0.1 * k
+    return T_world_camera
+
+
+def write_poses(scene: Path, poses: list[np.ndarray]) -> None:
+    (scene / "traj.txt").write_text("".join(" ".join(f"{x:.18e}" for x in pose.ravel()) + "\n" for pose in poses))
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    root = tmp_path / "Replica"
+    for k in range(FRAMES):
+        write_color(root / f"room0/results/frame{k:06d}.jpg", (40 * k, 100, 200), SHAPE)
+        write_depth(root / f"room0/results/depth{k:06d}.png", 13107, SHAPE)  # 2 m
+    write_camera(root)
+    write_poses(root / "room0", [pose_at(k) for k in range(FRAMES)])
+    return root
+
+
+def test_a_frame_holds_what_the_files_hold(root: Path) -> None:
+    sequence = ReplicaNiceSlam(root, scene="room0")
+    assert (len(sequence), sequence.name) == (FRAMES, "room0")
+    assert sequence.camera == Camera(24, 16, 12.0, 12.0, 11.5, 7.5)
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
+    assert np.abs(frame.color.astype(int) - (80, 100, 200)).max() <= 2  # JPEG
+    np.testing.assert_allclose(frame.depth, 2, rtol=1e-6)
+    np.testing.assert_allclose(frame.T_world_camera, pose_at(2), atol=1e-12)
+    assert sequence.scene_truth() is None
+
+
+def test_it_runs_through_the_pipeline(root: Path) -> None:
+    result, points_world = mapped(opened("replica_nice_slam", f"dataset.root={root}", "dataset.scene=room0"))
+    assert (result.frames, result.frames_skipped) == (FRAMES, 0)
+    for k, points in enumerate(np.split(points_world, FRAMES)):
+        R, center = pose_at(k)[:3, :3], pose_at(k)[:3, 3]
+        np.testing.assert_allclose((points - center) @ R[:, 2], 2, atol=1e-5)  # all are 2 m in front of the camera
+        assert (points[0] - center) @ R[:, 1] < 0 < (points[-1] - center) @ R[:, 1]  # the first row is above
+
+
+def test_a_part_of_the_frames_keeps_its_poses(root: Path) -> None:
+    for name in ("frame000000.jpg", "depth000000.png"):
+        (root / "room0/results" / name).unlink()
+    np.testing.assert_allclose(ReplicaNiceSlam(root / "room0")[0].T_world_camera, pose_at(1), atol=1e-12)
+
+
+def test_a_pose_that_is_none_is_the_fault_of_its_frame(root: Path) -> None:
+    stretched = pose_at(1)
+    stretched[0] *= 1.1
+    write_poses(root / "room0", [pose_at(0), stretched, pose_at(2)])
+    assert "traj.txt, line 2: the pose is not rigid" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    write_poses(root / "room0", [pose_at(0), np.full((4, 4), np.nan), pose_at(2)])
+    assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+
+
+@pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])
+def test_a_missing_image_is_the_fault_of_its_frame(root: Path, name: str) -> None:
+    (root / "room0/results" / name).unlink()
+    assert f"{name} could not be read" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+
+
+@pytest.mark.parametrize("name", ["results", "traj.txt"])
+def test_what_is_missing_is_named(root: Path, name: str) -> None:
+    (root / "room0" / name).rename(root / "elsewhere")
+    with pytest.raises(DataError, match=name):
+        ReplicaNiceSlam(root, scene="room0")
+
+
+def test_without_a_scene_the_camera_is_missing(root: Path) -> None:
+    with pytest.raises(DataError, match=r"cam_params\.json is missing: .* dataset\.scene=room0"):
+        ReplicaNiceSlam(root)
+
+
+def test_fewer_poses_than_frames(root: Path) -> None:
+    write_poses(root / "room0", [pose_at(0), pose_at(1)])
+    with pytest.raises(DataError, match=r"traj\.txt holds 2 poses, but results/ has a frame 2"):
+        ReplicaNiceSlam(root, scene="room0")
+
+
+def test_a_bad_line_of_poses_is_named(root: Path) -> None:
+    write_poses(root / "room0", [pose_at(0), pose_at(1)[:3], pose_at(2)])
+    with pytest.raises(DataError, match=r"traj\.txt, line 2: expected 16 numbers, found 12"):
+        ReplicaNiceSlam(root, scene="room0")
+
+
+@pytest.mark.parametrize(
+    "changes", [{"w": "wide"}, {"h": 16.5}, {"fx": -1.0}, {"cy": float("nan")}, {"scale": 0}, {"fy": 10**400}]
+)
+def test_a_bad_camera_value_is_named(root: Path, changes: dict[str, Any]) -> None:
+    write_camera(root, **changes)
+    with pytest.raises(DataError, match=rf"cam_params\.json: .*{next(iter(changes))}"):
+        ReplicaNiceSlam(root, scene="room0")
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"camera": 3}', "{}", "[" * 100_000, '{"camera": {"w": 24}}'])
+def test_a_file_without_a_camera(root: Path, text: str) -> None:
+    (root / "cam_params.json").write_text(text)
+    with pytest.raises(DataError, match=r"cam_params\.json"):
+        ReplicaNiceSlam(root, scene="room0")
+
+
+def test_images_of_another_size(root: Path) -> None:
+    write_depth(root / "room0/results/depth000002.png", 1, (8, 12))
+    assert "is 12x8, but" in fault_of(ReplicaNiceSlam(root, scene="room0"), 2)
+    write_camera(root, w=1200, h=680)
+    with pytest.raises(DataError, match=r"frame000000\.jpg is 24x16, but .*cam_params\.json says 1200x680"):
+        ReplicaNiceSlam(root, scene="room0")

@@ -1,0 +1,158 @@
+"""7-Scenes in the published format, sound and with every fault; registration against exact projection."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Camera
+from framework.datasets.seven_scenes import BASELINE, COLOR_CAMERA, DEPTH_CAMERA, SevenScenes, register
+from framework.errors import DataError
+from framework.geometry import back_project, inverse, project, transform
+from tests.recordings import fault_of, mapped, opened, write_color, write_depth
+
+FRAMES = 3
+
+
+def pose_at(k: int) -> np.ndarray:
+    """T_world_depthcamera."""
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0, 0.1 * k, 0.05]).as_matrix()
+    T[:3, 3] = 0.1 * k, -1, 2
+    return T
+
+
+def write_pose(folder: Path, k: int, T: np.ndarray) -> None:
+    """With eight digits and tabs, as published."""
+    rows = "".join("\t ".join(f"{x:.7e}" for x in row) + "\t \n" for row in T)
+    (folder / f"frame-{k:06d}.pose.txt").write_text(rows)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    folder = tmp_path / "chess" / "seq-01"
+    for k in range(FRAMES):
+        write_color(folder / f"frame-{k:06d}.color.png", (40 * k, 100, 200))
+        write_depth(folder / f"frame-{k:06d}.depth.png", 2000)
+        write_pose(folder, k, pose_at(k))
+    (folder / "Thumbs.db").write_bytes(b"\xd0\xcf")
+    return folder
+
+
+def all_points(camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """The readings (P, 3) in camera coordinates."""
+    v, u = np.nonzero(depth)
+    return back_project(camera, np.stack([u, v], 1).astype(np.int32), depth[v, u])
+
+
+def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
+    sequence = SevenScenes(folder.parents[1], scene="chess/seq-01")
+    assert (len(sequence), sequence.name, sequence.camera) == (FRAMES, "chess-seq-01", COLOR_CAMERA)
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, pytest.approx(2 / 30))
+    assert (frame.color == (80, 100, 200)).all()
+    assert set(np.unique(frame.depth)) == {0, 2}  # the border, which the depth camera does not see
+    assert (frame.depth > 0).mean() == pytest.approx((529 / 585) ** 2, abs=0.02)
+    T_depthcamera_camera = inverse(pose_at(2)) @ frame.T_world_camera
+    np.testing.assert_allclose(T_depthcamera_camera[:3, :3], np.eye(3), atol=1e-6)
+    np.testing.assert_allclose(T_depthcamera_camera[:3, 3], [BASELINE, 0, 0], atol=1e-6)
+
+
+def test_it_runs_through_the_pipeline(folder: Path) -> None:
+    """The wall that each depth camera has 2 m before it is mapped where that camera saw it."""
+    root = folder.parents[1]
+    result, points_world = mapped(
+        opened("seven_scenes", f"dataset.root={root}", "dataset.scene=chess/seq-01", "dataset.stop=2")
+    )
+    assert (result.frames, result.frames_skipped) == (2, 0)
+    for k, points in enumerate(np.split(points_world, 2)):
+        z = transform(inverse(pose_at(k)), points.astype(np.float64))[:, 2]
+        seen = np.abs(z) > 1e-5  # what has no reading is mapped at the camera itself by the tests' fuser
+        assert seen.mean() > 0.7
+        np.testing.assert_allclose(z[seen], 2, atol=1e-5)
+
+
+def test_registered_depth_is_where_the_colour_camera_sees_it() -> None:
+    """Each reading's own point, projected into the colour camera, lies within half a pixel of where it went."""
+    raw = np.zeros(DEPTH_CAMERA.shape, np.uint16)
+    raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # far apart, all different
+    registered = register(raw)
+    points = all_points(DEPTH_CAMERA, raw.astype(np.float32) / 1000) - np.float32([BASELINE, 0, 0])
+    seen = project(COLOR_CAMERA, points)
+    inside = (np.abs(seen - [319.5, 239.5]) < [319, 239]).all(axis=1)
+    assert inside.sum() > 150
+    for (u, v), z in zip(seen[inside], points[inside, 2], strict=True):
+        rows, columns = np.nonzero(registered == round(1000 * z))
+        assert len(rows) == 1
+        assert abs(columns[0] - u) <= 0.501
+        assert abs(rows[0] - v) <= 0.501
+
+
+def test_the_nearest_reading_wins_and_no_reading_stays_none() -> None:
+    raw = np.full(DEPTH_CAMERA.shape, 4000, np.uint16)
+    raw[:, 300:340] = 1000
+    raw[:100] = 65535
+    raw[400:] = 0
+    registered = register(raw)
+    assert set(np.unique(registered)) == {0, 1000, 4000}
+    assert not registered[:110].any()
+    assert not registered[390:].any()
+    row = registered[240]
+    near = np.flatnonzero(row == 1000)
+    # x = (u - 320) / 585 m at 1 m, seen from 25 mm to the right
+    np.testing.assert_allclose(near[[0, -1]], 320 + 529 * ((np.array([300, 339]) - 320) / 585 - 0.025), atol=0.51)
+    # left of the near strip the far wall goes on, hidden behind it as far as the cameras' parallax says
+    assert row[near[0] - 1] == 4000
+    gap = np.flatnonzero(row[near[-1] + 1 :] == 4000)[0]
+    assert gap == pytest.approx(529 * 0.025 * (1 / 1 - 1 / 4), abs=1.5)
+
+
+def test_rounded_rotations_are_made_rigid(folder: Path) -> None:
+    rounded = np.round(pose_at(1), 3)
+    write_pose(folder, 1, rounded)
+    T = SevenScenes(folder)[1].T_world_camera
+    assert T is not None
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    np.testing.assert_allclose(T[:3, :3], pose_at(1)[:3, :3], atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "pose.txt does not exist"),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n", "pose.txt: expected 4 lines of 4 numbers, found 3 lines"),
+        ("1 0 0 0\n0 1 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers, found 3"),
+        ("1 0 0 0\n0 one 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt, line 2: expected 4 numbers: .*'one'"),
+        ("1 0 0 0\n0 1 0 0\n0 0 nan 0\n0 0 0 1\n", "pose.txt: the pose is not finite"),
+        ("1 0 0 0\n0 1 0 0\n0 0 -1 0\n0 0 0 1\n", "pose.txt: the pose is not rigid"),
+        ("1 0 0 0\n0 2 0 0\n0 0 1 0\n0 0 0 1\n", "pose.txt: the pose is not rigid"),
+        ("1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 1 1\n", "pose.txt: the last row of the pose is not 0 0 0 1"),
+    ],
+)
+def test_a_pose_that_is_none_is_the_fault_of_its_frame(folder: Path, text: str | None, message: str) -> None:
+    path = folder / "frame-000001.pose.txt"
+    path.unlink() if text is None else path.write_text(text)
+    assert re.search(rf"frame-000001\.{message}", fault_of(SevenScenes(folder), 1))
+
+
+@pytest.mark.parametrize("name", ["color", "depth"])
+def test_a_missing_image_is_the_fault_of_its_frame(folder: Path, name: str) -> None:
+    (folder / f"frame-000002.{name}.png").unlink()
+    assert f"frame-000002.{name}.png could not be read" in fault_of(SevenScenes(folder), 2)
+
+
+def test_a_folder_without_frames_says_how_a_scene_is_named(folder: Path) -> None:
+    with pytest.raises(DataError, match=r"holds no frame-000000\.color\.png; dataset\.scene is like chess/seq-01"):
+        SevenScenes(folder.parents[1], scene="chess")
+
+
+def test_images_of_another_size(folder: Path) -> None:
+    write_color(folder / "frame-000001.color.png", (1, 2, 3), (240, 320))
+    assert "is 320x240, but the camera of 7-Scenes says 640x480" in fault_of(SevenScenes(folder), 1)
+    write_depth(folder / "frame-000000.depth.png", 1, (240, 320))
+    with pytest.raises(DataError, match=r"frame-000000\.depth\.png is 320x240"):
+        SevenScenes(folder)

@@ -1,0 +1,222 @@
+"""TUM RGB-D in the published format, sound and with every fault."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation, Slerp
+
+from framework.datasets.tum_rgbd import CAMERAS, Intrinsics, TumRgbd, associate
+from framework.errors import ConfigError, DataError
+from tests.recordings import fault_of, mapped, opened, write_color, write_depth
+
+START = 1305031102.175304  # s
+DEPTH_DELAY = 0.0151  # s, of each depth image after its colour image
+FRAMES = 3
+HEADER = "# {}\n# file: 'rgbd_dataset_freiburg1_xyz.bag'\n# timestamp {}\n"
+
+
+def color_time(k: int) -> float:
+    return round(START + k / 30, 6)
+
+
+def write_lists(folder: Path, color: list[float], depth: list[float]) -> None:
+    for name, title, times in (("rgb", "color images", color), ("depth", "depth maps", depth)):
+        lines = [f"{time:.6f} {name}/{time:.6f}.png\n" for time in times]
+        (folder / f"{name}.txt").write_text(HEADER.format(title, "filename") + "".join(lines))
+
+
+def write_poses(folder: Path, lines: list[str]) -> None:
+    text = HEADER.format("ground truth trajectory", "tx ty tz qx qy qz qw") + "\n".join(lines) + "\n"
+    (folder / "groundtruth.txt").write_text(text)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A walk of 1 m/s along x, seen at 100 Hz by the motion capture, before a wall at z = 2 m."""
+    folder = tmp_path / "rgbd_dataset_freiburg1_xyz"
+    color = [color_time(k) for k in range(FRAMES)]
+    depth = [time + DEPTH_DELAY for time in color]
+    for k, (of_color, of_depth) in enumerate(zip(color, depth, strict=True)):
+        write_color(folder / f"rgb/{of_color:.6f}.png", (10 * k, 20, 30))
+        write_depth(folder / f"depth/{of_depth:.6f}.png", 10_000)
+    write_lists(folder, color, depth)
+    write_poses(folder, [f"{START + k / 100:.4f} {k / 100:.4f} 0 0 0 0 0 1" for k in range(-3, 20)])
+    return folder
+
+
+def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
+    sequence = TumRgbd(folder)
+    assert (len(sequence), sequence.name) == (FRAMES, "rgbd_dataset_freiburg1_xyz")
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, color_time(2))
+    assert (frame.color == (20, 20, 30)).all()
+    assert (frame.depth == 2).all()  # 5000 units a metre
+    assert frame.T_world_camera is not None
+    np.testing.assert_allclose(frame.T_world_camera[:3, 3], [2 / 30, 0, 0], atol=1e-4)  # times have four digits
+    assert frame.camera == CAMERAS[Intrinsics.FREIBURG1]
+
+
+def test_it_runs_through_the_pipeline(folder: Path) -> None:
+    places = f"dataset.root={folder.parent}", f"dataset.scene={folder.name}"
+    result, points_world = mapped(opened("tum_rgbd", *places, "dataset.stop=2"))
+    assert (result.frames, result.frames_skipped, result.frames_lost) == (2, 0, 0)
+    np.testing.assert_allclose(points_world[:, 2], 2, atol=1e-6)
+    # the first pixel of each frame lies left of the camera, which walks along x
+    lefts = points_world[:: 640 * 480, 0]
+    np.testing.assert_allclose(lefts, (0 - 318.6) / 517.3 * 2 + np.arange(2) / 30, atol=1e-4)
+
+
+@pytest.mark.parametrize("number", [1, 2, 3])
+def test_the_folders_name_gives_the_camera(folder: Path, number: int) -> None:
+    renamed = folder.rename(folder.parent / f"rgbd_dataset_freiburg{number}_long_office")
+    assert TumRgbd(renamed).camera == CAMERAS[Intrinsics[f"FREIBURG{number}"]]
+    assert TumRgbd(renamed, intrinsics=Intrinsics.ROS_DEFAULT).camera == CAMERAS[Intrinsics.ROS_DEFAULT]
+
+
+def test_another_name_asks_for_the_camera(folder: Path) -> None:
+    mine = folder.rename(folder.parent / "my_desk")
+    with pytest.raises(ConfigError, match=r"dataset\.intrinsics: the folder's name my_desk"):
+        TumRgbd(mine)
+    sequence = opened("tum_rgbd", f"dataset.root={mine}", "dataset.intrinsics=FREIBURG3")
+    assert sequence.camera == CAMERAS[Intrinsics.FREIBURG3]
+
+
+# Association
+
+
+def test_the_closest_pair_comes_first_and_each_image_is_used_once() -> None:
+    """Depth 0.015 is nearest to both colour images: the closer one gets it, and the other what is left."""
+    assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
+    assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
+    assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]
+
+
+def test_pairs_come_in_the_order_of_time_whatever_the_lists_order() -> None:
+    assert associate([0.2, 0.0, 0.1], [0.11, 0.21, 0.01], 0.02) == [(1, 2), (2, 0), (0, 1)]
+
+
+def test_associate_agrees_with_all_pairs_by_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    first, second = np.sort(rng.uniform(0, 1, 40)), rng.uniform(0, 1, 50)
+    free = np.abs(first[:, None] - second)
+    expected = []
+    while free.min() <= 0.02:
+        i, j = np.unravel_index(free.argmin(), free.shape)
+        expected.append((int(i), int(j)))
+        free[i], free[:, j] = np.inf, np.inf
+    assert associate(first.tolist(), second.tolist(), 0.02) == sorted(expected)
+    assert len(expected) > 20
+
+
+def test_colour_images_without_depth_are_left_out_and_counted(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    color = [color_time(k) for k in range(FRAMES)]
+    write_lists(folder, color, [color[0] + DEPTH_DELAY, color[2] + DEPTH_DELAY])
+    with caplog.at_level(logging.INFO):
+        sequence = TumRgbd(folder)
+    assert [frame.timestamp for frame in sequence] == [color[0], color[2]]
+    assert "1 of 3 colour images have no depth image" in caplog.text
+
+
+def test_nothing_that_belongs_together_is_a_fault(folder: Path) -> None:
+    with pytest.raises(DataError, match=r"within dataset\.max_difference \(0\.01 s\)"):
+        TumRgbd(folder, max_difference=0.01)
+
+
+# Poses
+
+
+def test_poses_are_interpolated(folder: Path) -> None:
+    q_0, q_1 = Rotation.from_rotvec([0.1, 0.2, 0.3]), Rotation.from_rotvec([-0.2, 0.1, 0.5])
+    times = [color_time(1) - 0.003, color_time(1) + 0.006]
+    lines = [
+        f"{time:.7f} {x} 2 3 " + " ".join(map(str, q.as_quat()))
+        for time, x, q in zip(times, (0.9, 1.2), (q_0, q_1), strict=True)
+    ]
+    write_poses(folder, lines)
+    T_world_camera = TumRgbd(folder)[1].T_world_camera
+    assert T_world_camera is not None
+    np.testing.assert_allclose(T_world_camera[:3, 3], [1.0, 2, 3], atol=1e-4)
+    slerp = Slerp([0, 1], Rotation.concatenate([q_0, q_1]))(1 / 3)
+    np.testing.assert_allclose(T_world_camera[:3, :3], slerp.as_matrix(), atol=1e-4)
+
+
+def test_beyond_the_tolerance_the_pose_is_not_known(folder: Path) -> None:
+    write_poses(folder, [f"{color_time(0) + 0.019:.6f} 5 0 0 0 0 0 1", f"{color_time(2) - 0.021:.6f} 6 0 0 0 0 0 1"])
+    sequence = TumRgbd(folder)
+    first = sequence[0].T_world_camera
+    assert first is not None
+    np.testing.assert_array_equal(first[:3, 3], [5, 0, 0])  # before all poses: the nearest
+    assert sequence[2].T_world_camera is None
+
+
+def test_without_ground_truth_no_pose_is_known(folder: Path) -> None:
+    (folder / "groundtruth.txt").unlink()
+    assert TumRgbd(folder)[0].T_world_camera is None
+
+
+def test_a_pose_that_is_none_is_the_fault_of_its_frame(folder: Path) -> None:
+    lines = [f"{color_time(k):.6f} 0 0 0 0 0 0 1" for k in range(FRAMES)]
+    lines[1] = f"{color_time(1):.6f} 0 0 0 0 0 0 0"
+    write_poses(folder, lines)
+    assert "groundtruth.txt, line 5: the quaternion" in fault_of(TumRgbd(folder), 1)
+
+
+# Faults
+
+
+@pytest.mark.parametrize("name", ["rgb.txt", "depth.txt"])
+def test_a_missing_list_is_named(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    with pytest.raises(DataError, match=f"{name} is missing"):
+        TumRgbd(folder)
+
+
+@pytest.mark.parametrize("line", ["1305031102.2", "yesterday rgb/1.png", "nan rgb/1.png", "1.5 rgb/\0.png"])
+def test_a_bad_line_of_a_list_is_named(folder: Path, line: str) -> None:
+    text = (folder / "rgb.txt").read_text()
+    (folder / "rgb.txt").write_text(text + line + "\n")
+    with pytest.raises(DataError, match=r"rgb\.txt, line 7: expected `timestamp filename`"):
+        TumRgbd(folder)
+
+
+def test_a_bad_line_of_the_poses_is_named(folder: Path) -> None:
+    write_poses(folder, ["1305031102.2 1 2 3"])
+    with pytest.raises(DataError, match=r"groundtruth\.txt, line 4: expected 8 numbers"):
+        TumRgbd(folder)
+
+
+@pytest.mark.parametrize("content", [b"", b"# color images\n"])
+def test_a_list_of_nothing(folder: Path, content: bytes) -> None:
+    (folder / "depth.txt").write_bytes(content)
+    with pytest.raises(DataError, match=r"depth\.txt lists no image"):
+        TumRgbd(folder)
+
+
+def test_a_list_that_is_no_text(folder: Path) -> None:
+    (folder / "rgb.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(DataError, match=r"rgb\.txt could not be read as text"):
+        TumRgbd(folder)
+
+
+def test_an_image_that_is_listed_and_not_there(folder: Path) -> None:
+    path = folder / f"depth/{color_time(1) + DEPTH_DELAY:.6f}.png"
+    path.unlink()
+    assert f"{path} could not be read" in fault_of(TumRgbd(folder), 1)
+
+
+def test_images_of_another_size(folder: Path) -> None:
+    write_color(folder / f"rgb/{color_time(1):.6f}.png", (1, 2, 3), (240, 320))
+    assert "is 320x240, but dataset.intrinsics=FREIBURG1 says 640x480" in fault_of(TumRgbd(folder), 1)
+    write_color(folder / f"rgb/{color_time(0):.6f}.png", (1, 2, 3), (240, 320))
+    with pytest.raises(DataError, match="is 320x240"):
+        TumRgbd(folder)
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, 1.5, float("nan")])
+def test_the_tolerance_is_checked(folder: Path, value: float) -> None:
+    with pytest.raises(ConfigError, match=r"dataset\.max_difference must be in \(0, 1\] s"):
+        TumRgbd(folder, max_difference=value)
