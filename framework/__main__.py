@@ -11,6 +11,7 @@ from omegaconf import DictConfig
 
 from framework.command_line import CONF, EXIT_FAILED, Jobs
 from framework.experiment import WriteTables, with_row
+from framework.figures import WriteFigures
 from framework.reports.records import is_recorded
 
 jobs = Jobs()
@@ -33,7 +34,7 @@ def job(config: DictConfig) -> None:
 def main() -> None:
     """The console script `instancemap`."""
     jobs.run(job)
-    if WriteTables.failed:
+    if WriteTables.failed or WriteFigures.failed:
         sys.exit(EXIT_FAILED)
 
 

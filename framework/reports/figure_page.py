@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
 
 from framework.atomic_files import written_whole
 
@@ -18,7 +19,7 @@ INK, FAINT_INK = "#20242a", "#787e86"
 INCH_MM = 25.4
 PNG_DPI = 200
 PDF_DPI = 300  # of the rasters in it
-NOTE_LINE_MM, NOTE_LETTER_MM = 2.35, 0.84  # of small type: a line's height, and a letter's width on average
+NOTE_LINE_MM = 2.35  # from one line of small type to the next
 MARGIN_MM = 1.0
 
 
@@ -26,7 +27,7 @@ class Page:
     """A white page with a note at its foot. Places are mm from the lower left corner of what is above the note."""
 
     def __init__(self, width: float, height: float, note: str) -> None:
-        lines = textwrap.wrap(note, int((width - 2 * MARGIN_MM) / NOTE_LETTER_MM))
+        lines = _wrapped(note, width - 2 * MARGIN_MM)
         self._foot = NOTE_LINE_MM * len(lines) + 2 * MARGIN_MM
         self._size = width, height + self._foot
         self.figure = Figure((self._size[0] / INCH_MM, self._size[1] / INCH_MM), facecolor="white")
@@ -56,6 +57,24 @@ class Page:
 
     def _share(self, x: float, y: float) -> tuple[float, float]:
         return x / self._size[0], (y + self._foot) / self._size[1]
+
+
+def text_width(text: str, size: float) -> float:
+    """How wide a text of this size, pt, is printed, mm."""
+    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
+    return float(width) / 72 * INCH_MM
+
+
+def _wrapped(text: str, width: float) -> list[str]:
+    """The lines of small type, mm wide at most, that hold the text."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and text_width(longer, NOTE_PT) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
 
 
 def say_inside(axes: Axes, text: str) -> None:

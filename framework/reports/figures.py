@@ -23,7 +23,7 @@ from framework.reports.rows import Row, Run, natural, rows_of
 from framework.reports.stage_times import WINDOW, MeanTimes, stage_times_figure
 from framework.reports.stored_map import StoredMap
 from framework.reports.table_notes import counted, machine
-from framework.reports.timings_file import read_timings
+from framework.reports.timings_file import StageTimes, read_timings
 
 NAME = "figure"  # of the files, and of the block in the experiment's config
 
@@ -101,27 +101,32 @@ class Pictured:
 
 
 def _stage_times(pictured: Pictured) -> Page:
-    times = {name: _mean_times(row) for name, row in pictured.rows.items()}
-    shown = [one for one in times.values() if one is not None]
+    read = {name: _times_of(row) for name, row in pictured.rows.items()}
+    means = {name: MeanTimes.of(list(times.values())) if times else None for name, times in read.items()}
+    shown = [one for one in means.values() if one is not None]
     if not shown:
         raise DataError("no timings.csv can be read; the log says why")
     counts = "/".join(map(str, dict.fromkeys(one.count for one in shown)))
+    sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
     note = (
-        f"Mean of {counts} sequences ({', '.join(map(pictured.called, pictured.runs))}), of running medians over "
-        f"{WINDOW} frames; bands: ± standard deviation between sequences. Right: median over all frames, and "
-        f"× the median of the last third of the frames by that of the first."
+        f"Mean of {counts} sequences ({', '.join(sequences)}), of running medians over {WINDOW} frames; bands: from "
+        f"the fastest sequence to the slowest. Right: median over all frames, and × the median of the last third of "
+        f"the frames by that of the first."
     )
     if any(one.longest > one.frames[-1] for one in shown):
         note += " Lines end where the shortest sequence does."
-    return stage_times_figure(times, f"{note} {_origin(pictured.records)}")
+    return stage_times_figure(means, f"{note} {_origin(pictured.records)}")
 
 
-def _mean_times(row: Row | None) -> MeanTimes | None:
-    """None where no run can be read."""
-    records = row.records.values() if row else ()
-    found = [_if_readable(lambda one: read_timings(one.directory / "timings.csv"), record) for record in records]
-    times = [one for one in found if one is not None]
-    return MeanTimes.of(times) if times else None
+def _times_of(row: Row | None) -> dict[Run, StageTimes]:
+    """Of the runs that can be read."""
+    records = row.records if row else {}
+    read = {run: _if_readable(_times, record) for run, record in records.items()}
+    return {run: times for run, times in read.items() if times is not None}
+
+
+def _times(record: Record) -> StageTimes:
+    return read_timings(record.directory / "timings.csv")
 
 
 def _maps(pictured: Pictured) -> Page:

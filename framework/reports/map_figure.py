@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -22,6 +23,7 @@ from framework.reports.figure_page import (
     TEXT_PT,
     Page,
     say_inside,
+    text_width,
 )
 from framework.reports.map_panels import Name, Panel, PanelLine, Window
 
@@ -29,7 +31,7 @@ HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, 
 LEFT_MM, RIGHT_MM = 3.5, 0.3  # beside the panels
 ASPECT = 0.78  # height by width of a panel
 NAME_ROOM_MM = 0.8  # around the middle of an object, for its name to be written there
-NAME_LETTER_MM, NAME_HEIGHT_MM = 1.06, 1.9
+NAME_HEIGHT_MM = 1.9
 
 
 @dataclass(frozen=True)
@@ -120,14 +122,13 @@ def _draw_names(axes: Axes, panel: Panel | None, width_mm: float) -> None:
     scale = panel.image.shape[1] / width_mm  # px by mm
     taken: list[tuple[Name, float]] = []  # with half the width, px
     for name in panel.names:
-        half = len(name.text) * NAME_LETTER_MM * scale / 2
+        half = text_width(name.text, NOTE_PT) * scale / 2
         if name.room < NAME_ROOM_MM * scale or any(
             abs(name.v - other.v) < NAME_HEIGHT_MM * scale and abs(name.u - other.u) < half + other_half
             for other, other_half in taken
         ):
             continue
         taken.append((name, half))
-        label = axes.text(
-            name.u, name.v, name.text, ha="center", va="center", fontsize=NOTE_PT, color=INK, clip_on=True
-        )
-        label.set_path_effects([withStroke(linewidth=1.2, foreground="white", alpha=0.85)])
+        halo = [withStroke(linewidth=1.2, foreground="white", alpha=0.85)]
+        place: dict[str, Any] = {"ha": "center", "va": "center", "path_effects": halo}
+        axes.text(name.u, name.v, name.text, fontsize=NOTE_PT, color=INK, **place)

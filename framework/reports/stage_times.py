@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from framework.data import Float64
@@ -30,8 +31,10 @@ COLORS = {
 
 STAGES = tuple(stage for stage in COLORS if stage != SUM)
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms a frame
-PLOT_MM, HEAD_MM, AXIS_MM = 50.0, 5.0, 9.0  # heights, of one row's diagram, its heading and what is below its axis
-LEFT_MM, RIGHT_MM = 10.5, 25.0  # beside the diagram
+PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights, of one row's diagram, its heading and what is below its axis
+LEFT_MM, RIGHT_MM = 9.5, 27.5  # beside the diagram
+PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
+LABEL_PLACES_MM = (2.2, 2.8, 20.0, 27.0)  # right of the diagram: the end of the line, the stage, its median, its growth
 LABEL_MM = 2.9  # from one label's line to the next
 LOWEST_MS = 0.1  # what is shorter is drawn as long
 
@@ -42,7 +45,8 @@ class MeanTimes:
 
     frames: Int64  # (G,) numbers of the video's frames
     mean: Mapping[str, Float64]  # by stage, and SUM: (G,) ms, NaN where no sequence knows it
-    deviation: Mapping[str, Float64]  # (G,) ms, sample standard deviation between sequences; 0 of one
+    lowest: Mapping[str, Float64]  # the same of the sequence that was fastest there
+    highest: Mapping[str, Float64]  # and of the slowest
     count: int  # sequences
     longest: int  # the last frame of the longest sequence
 
@@ -51,7 +55,7 @@ class MeanTimes:
         """Of one run or more, each with a frame or more."""
         end = min(int(run.frames[-1]) for run in runs)
         frames = np.unique(np.concatenate([run.frames[run.frames <= end] for run in runs]))
-        mean, deviation = {}, {}
+        mean, lowest, highest = {}, {}, {}
         for stage in COLORS:
             smooth = np.full((len(runs), len(frames)), np.nan)
             for line, run in zip(smooth, runs, strict=True):
@@ -59,10 +63,10 @@ class MeanTimes:
                     _of_stage(run, stage), WINDOW
                 )[run.frames <= end]
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore", RuntimeWarning)  # where all are NaN, or all but one
+                warnings.simplefilter("ignore", RuntimeWarning)  # where all are NaN
                 mean[stage] = np.nanmean(smooth, axis=0)
-                deviation[stage] = np.nan_to_num(np.nanstd(smooth, axis=0, ddof=1))
-        return cls(frames, mean, deviation, len(runs), max(int(run.frames[-1]) for run in runs))
+                lowest[stage], highest[stage] = np.nanmin(smooth, axis=0), np.nanmax(smooth, axis=0)
+        return cls(frames, mean, lowest, highest, len(runs), max(int(run.frames[-1]) for run in runs))
 
     @property
     def stages(self) -> list[str]:
@@ -115,7 +119,7 @@ def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
     step = HEAD_MM + PLOT_MM + AXIS_MM
     page = Page(COLUMN_MM, step * len(rows), note)
     for k, (name, times) in enumerate(rows.items(), start=1):
-        axes = page.axes(LEFT_MM, step * (len(rows) - k) + AXIS_MM, COLUMN_MM - LEFT_MM - RIGHT_MM, PLOT_MM)
+        axes = page.axes(LEFT_MM, step * (len(rows) - k) + AXIS_MM, PLOT_WIDTH_MM, PLOT_MM)
         axes.set_title(name, fontsize=TEXT_PT, loc="left", pad=3, color=INK)
         if times is None:
             say_inside(axes, "not complete")
@@ -141,10 +145,9 @@ def _end(group: list[float], gap: float) -> float:
 
 def _draw(axes: Axes, times: MeanTimes) -> None:
     for stage in times.stages:
-        mean = np.maximum(times.mean[stage], LOWEST_MS)
-        low, high = mean - times.deviation[stage], mean + times.deviation[stage]
+        low, mean, high = (np.maximum(one[stage], LOWEST_MS) for one in (times.lowest, times.mean, times.highest))
         color = COLORS[stage]
-        axes.fill_between(times.frames, np.maximum(low, LOWEST_MS), high, color=color, alpha=0.16, linewidth=0)
+        axes.fill_between(times.frames, low, high, color=color, alpha=0.14, linewidth=0)
         axes.plot(times.frames, mean, color=color, linewidth=1.1 if stage == SUM else 0.9, solid_capstyle="round")
     axes.set_yscale("log")
     axes.set_xlim(times.frames[0], max(times.frames[-1], times.frames[0] + 1))
@@ -154,6 +157,7 @@ def _draw(axes: Axes, times: MeanTimes) -> None:
     axes.yaxis.set_major_locator(LogLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=2, color=FAINT_INK, labelcolor=INK)
+    axes.tick_params(which="minor", width=0.3, length=1.2, color=FAINT_INK)
     axes.grid(axis="y", color="#e6e8eb", linewidth=0.4)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
@@ -161,15 +165,9 @@ def _draw(axes: Axes, times: MeanTimes) -> None:
     axes.set_ylabel("milliseconds a frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
     for milliseconds, rate in RATES.items():
         axes.axhline(milliseconds, color=FAINT_INK, linewidth=0.5, dashes=(1.5, 2))
-        axes.annotate(
-            rate,
-            (0, milliseconds),
-            xycoords=axes.get_yaxis_transform(),
-            xytext=(2, 1.2),
-            textcoords="offset points",
-            fontsize=NOTE_PT,
-            color=FAINT_INK,
-        )
+        halo = [withStroke(linewidth=1.2, foreground="white")]
+        place: dict[str, Any] = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points"}
+        axes.annotate(rate, (0, milliseconds), (2, 1.2), fontsize=NOTE_PT, color=FAINT_INK, path_effects=halo, **place)
     _draw_labels(axes, times)
 
 
@@ -178,22 +176,16 @@ def _draw_labels(axes: Axes, times: MeanTimes) -> None:
     low, high = np.log10(axes.get_ylim())
     ends = [np.maximum(times.mean[stage][np.isfinite(times.mean[stage])][-1], LOWEST_MS) for stage in times.stages]
     heights = [float((np.log10(end) - low) / (high - low)) for end in ends]  # as shares of the diagram
+    line_x, stage_x, median_x, growth_x = (1 + place / PLOT_WIDTH_MM for place in LABEL_PLACES_MM)
     for stage, height, place in zip(times.stages, heights, spread(heights, LABEL_MM / PLOT_MM), strict=True):
         color = COLORS[stage]
-        axes.annotate(
-            "",
-            (1.0, height),
-            (1.05, place),
-            xycoords="axes fraction",
-            textcoords="axes fraction",
-            arrowprops={"arrowstyle": "-", "color": color, "linewidth": 0.5, "shrinkA": 0, "shrinkB": 0},
-        )
+        axes.plot([1, line_x], [height, place], color=color, linewidth=0.5, transform=axes.transAxes, clip_on=False)
         beside: dict[str, Any] = {"va": "center", "transform": axes.transAxes}
-        axes.text(1.06, place, stage, fontsize=SMALL_PT, color=color, weight="bold", **beside)
+        axes.text(stage_x, place, stage, fontsize=SMALL_PT, color=color, weight="bold", **beside)
         median, growth = float(np.nanmedian(times.mean[stage])), times.growth(stage)
-        axes.text(1.27, place, _short(median), fontsize=SMALL_PT, color=color, **beside)
+        axes.text(median_x, place, _short(median), fontsize=SMALL_PT, color=color, ha="right", **beside)
         if np.isfinite(growth):
-            axes.text(1.45, place, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, **beside)
+            axes.text(growth_x, place, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, ha="right", **beside)
 
 
 def _short(milliseconds: float) -> str:

@@ -45,6 +45,8 @@ def read_timings(path: Path) -> StageTimes:
                 f"{path}, line {number}: expected a frame, a stage and a time, found {','.join(line)!r:.60}"
             )
         taken[frame, stage] = milliseconds
+    if not taken:
+        raise DataError(f"{path} has no times")
     frames = sorted({frame for frame, _ in taken})
     stages = dict.fromkeys(stage for _, stage in taken)
     return StageTimes(
