@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Camera, Float64, Frame, Int32
+from framework.data import Camera, Float32, Float64, Frame, Int32
 from framework.geometry import inverse
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.sensor import Sensor, pinhole, ray_direction
@@ -161,8 +161,7 @@ class Allocator:
         Raises MapFullError when the block budget is reached.
         """
         self._frames += 1
-        coords = self._surface_coords(frame, T_world_camera)
-        self.voxels.allocate(coords)
+        coords = self.allocate(frame.camera, frame.depth, T_world_camera)
         capacity = len(self.voxels.grid.block_coords)
         if len(self._stamp) < capacity:
             self._stamp = grown(self._stamp, capacity, 0)
@@ -180,21 +179,29 @@ class Allocator:
         )
         return active[:count].copy()
 
-    def _surface_coords(self, frame: Frame, T_world_camera: Float64) -> Int32:
-        """(N, 3) coordinates of the blocks along the truncation band of the frame's readings."""
+    def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
+        """(N, 3) coordinates of the blocks along the truncation band of the readings `depth` (H, W) m, allocated here.
+
+        Raises MapFullError when the block budget is reached.
+        """
+        coords = self._surface_coords(camera, depth, T_world_camera)
+        self.voxels.allocate(coords)
+        return coords
+
+    def _surface_coords(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
         block_size = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
         # readings this far apart are at most a quarter of a block apart at the greatest depth
-        footprint = float(self.sensor.max_depth) / frame.camera.fx
+        footprint = float(self.sensor.max_depth) / camera.fx
         stride = max(1, min(8, int(0.25 * block_size / footprint)))
         # samples at most half a block apart along the ray of a corner, at the frame's greatest depth
-        farthest = min(float(frame.depth.max()), float(self.sensor.max_depth))
+        farthest = min(float(depth.max()), float(self.sensor.max_depth))
         band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
-        samples = 1 + int(np.ceil(4 * band * _longest_ray(frame.camera) / block_size))
+        samples = 1 + int(np.ceil(4 * band * _longest_ray(camera) / block_size))
         counts = np.zeros(CHUNKS, np.int32)
         while True:
             _surface_blocks(
-                frame.depth,
-                pinhole(frame.camera, T_world_camera),
+                depth,
+                pinhole(camera, T_world_camera),
                 self.sensor,
                 np.float32(block_size),
                 stride,

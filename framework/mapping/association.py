@@ -29,6 +29,7 @@ class OverlapRule(Enum):
 
     SMALLER = "the smaller of cluster and instance: a part of an object still finds the whole"
     IOU = "all pixels of either"
+    CLUSTER = "the cluster: a small part of an object finds it, the whole may not"
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,9 @@ class Overlaps:
     votes: Int32  # (N, M) pixels of both
 
     def by(self, rule: OverlapRule, least: int) -> npt.NDArray[np.float64]:
-        """(N, M) overlaps in [0, 1] by either rule, with `least` as in `over_smaller`."""
+        """(N, M) overlaps in [0, 1] by one of the rules, with `least` as in `over_smaller`."""
+        if rule is OverlapRule.CLUSTER:
+            return np.asarray(self.votes / np.maximum(self.sizes[:, None], least))
         return self.over_smaller(least) if rule is OverlapRule.SMALLER else self.over_union(least)
 
     def over_union(self, least: int) -> npt.NDArray[np.float64]:
@@ -56,6 +59,19 @@ class Overlaps:
         otherwise overlap it completely, and win it from the instance that it belongs to.
         """
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), least)
+
+
+def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
+    """Raises DataError when a cluster's pixel lies outside the (height, width) image.
+
+    A refiner made it up then, and kernels do not check bounds.
+    """
+    u, v = clusters.pixels.T
+    if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
+        raise DataError(
+            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
+            f"v in [{v.min()}, {v.max()}]"
+        )
 
 
 class PixelLists(NamedTuple):
@@ -82,15 +98,11 @@ def _link_points(pixels, cluster, first, following):
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
     """The points of `clusters` by the pixel of the (height, width) image that they were seen at, in order.
 
-    Raises DataError when a pixel lies outside the image: a refiner made it up, and kernels do not check bounds.
+    Raises DataError when a pixel lies outside the image.
     """
     lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
     if not _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next):
-        u, v = clusters.pixels.T
-        raise DataError(
-            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
-            f"v in [{v.min()}, {v.max()}]"
-        )
+        require_pixels_inside(clusters, shape)
     return lists
 
 

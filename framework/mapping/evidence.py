@@ -177,7 +177,7 @@ def add_evidence(labels, values, free, label, gain, combine, most):
 
 
 @device
-def _best_first(labels, values, free):
+def best_first(labels, values, free):
     """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not
     matter.
     """
@@ -242,8 +242,8 @@ def update_voxel(evidence, row, n, measurement, point):
             if not (known >> m) & 1:
                 gain = measurement.class_gain[k, label]
                 evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
-    _best_first(ids, id_values, 0)
-    _best_first(classes, class_values, NO_CLASS)
+    best_first(ids, id_values, 0)
+    best_first(classes, class_values, NO_CLASS)
     return evicted
 
 
@@ -310,7 +310,7 @@ def _merge(evidence, rows, kept, dropped, combine):
                     ids[s], values[s] = ids[last], values[last]
                     ids[last], values[last] = 0, 0
                     add_evidence(ids, values, 0, kept, gain, combine, UNBOUNDED)
-                    _best_first(ids, values, 0)
+                    best_first(ids, values, 0)
                     break
 
 

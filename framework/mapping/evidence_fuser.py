@@ -14,8 +14,7 @@ from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measureme
 from framework.mapping.instance_fuser import InstanceFuser
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.integration import Integrator
-from framework.mapping.sensor import Sensor
-from framework.parameters import check_bounds
+from framework.mapping.tsdf_fuser import VoxelHashingFuser
 
 EXACT_BITS = 16  # by which exact storage's units are finer
 
@@ -29,13 +28,9 @@ def only_best(clusters: PointClusters, weights: npt.NDArray[np.floating]) -> Flo
 
 
 @dataclass
-class EvidenceFuser(InstanceFuser):
+class EvidenceFuser(VoxelHashingFuser, InstanceFuser):
     """A TSDF whose voxels carry evidence for instances and classes. A subclass says what counts as evidence."""
 
-    truncation_slope: float = 0.01  # m more for each m of depth, >= 0: noise grows with depth (VoxelHashing's value)
-    max_weight: float = 200.0  # observations, 1 to 255: how slowly an old surface gives way
-    full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
-    max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     combine = Combine.SUM  # how new evidence for a label meets the old one
@@ -44,21 +39,7 @@ class EvidenceFuser(InstanceFuser):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_bounds(
-            self,
-            truncation_slope=(0.0, 1.0),
-            max_weight=(1.0, 255.0),
-            full_weight_depth=(1e-3, 1000.0),
-            max_blocks=(1, 2**31 // 512),
-        )
-        sensor = Sensor(
-            truncation=np.float32(self.truncation * self.voxel_size),
-            truncation_slope=np.float32(self.truncation_slope),
-            min_depth=np.float32(self.min_depth),
-            max_depth=np.float32(self.max_depth),
-            max_weight=np.float32(self.max_weight),
-            full_weight_depth=np.float32(self.full_weight_depth),
-        )
+        sensor = self.sensor
         self.scene: InstanceMap = InstanceMap(
             self.voxel_size,
             sensor,

@@ -12,8 +12,6 @@ from itertools import combinations
 import numpy as np
 
 from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters, Pose
-from framework.errors import DataError
-from framework.interfaces import MapFuser
 from framework.mapping.association import (
     OverlapRule,
     Overlaps,
@@ -26,6 +24,7 @@ from framework.mapping.association import (
 )
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.labeled_map import LabeledMap
+from framework.mapping.tsdf_fuser import TsdfFuser, require_same_classes
 from framework.parameters import check_bounds
 
 VOTES_ACROSS = 320  # pixels of an image row that vote in association: more cost time and tell the same
@@ -41,16 +40,11 @@ def floored_log(class_probabilities: Float32, floor: float) -> Float64:
 
 
 @dataclass
-class InstanceFuser(MapFuser):
+class InstanceFuser(TsdfFuser):
     """A TSDF whose voxels are labelled with instances: a frame's clusters update those that the map has, or make new
     ones.
     """
 
-    voxel_size: float = 0.01  # m, > 0
-    truncation: float = 4.0  # voxels, >= 1: the width of the band at depth 0
-    min_depth: float = 0.2  # m, > 0
-    max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
-    label_band: float = 2.0  # voxels, >= 1: labels go to voxels within this distance of the measured surface
     overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
     class_gate: float = 0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
@@ -62,16 +56,11 @@ class InstanceFuser(MapFuser):
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
     min_observations: int = 3  # frames, >= 1: before that an instance is tentative
     min_confidence: float = 0.1  # in [0, 1]: likewise
-    min_area: float = 0.01  # m^2 of its surface in the mesh, >= 0: likewise; voxel_size^2 for each vertex, 4 at least
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         check_bounds(
             self,
-            voxel_size=(1e-4, 1.0),
-            truncation=(1.0, 100.0),
-            min_depth=(1e-3, 100.0),
-            max_depth=(self.min_depth, 1000.0),
-            label_band=(1.0, self.truncation),
             overlap=(0.0, 1.0),
             class_gate=(0.0, 1.0),
             create_score=(0.0, 1.0),
@@ -81,7 +70,6 @@ class InstanceFuser(MapFuser):
             merge_frames=(1, 2**31),
             min_observations=(1, 2**31),
             min_confidence=(0.0, 1.0),
-            min_area=(0.0, 1000.0),
         )
         self.scene: LabeledMap  # which a subclass makes
         self._together: Counter[tuple[int, int]] = Counter()  # frames that see two instances as one, less those as two
@@ -117,11 +105,7 @@ class InstanceFuser(MapFuser):
         """The first frame's label space becomes the map's."""
         if not self.scene.classes:
             self.scene.begin(classes)
-        elif self.scene.classes != classes:
-            raise DataError(
-                f"the map has {len(self.scene.classes)} classes and this frame's clusters have {len(classes)} "
-                "others; use one detector, or map them to one label space"
-            )
+        require_same_classes(self.scene.classes, classes)
 
     def _look_up(self, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the instances that the map has at the measured surface."""

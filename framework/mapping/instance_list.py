@@ -32,32 +32,40 @@ class Confirmation:
         return counts
 
     def min_vertices(self, voxel_size: float) -> int:
-        """The vertices that an instance of `min_area` has.
-
-        One stands for voxel_size^2 where the surface lies along the grid. The mesh has one for each voxel that the
-        surface passes through, so a surface askew has up to sqrt(3) times as many.
-        """
-        return max(LEAST_VERTICES, round(self.min_area / voxel_size**2))
+        """The vertices that an instance of `min_area` has."""
+        return vertices_of_area(self.min_area, voxel_size)
 
     def too_small(self, instance_ids: Int32, voxel_size: float) -> Bool:
         """(V,) the vertices of an instance that has less than `min_area`, by the ids (V,) of all vertices."""
         return np.asarray((np.bincount(instance_ids) < self.min_vertices(voxel_size))[instance_ids])
 
 
+def vertices_of_area(area: float, voxel_size: float) -> int:
+    """The vertices that a surface of `area` m^2 has, and at least those that span a box.
+
+    One stands for voxel_size^2 where the surface lies along the grid. The mesh has one for each voxel that the surface
+    passes through, so a surface askew has up to sqrt(3) times as many.
+    """
+    return max(LEAST_VERTICES, round(area / voxel_size**2))
+
+
 def list_instances(mesh: InstanceMesh, table: InstanceTable) -> Mapping[int, Instance]:
     """The instances that have vertices, by id, ascending."""
-    order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
-    ids, starts = np.unique(mesh.instance_ids[order], return_index=True)
-    ends = [*starts[1:], len(order)]
     return {
-        int(k): _instance(table, table.records[int(k)], order[start:end], mesh.vertices[order[start:end]])
-        for k, start, end in zip(ids, starts, ends, strict=False)
-        if k > 0
+        k: _instance(table, table.records[k], vertices, mesh.vertices[vertices])
+        for k, vertices in vertices_by_id(mesh.instance_ids).items()
     }
 
 
+def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
+    """The vertices (M,) of each instance, ascending, by the ids (V,) of all vertices; without those of none."""
+    order = np.argsort(instance_ids, kind="stable").astype(np.int32)
+    ids, starts = np.unique(instance_ids[order], return_index=True)
+    ends = [*starts[1:], len(order)]
+    return {int(k): order[start:end] for k, start, end in zip(ids, starts, ends, strict=False) if k > 0}
+
+
 def _instance(table: InstanceTable, record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
-    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return Instance(
         id=record.id,
         class_probabilities=table.class_probabilities(record),
@@ -66,12 +74,18 @@ def _instance(table: InstanceTable, record: InstanceRecord, vertices: Int32, poi
         first_frame=record.first_frame,
         last_frame=record.last_frame,
         vertices=vertices,
-        aabb=Box((low + high) / 2, high - low, np.eye(3)),
-        obb=_oriented_box(points),
+        aabb=aligned_box(points),
+        obb=oriented_box(points),
     )
 
 
-def _oriented_box(points: Float32) -> Box:
+def aligned_box(points: Float32) -> Box:
+    """The box along the world's axes around points (M, 3) m."""
+    low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
+    return Box((low + high) / 2, high - low, np.eye(3))
+
+
+def oriented_box(points: Float32) -> Box:
     """The box along the principal axes of the points' convex hull (Open3D); `robust` lets flat and thin sets pass."""
     four = np.resize(points, (max(len(points), 4), 3))  # Qhull refuses fewer; repeated points change nothing
     box = o3d.geometry.OrientedBoundingBox.create_from_points(

@@ -214,8 +214,19 @@ class Integrator:
 
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
+        return self._update(frame, T_world_camera, near_band, self._allocator.active_blocks(frame, T_world_camera))
+
+    def integrate_object(self, frame: Frame, T_world_camera: Float64, near_band: float, mask: Bool) -> SeenBlocks:
+        """Like `integrate`, for a grid of one object: it grows where `mask` (H, W) shows the object, and nowhere else.
+
+        What is measured outside the mask is integrated into the blocks that there are, all of which are gone through.
+        """
+        depth = np.where(mask, frame.depth, np.float32(0.0))
+        self._allocator.allocate(frame.camera, depth, T_world_camera)
+        return self._update(frame, T_world_camera, near_band, np.arange(self.voxels.block_count, dtype=np.int32))
+
+    def _update(self, frame: Frame, T_world_camera: Float64, near_band: float, active: Int32) -> SeenBlocks:
         self.frames += 1
-        active = self._allocator.active_blocks(frame, T_world_camera)
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
         if len(self._near_pixel) < len(active):

@@ -318,12 +318,23 @@ def paint(grid, view, depth, color):
         blend_colors(found, points, color[v])
 
 
+@device
+def voxel_seen(grid, view, u, v, z, key, region):
+    """(block, number, key, region) of the voxel nearest to what pixel (u, v) sees at depth z (m), as find_block()."""
+    scale = np.float32(1.0) / grid.voxel_size
+    half = np.float32(0.5)
+    x, y, w = seen_point(view, u, v, z)
+    i = int(np.floor(x * scale + half))
+    j = int(np.floor(y * scale + half))
+    k = int(np.floor(w * scale + half))
+    block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+    return block, voxel_number(i, j, k), key, region
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def label(grid, evidence, view, depth, instance_ids, class_ids):
     """Fills instance_ids and class_ids (H, W) with the labels of the voxels nearest to the surface at `depth`."""
     height, width = depth.shape
-    scale = np.float32(1.0) / grid.voxel_size
-    half = np.float32(0.5)
     for v in prange(height):
         key = np.int64(-2)
         region = np.int32(-1)
@@ -332,14 +343,9 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
             class_ids[v, u] = -1
             z = depth[v, u]
             if z > np.float32(0.0):
-                x, y, w = seen_point(view, u, v, z)
-                i = int(np.floor(x * scale + half))
-                j = int(np.floor(y * scale + half))
-                k = int(np.floor(w * scale + half))
-                block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
+                block, n, key, region = voxel_seen(grid, view, u, v, z, key, region)
                 if block >= 0 and grid.label_row[block] >= 0:
                     row = grid.label_row[block]
-                    n = voxel_number(i, j, k)
                     instance_ids[v, u] = best_instance(evidence, row, n)
                     class_ids[v, u] = best_class(evidence, row, n)
 
@@ -389,14 +395,19 @@ def _stride(camera: Camera, voxel_size: float, max_depth: float) -> int:
 
 def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> View:
     """What `camera` sees of the map, between the sensor's nearest and farthest depth."""
-    depth, normals = cast_view(voxels, sensor, camera, T_world_camera)
-    view = pinhole(camera, T_world_camera)
-    color = np.empty((*camera.shape, 3), np.uint8)
+    surface = render_surface(voxels, sensor, camera, T_world_camera)
     instance_ids = np.empty(camera.shape, np.int32)
     class_ids = np.empty(camera.shape, np.int32)
-    paint(voxels.grid, view, depth, color)
-    label(voxels.grid, evidence, view, depth, instance_ids, class_ids)
-    return View(camera, T_world_camera, depth, normals, color, instance_ids, class_ids)
+    label(voxels.grid, evidence, pinhole(camera, T_world_camera), surface.depth, instance_ids, class_ids)
+    return View(**vars(surface), instance_ids=instance_ids, class_ids=class_ids)
+
+
+def render_surface(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> SurfaceView:
+    """The same without labels."""
+    depth, normals = cast_view(voxels, sensor, camera, T_world_camera)
+    color = np.empty((*camera.shape, 3), np.uint8)
+    paint(voxels.grid, pinhole(camera, T_world_camera), depth, color)
+    return SurfaceView(camera, T_world_camera, depth, normals, color)
 
 
 def render_near(

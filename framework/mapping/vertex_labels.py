@@ -17,7 +17,7 @@ CHUNK = 1024  # vertices that share their scratch arrays
 
 
 @device
-def _corner_voxels(grid, vertex, blocks, numbers, shares):
+def corner_voxels(grid, vertex, blocks, numbers, shares):
     """The voxels around a vertex (3,) m: block, -1 = absent, number within it and trilinear share, into (8,) arrays.
 
     Returns whether any of them has label evidence.
@@ -40,37 +40,65 @@ def _corner_voxels(grid, vertex, blocks, numbers, shares):
 
 
 @device
+def keep_near(grid, blocks, numbers, shares):
+    """Takes the shares (8,) from those of the voxels around a vertex that were not seen or are far from the surface."""
+    near = np.float32(REACH) * grid.voxel_size
+    for c in range(CORNERS):
+        stored = grid.tsdf[blocks[c], numbers[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
+        if stored == UNSEEN or abs(stored) * grid.tsdf_unit > near:
+            shares[c] = 0
+
+
+@device
+def majority(labels, shares):
+    """The voxel with the largest share of those whose label, above 0, has more than half of all shares; -1 if none has.
+
+    `labels` and `shares` (8,) are those of the voxels around a vertex.
+    """
+    total = np.float32(0.0)
+    for c in range(CORNERS):
+        total += shares[c]
+    for c in range(CORNERS):
+        votes = np.float32(0.0)
+        largest = c
+        for d in range(CORNERS):
+            if labels[d] == labels[c]:
+                votes += shares[d]
+                if shares[d] > shares[largest]:
+                    largest = d
+        if labels[c] > 0 and votes > np.float32(0.5) * total:
+            return largest
+    return -1
+
+
+@device
 def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
     """(instance, class) of a vertex: the instance that has more than half of its corners' votes, 0 and -1 if none has.
 
     A voxel near the surface votes with its share for its likeliest instance that counts, or for none.
     """
-    near = np.float32(REACH) * grid.voxel_size
-    total = np.float32(0.0)
+    keep_near(grid, blocks, numbers, shares)
     for c in range(CORNERS):
         ids[c] = 0
-        block = blocks[c]
-        if block < 0 or grid.tsdf[block, numbers[c]] == UNSEEN:
-            shares[c] = 0
-            continue
-        if abs(grid.tsdf[block, numbers[c]]) * grid.tsdf_unit > near:
-            shares[c] = 0
-            continue
-        total += shares[c]
-        row = grid.label_row[block]
-        if row >= 0:
-            ids[c] = best_counted_instance(evidence, row, numbers[c], counts)
-    for c in range(CORNERS):
-        votes = np.float32(0.0)
-        largest = c  # of those that vote alike, whose class is taken
-        for d in range(CORNERS):
-            if ids[d] == ids[c]:
-                votes += shares[d]
-                if shares[d] > shares[largest]:
-                    largest = d
-        if ids[c] > 0 and votes > np.float32(0.5) * total:
-            return ids[c], best_class(evidence, grid.label_row[blocks[largest]], numbers[largest])
-    return np.int32(0), np.int32(-1)
+        if shares[c] > 0 and grid.label_row[blocks[c]] >= 0:
+            ids[c] = best_counted_instance(evidence, grid.label_row[blocks[c]], numbers[c], counts)
+    elected = majority(ids, shares)
+    if elected < 0:
+        return np.int32(0), np.int32(-1)
+    return ids[elected], best_class(evidence, grid.label_row[blocks[elected]], numbers[elected])
+
+
+@device
+def color_of(color, voxel, out):
+    """The colour of a voxel, numbered as in a Surface, into `out` (3,)."""
+    red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
+    out[0], out[1], out[2] = red / 4, green / 4, blue / 4
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _color(color, voxels, colors):
+    for v in prange(len(voxels)):
+        color_of(color, voxels[v], colors[v])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -79,10 +107,9 @@ def _label(grid, evidence, counts, vertices, voxels, colors, instance_ids, class
         blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
         ids, shares = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
         for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(voxels))):
-            red, green, blue = unpack_color(grid.color[voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS])
-            colors[v, 0], colors[v, 1], colors[v, 2] = red / 4, green / 4, blue / 4
+            color_of(grid.color, voxels[v], colors[v])
             instance, label = np.int32(0), np.int32(-1)
-            if _corner_voxels(grid, vertices[v], blocks, numbers, shares):
+            if corner_voxels(grid, vertices[v], blocks, numbers, shares):
                 instance, label = _elect(grid, evidence, counts, blocks, numbers, shares, ids)
             instance_ids[v] = instance
             class_ids[v] = label
@@ -102,3 +129,10 @@ def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: Surface
     instance_ids, class_ids = np.empty(count, np.int32), np.empty(count, np.int32)
     _label(grid, evidence, counts, surface.vertices, surface.voxels, colors, instance_ids, class_ids)
     return colors, instance_ids, class_ids
+
+
+def vertex_colors(grid: Grid, voxels: Int32) -> UInt8:
+    """(V, 3) RGB of the voxels nearest to vertices, numbered as in a Surface."""
+    colors = np.empty((len(voxels), 3), np.uint8)
+    _color(grid.color, voxels, colors)
+    return colors

@@ -38,9 +38,12 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
     return times
 
 
-def write_timestamps(path: Path, times: Mapping[int, float]) -> None:
-    """Writes the time in s of each image, by its number, for colour and depth alike; whole or not at all."""
+def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
+    """Writes the time in s of each image, by its number, whole or not at all.
+
+    `times` are those of depth, and of colour as well where it has none of its own.
+    """
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         for number, time in times.items():
-            microseconds = round(time * MICROSECONDS)
-            file.write(f"{number} {microseconds} {microseconds}\n")
+            color_time = time if color_times is None else color_times[number]
+            file.write(f"{number} {round(color_time * MICROSECONDS)} {round(time * MICROSECONDS)}\n")

@@ -73,24 +73,28 @@ def bed_group(rng: Rng) -> Group:
     side = 1 if rng.uniform() < 0.5 else -1
     stand = clutter.nightstand(rng)
     stand = group.add(stand, beside(stand, bed, side, 0.06), against_wall(stand))
-    _set(group, stand, rng, [clutter.table_lamp(rng), tables.book(rng)][::side])
+    put_on(group, stand, rng, [clutter.table_lamp(rng), tables.book(rng)][::side])
     return group
 
 
 def couch_group(rng: Rng) -> Group:
+    return with_low_table(seating.couch(rng), rng)
+
+
+def with_low_table(couch: Furniture, rng: Rng) -> Group:
+    """A couch with a rug and a low table before it."""
     group = Group("couch")
-    couch = seating.couch(rng)
     couch = group.add(couch, y=against_wall(couch))
     front = couch.bounds()[1][1]
     low_table = tables.coffee_table(rng)
     low_table = group.add(low_table, rng.uniform(-0.1, 0.1), front + 0.33 + size(low_table)[1] / 2)
-    _set(group, low_table, rng, [tables.book(rng), clutter.mug(rng), tables.book_pile(rng)])
+    put_on(group, low_table, rng, [tables.book(rng), clutter.mug(rng), tables.book_pile(rng)])
     rug = clutter.rug(rng, size(couch)[0] + 0.3, 1.5)
     group.add(rug, 0.0, front + 0.60)
     return group
 
 
-def _set(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
+def put_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
     """Puts things on a table, side by side along its length."""
     low, high = table.bounds()
     slots = np.linspace(low[0], high[0], len(things) + 1)
@@ -146,7 +150,7 @@ def dining_group(rng: Rng) -> Group:
     ]
     if is_round:
         things = [things[1]]
-    _set(group, table, rng, things)
+    put_on(group, table, rng, things)
     return group
 
 
@@ -172,7 +176,7 @@ def desk_group(rng: Rng) -> Group:
     group = Group("desk")
     desk = tables.desk(rng)
     desk = group.add(desk, y=against_wall(desk))
-    _set(group, desk, rng, [clutter.table_lamp(rng), tables.book(rng), tables.book_pile(rng)])
+    put_on(group, desk, rng, [clutter.table_lamp(rng), tables.book(rng), tables.book_pile(rng)])
     chair = seating.office_chair(rng).placed(0, 0, 0, np.pi + rng.uniform(-0.4, 0.4))
     group.add(chair, rng.uniform(-0.2, 0.2), desk.bounds()[1][1] - chair.bounds()[0][1] + 0.03)
     return group

@@ -42,8 +42,9 @@ def arrange(groups: list[Group], width: float, depth: float, rng: Rng) -> Layout
 
     Raises DataError when even a room half as long again is too small.
     """
+    boxes = [group.boxes for group in groups]
     for factor in GROWTH:
-        plans = [_try_layout(groups, factor * width, factor * depth, rng) for _ in range(LAYOUTS)]
+        plans = [_try_layout(groups, boxes, factor * width, factor * depth, rng) for _ in range(LAYOUTS)]
         complete = [plan for plan in plans if plan is not None]
         if not complete:
             continue
@@ -62,13 +63,15 @@ class _Plan:
     solid: list[Float64] = field(default_factory=list)  # (N, 2, 3) boxes that others must not enter, for each group
 
 
-def _try_layout(groups: list[Group], width: float, depth: float, rng: Rng) -> _Plan | None:
+def _try_layout(
+    groups: list[Group], boxes_of_groups: list[Float64], width: float, depth: float, rng: Rng
+) -> _Plan | None:
     """One random layout, None when a group finds no place. Works on boxes alone: they turn by quarters exactly."""
     plan = _Plan()
     taken = np.zeros((0, 2, 3))
     walls: dict[str, tuple[int, float]] = {}
-    for group in groups:
-        boxes, solid = group.boxes, group.solid
+    for group, boxes in zip(groups, boxes_of_groups, strict=True):
+        solid = group.solid
         low, high = boxes[:, 0, 0].min(), boxes[:, 1, 0].max()
         for _ in range(TRIES):
             wall = int(rng.integers(4))

@@ -38,6 +38,12 @@ class Furniture:
         parts = [(solid.turned("z", angle).moved(x, y, z), material) for solid, material in self.parts]
         return Furniture(self.kind, self.class_name, parts)
 
+    def tilted(self, angle: float) -> Furniture:
+        """Turned by `angle` rad about x, its front going up, then lifted so that it stands on z = 0 again."""
+        parts = [(solid.turned("x", angle), material) for solid, material in self.parts]
+        tilted = Furniture(self.kind, self.class_name, parts)
+        return tilted.placed(0.0, 0.0, -float(tilted.bounds()[0][2]))
+
 
 def corners(x: float, y: float) -> tuple[tuple[float, float], ...]:
     return (-x, -y), (x, -y), (x, y), (-x, y)

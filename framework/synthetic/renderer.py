@@ -33,9 +33,9 @@ class Rendering:
 class Renderer:
     """Renders `surfaces` under `lamps`, whose light is baked once. Safe to call from several threads."""
 
-    def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
+    def __init__(self, surfaces: Surfaces, lamps: list[Lamp], casting_threads: int = 0) -> None:
         self.surfaces = surfaces
-        self.caster = RayCaster(surfaces.vertices, surfaces.triangles)
+        self.caster = RayCaster(surfaces.vertices, surfaces.triangles, casting_threads)
         self.irradiance = bake(surfaces, self.caster, lamps)
         # Not numba's own threads: their simplest layer may not be entered from two threads at once.
         self._threads = ThreadPoolExecutor(SHADING_THREADS, "shading")
@@ -56,10 +56,7 @@ class Renderer:
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
         """Exact depth and instance ids only, (H, W) each."""
-        hits = self.caster.cast(image_rays(camera, T_world_camera))
-        met = hits.triangle != NO_TRIANGLE
-        depth = np.where(met, hits.distance, np.float32(0))
-        return depth, np.where(met, self.surfaces.instance_ids[hits.triangle], 0).astype(np.int32)
+        return depth_and_ids(self.surfaces, self.caster, camera, T_world_camera)
 
     def _shade(self, triangle: Int32, uv: Float32, depth: Float32, incidence: Float32, camera: Camera) -> Float32:
         """The light (N, 3) of N hits. Each hit is shaded by itself, so the split among threads changes nothing."""
@@ -110,6 +107,16 @@ class Renderer:
         reach = np.where(hits.triangle == NO_TRIANGLE, np.float32(0), hits.distance)
         samples = self._shade(hits.triangle, hits.uv, reach, incidence, camera).reshape(-1, len(offsets), 3)
         light[v, u] = np.minimum(samples, WHITE).mean(axis=1)
+
+
+def depth_and_ids(
+    surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64
+) -> tuple[Float32, Int32]:
+    """What a Renderer's method of this name gives, without the light that a Renderer begins with."""
+    hits = caster.cast(image_rays(camera, T_world_camera))
+    met = hits.triangle != NO_TRIANGLE
+    depth = np.where(met, hits.distance, np.float32(0))
+    return depth, np.where(met, surfaces.instance_ids[hits.triangle], 0).astype(np.int32)
 
 
 @njit(cache=True, nogil=True)

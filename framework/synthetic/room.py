@@ -44,7 +44,6 @@ SMALLEST = {  # m, width and depth of the smallest room tried
 class Room:
     """One room, complete."""
 
-    kind: RoomKind
     layout: Layout
     objects: tuple[tuple[int, Furniture], ...]  # (instance id, piece); 0 = shell
     lamps: tuple[Lamp, ...]
@@ -53,11 +52,16 @@ class Room:
 
 def furnish(kind: RoomKind, rng: Rng) -> Room:
     """A room of this kind, drawn at random."""
-    layout = arrange(_groups(kind, rng), *SMALLEST[kind], rng)
+    return furnish_with(_groups(kind, rng), *SMALLEST[kind], rng)
+
+
+def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng) -> Room:
+    """A room of at least `width` x `depth` m with these contents, the largest first: they find a place most easily."""
+    layout = arrange(contents, width, depth, rng)
     globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
     pieces = [*layout.pieces, globe_lamp]
     objects = ((0, _shell(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))
-    return Room(kind, layout, objects, tuple(_lamps(pieces)), assemble(objects))
+    return Room(layout, objects, tuple(_lamps(pieces)), assemble(objects))
 
 
 def _groups(kind: RoomKind, rng: Rng) -> list[Group]:

@@ -138,6 +138,21 @@ def office_chair(rng: Rng) -> Furniture:
 
 
 def couch(rng: Rng) -> Furniture:
+    piece, width, depth, arm = _couch_body(rng)
+    for x in (-1, 1):
+        if rng.uniform() < 0.7:
+            pillow = cushion(0.42, 0.42, 0.16).turned("x", np.pi / 2 + 0.35).turned("z", -0.45 * x)
+            piece.add(pillow.moved(x * (width / 2 - arm - 0.24), -depth / 2 + 0.50, 0.64), palette.patterned_cloth(rng))
+    return piece
+
+
+def bare_couch(rng: Rng) -> Furniture:
+    """A couch without pillows."""
+    return _couch_body(rng)[0]
+
+
+def _couch_body(rng: Rng) -> tuple[Furniture, float, float, float]:
+    """A couch without pillows; its width and depth and the width of an arm, m."""
     piece = Furniture("couch", "couch")
     cover, feet = palette.cloth(rng), palette.wood(rng)
     seats = int(rng.integers(2, 4))
@@ -154,8 +169,4 @@ def couch(rng: Rng) -> Furniture:
         piece.add(rounded_box(seat_width - 0.008, depth - 0.20, 0.17, 0.055, 4).moved(x, 0.10, 0.365), cover)
         back = cushion(seat_width - 0.02, 0.46, 0.24, 0.35).turned("x", np.pi / 2 + 0.22)
         piece.add(back.moved(x, -depth / 2 + 0.32, 0.63), cover)
-    for x in (-1, 1):
-        if rng.uniform() < 0.7:
-            pillow = cushion(0.42, 0.42, 0.16).turned("x", np.pi / 2 + 0.35).turned("z", -0.45 * x)
-            piece.add(pillow.moved(x * (width / 2 - arm - 0.24), -depth / 2 + 0.50, 0.64), palette.patterned_cloth(rng))
-    return piece
+    return piece, width, depth, arm

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from framework.data import PointClusters
 from framework.errors import DataError
 from framework.mapping.association import (
+    OverlapRule,
     class_agreement,
     count_overlaps,
     cover_another,
@@ -50,6 +51,8 @@ def test_votes_are_pixels_shared() -> None:
     assert overlaps.over_union(least=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
     assert overlaps.over_union(least=16).tolist() == [[0, 8 / 16], [4 / 16, 0], [0, 0]]
     assert overlaps.over_smaller(least=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
+    assert overlaps.by(OverlapRule.CLUSTER, least=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
+    assert overlaps.by(OverlapRule.CLUSTER, least=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
 
 
 def test_classes_agree_by_their_bhattacharyya_coefficient() -> None:

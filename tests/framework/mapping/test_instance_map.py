@@ -11,7 +11,7 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import lift
-from framework.mapping.instance_list import _oriented_box
+from framework.mapping.instance_list import oriented_box
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.integration import Integrator
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -168,7 +168,7 @@ def test_what_is_below_a_threshold_does_not_count(
 @pytest.mark.parametrize("points", [1, 2, 3])
 def test_an_instance_of_a_few_vertices_has_a_box(points: int) -> None:
     corners = np.float32([[0, 0, 1], [2, 0, 1], [0, 0, 1]])[:points]
-    box = _oriented_box(corners)
+    box = oriented_box(corners)
     assert np.allclose(np.sort(box.extent), [0, 0, 2 if points > 1 else 0], atol=1e-5)
 
 

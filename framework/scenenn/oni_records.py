@@ -1,0 +1,193 @@
+"""The records of an OpenNI recording (.oni): which streams it holds, how many images, and where it was cut off."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import IntEnum
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import BinaryIO
+
+from framework.errors import DataError
+
+FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), largest time, largest node
+FILE_MAGIC = b"NI10"
+LARGEST_NODE_AT = FILE_HEADER.size - 4
+VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # that OpenNI 2 plays, from and to
+FIRST_WIDE = (1, 0, 1, 0)  # from this version on, places in the file are 64 bits
+IMAGE_FIELDS = struct.Struct("<QI")  # time, us; number
+RECORD_MAGIC = b"NIR\0"
+LARGEST_NODE = 255  # recorders number them from 1; OpenNI allocates as many as the file says
+LARGEST_FIELDS = 2**20  # bytes; OpenNI has a buffer of 5.8 MB for them and does not look
+
+
+class Record(IntEnum):
+    """The kinds of records that matter here."""
+
+    NODE_ADDED_1_0_0_4 = 0x02
+    NEW_DATA = 0x0A
+    END = 0x0B
+    NODE_ADDED_1_0_0_5 = 0x0C
+    NODE_ADDED = 0x0D
+
+
+class Stream(IntEnum):
+    """What a node of a recording delivers, with the format's number for it."""
+
+    DEPTH = 2
+    COLOR = 3
+
+
+@dataclass
+class Images:
+    """The images of one stream that the file holds whole."""
+
+    node: int  # which records are this stream's
+    count: int = 0
+    last: int = 0  # number of the last one; recorders count from 1
+
+
+@dataclass(frozen=True)
+class Contents:
+    """What the records of a file say."""
+
+    path: Path
+    streams: Mapping[Stream, Images]  # both
+    end: int  # bytes of whole records
+    cut_off: bool  # whether what follows them is no record, though the recording goes on
+    largest_node: int
+    wide: bool  # whether places in the file have 64 bits, else 32
+    table_notes: tuple[int, ...]  # where the places of the tables for seeking are noted
+
+
+def read_contents(path: Path) -> Contents:
+    """The streams and their images; pixels are not looked at.
+
+    Raises DataError when it is no recording, or has no image of depth or of colour.
+    """
+    try:
+        with path.open("rb") as file:
+            return _read_contents(path, file)
+    except OSError as error:
+        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+
+
+@contextmanager
+def playable(contents: Contents, scratch: Path) -> Iterator[Path]:
+    """A file that OpenNI 2 plays: the recording, or a copy of its whole records in `scratch` where it was cut off.
+
+    OpenNI looks for the tables for seeking at the recording's end, and without them refuses all of it.
+    """
+    if not contents.cut_off:
+        yield contents.path
+        return
+    place, record_header = _layouts(contents.wide)
+    with TemporaryDirectory(prefix=".", dir=scratch) as folder:
+        copy = Path(folder) / "mended.oni"
+        shutil.copyfile(contents.path, copy)
+        with copy.open("r+b") as file:
+            file.seek(LARGEST_NODE_AT)  # a recorder that was killed has not noted it
+            file.write(struct.pack("<I", contents.largest_node))
+            for note in contents.table_notes:
+                file.seek(note)
+                file.write(place.pack(0))  # 0 = there is no table
+            file.seek(contents.end)
+            file.write(record_header.pack(RECORD_MAGIC, Record.END, 0, record_header.size, 0, 0))
+        yield copy
+
+
+@dataclass(frozen=True)
+class _Record:
+    kind: int
+    node: int
+    fields: bytes
+    fields_end: int  # bytes from the file's beginning
+    end: int
+
+
+def _read_contents(path: Path, file: BinaryIO) -> Contents:
+    wide = _read_version(path, file) >= FIRST_WIDE
+    place, record_header = _layouts(wide)
+    streams: dict[Stream, Images] = {}
+    notes = []
+    end, cut_off, largest_node = FILE_HEADER.size, True, 0
+    for record in _records(file, record_header):
+        end, cut_off = record.end, record.kind != Record.END
+        largest_node = max(largest_node, record.node)
+        if record.kind in (Record.NODE_ADDED_1_0_0_4, Record.NODE_ADDED_1_0_0_5, Record.NODE_ADDED):
+            stream = _added_stream(path, record)
+            if stream is not None:
+                streams.setdefault(stream, Images(record.node))
+            if record.kind == Record.NODE_ADDED:
+                notes.append(record.fields_end - place.size)
+        elif record.kind == Record.NEW_DATA:
+            _count(streams, record)
+    for stream in Stream:
+        if stream not in streams or not streams[stream].count:
+            where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
+            raise DataError(f"{path} has no {stream.name.lower()} image{where}; it needs depth and color")
+    return Contents(path, streams, end, cut_off, largest_node, wide, tuple(notes))
+
+
+def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
+    """Of a place in the file, and of what a record begins with: magic, kind, node, two sizes, a place."""
+    place = "Q" if wide else "I"
+    return struct.Struct(f"<{place}"), struct.Struct(f"<4s4I{place}")
+
+
+def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
+    header = file.read(FILE_HEADER.size)
+    if len(header) < FILE_HEADER.size or not header.startswith(FILE_MAGIC):
+        raise DataError(f"{path} is no OpenNI recording: it begins with {header[:4]!r}, expected {FILE_MAGIC!r}")
+    _magic, *numbers, _time, largest_node = FILE_HEADER.unpack(header)
+    version = tuple(numbers)
+    if largest_node > LARGEST_NODE:
+        raise DataError(f"{path} is damaged: it says to have {largest_node} nodes, expected at most {LARGEST_NODE}")
+    if not VERSIONS[0] <= version <= VERSIONS[1]:
+        first, last, found = (".".join(map(str, one)) for one in (*VERSIONS, version))
+        raise DataError(f"{path} has the format's version {found}; OpenNI 2 plays {first} to {last}")
+    return version
+
+
+def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
+    """The records up to the end, or up to the first that is not whole."""
+    size = file.seek(0, 2)
+    position = FILE_HEADER.size
+    while position + header.size <= size:
+        file.seek(position)
+        magic, kind, node, fields_size, payload_size, _undo = header.unpack(file.read(header.size))
+        end = position + fields_size + payload_size
+        if (
+            magic != RECORD_MAGIC
+            or not header.size <= fields_size <= LARGEST_FIELDS
+            or end > size
+            or node > LARGEST_NODE
+        ):
+            return
+        yield _Record(kind, node, file.read(fields_size - header.size), position + fields_size, end)
+        if kind == Record.END:
+            return
+        position = end
+
+
+def _added_stream(path: Path, record: _Record) -> Stream | None:
+    """Which stream a node delivers; None for a device, infrared or sound."""
+    try:
+        (name_size,) = struct.unpack_from("<I", record.fields)
+        (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)
+    except struct.error as error:
+        raise DataError(f"{path} is damaged: the record before byte {record.fields_end} is too short") from error
+    return Stream(node_type) if node_type in list(Stream) else None
+
+
+def _count(streams: Mapping[Stream, Images], record: _Record) -> None:
+    for images in streams.values():
+        if images.node == record.node and len(record.fields) >= IMAGE_FIELDS.size:
+            _time, number = IMAGE_FIELDS.unpack_from(record.fields)
+            if number:
+                images.count += 1
+                images.last = number

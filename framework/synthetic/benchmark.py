@@ -1,0 +1,191 @@
+"""The ten rooms of the synthetic benchmark, named after the SceneNN sequences that the paper evaluates.
+
+Nobody here has seen the sequences, so a room has the role of its namesake, not its furniture: 016, 061, 096 and 206 are
+the hard ones, with things lying on beds and couches. Each of the nine classes is in several rooms.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from framework.data import Camera, Float64, Int32
+from framework.errors import DataError
+from framework.synthetic import clutter, fixtures
+from framework.synthetic.camera_path import CameraPath, plan_path
+from framework.synthetic.cluttered_groups import (
+    board_group,
+    chair_row,
+    cluttered_bed_group,
+    cluttered_couch,
+    cluttered_couch_group,
+    desk_row,
+)
+from framework.synthetic.groups import (
+    Group,
+    bed_group,
+    couch_group,
+    desk_group,
+    dining_group,
+    kitchen_group,
+    single,
+    toilet_group,
+    tv_group,
+)
+from framework.synthetic.piece import Rng
+from framework.synthetic.ray_caster import RayCaster
+from framework.synthetic.renderer import depth_and_ids
+from framework.synthetic.room import Room, furnish_with
+
+SMALLEST = (4.2, 3.8)  # m, width and depth of the smallest room tried
+ATTEMPTS = 6  # scenes drawn, of which the walk that shows most is kept
+JUDGED_VIEWS = 30  # of a walk
+WELL_SEEN, LONG_SEEN = 10, 1 / 6  # px of an object in one of these views; share of the views that show as many
+SMALL_VIEW = Camera(80, 60, 68.0, 68.0, 39.5, 29.5)  # what they are looked at with: a Kinect's field of view
+
+MakeGroup = Callable[[Rng], Group]
+
+
+@dataclass(frozen=True)
+class SceneSpec:
+    """What one room is for and what stands in it, beside what all rooms have."""
+
+    role: str  # for people
+    groups: tuple[MakeGroup, ...]  # the largest first: they find a place most easily
+    holds: Mapping[str, int]  # COCO class -> how many of it there are at least
+
+
+def bag(rng: Rng) -> Group:
+    return single("bag", fixtures.backpack(rng))
+
+
+def cupboard(rng: Rng) -> Group:
+    return single("cupboard", clutter.cupboard(rng))
+
+
+def carton(rng: Rng) -> Group:
+    return single("carton", clutter.carton(rng))
+
+
+def pouf(rng: Rng) -> Group:
+    return single("pouf", clutter.pouf(rng))
+
+
+SCENES: Mapping[str, SceneSpec] = {
+    "011": SceneSpec(
+        "living room with a row of equal chairs",
+        (couch_group, dining_group, partial(chair_row, count=3), tv_group),
+        {"couch": 1, "chair": 5, "dining table": 2, "tv": 1, "book": 2},
+    ),
+    "016": SceneSpec(
+        "bedroom with a cluttered bed and a cluttered couch",
+        (cluttered_bed_group, cluttered_couch, cupboard, carton),
+        {"bed": 1, "couch": 1, "backpack": 2, "book": 3},
+    ),
+    "030": SceneSpec(
+        "living room with many books",
+        (couch_group, dining_group, board_group, pouf),
+        {"couch": 1, "chair": 2, "dining table": 2, "book": 5, "backpack": 1},
+    ),
+    "061": SceneSpec(
+        "living room with two cluttered couches",
+        (cluttered_couch_group, cluttered_couch, tv_group, bag),
+        {"couch": 2, "dining table": 1, "tv": 1, "backpack": 3, "book": 3},
+    ),
+    "078": SceneSpec(
+        "office with two equal desks and a refrigerator",
+        (partial(desk_row, count=2), partial(chair_row, count=2), kitchen_group, board_group),
+        {"dining table": 2, "chair": 4, "refrigerator": 1, "book": 6, "backpack": 1},
+    ),
+    "086": SceneSpec(
+        "office and meeting room with many equal chairs",
+        (partial(chair_row, count=4), dining_group, desk_group, tv_group, bag, bag),
+        {"chair": 7, "dining table": 2, "tv": 1, "backpack": 2, "book": 2},
+    ),
+    "096": SceneSpec(
+        "student's room with a cluttered bed",
+        (cluttered_bed_group, desk_group, partial(chair_row, count=2), tv_group, toilet_group),
+        {"bed": 1, "chair": 3, "dining table": 1, "tv": 1, "toilet": 1, "backpack": 1, "book": 4},
+    ),
+    "206": SceneSpec(
+        "one-room flat with a cluttered bed and a cluttered couch",
+        (cluttered_bed_group, cluttered_couch_group, desk_group, toilet_group),
+        {"bed": 1, "couch": 1, "dining table": 2, "chair": 1, "toilet": 1, "backpack": 2, "book": 6},
+    ),
+    "223": SceneSpec(
+        "kitchen with a table, a row of equal chairs and bags",
+        (dining_group, kitchen_group, partial(chair_row, count=3), cupboard, bag, bag),
+        {"dining table": 1, "chair": 5, "refrigerator": 1, "backpack": 2},
+    ),
+    "255": SceneSpec(
+        "kitchen to live in, with a bed and a toilet",
+        (bed_group, kitchen_group, dining_group, toilet_group, board_group),
+        {"bed": 1, "refrigerator": 1, "dining table": 1, "chair": 2, "toilet": 1, "book": 3},
+    ),
+}
+"""The rooms by name."""
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A furnished room, the walk through it, and the random numbers that are left for what follows."""
+
+    room: Room
+    path: CameraPath
+    rng: Rng
+
+
+def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int) -> Scene:
+    """The scene of this spec that a walk of `frames` frames shows most of, among several drawn from `stream`.
+
+    Raises DataError when in none of them the furniture fits.
+    """
+    best: Scene | None = None
+    most_shown = (-1.0, -1.0)
+    for attempt in range(ATTEMPTS):
+        rng = np.random.default_rng([*stream, attempt])
+        try:
+            scene, shown = _draw_scene(spec, frames, rng)
+        except DataError:
+            continue
+        if shown > most_shown:
+            best, most_shown = scene, shown
+        if min(shown) == 1:
+            break
+    if best is None:
+        raise DataError(f"the {spec.role}: its furniture does not fit; choose another seed")
+    return best
+
+
+def _draw_scene(spec: SceneSpec, frames: int, rng: Rng) -> tuple[Scene, tuple[float, float]]:
+    """A scene, and the shares of its classes and of its objects of a class that its walk shows well."""
+    room = furnish_scene(spec, rng)
+    surfaces = room.surfaces
+    caster = RayCaster(surfaces.vertices, surfaces.triangles, threads=1)
+    wanted = {i: name for i, name in surfaces.class_names.items() if name is not None}
+
+    def labels(T_world_camera: Float64) -> Int32:
+        return depth_and_ids(surfaces, caster, SMALL_VIEW, T_world_camera)[1]
+
+    path = plan_path(room.layout, frames, labels, set(wanted), rng)
+    views = [labels(path.pose(k)) for k in range(0, frames, -(-frames // JUDGED_VIEWS))]
+    seen = [i for i in wanted if np.mean([np.count_nonzero(view == i) >= WELL_SEEN for view in views]) >= LONG_SEEN]
+    classes = len({wanted[i] for i in seen}) / len(set(wanted.values()))
+    return Scene(room, path, rng), (classes, len(seen) / len(wanted))
+
+
+def furnish_scene(spec: SceneSpec, rng: Rng) -> Room:
+    """A room of this spec, drawn at random. Raises DataError when its furniture does not fit."""
+    contents = [make(rng) for make in spec.groups]
+    contents += [
+        single("door", clutter.door(rng)),
+        single("window", clutter.window(rng), z=0.95, hung=True),
+        single("plant", clutter.plant(rng)),
+        single("lamp", clutter.floor_lamp(rng)),
+        single("picture", clutter.painting(rng), z=1.35, hung=True),
+        single("picture", clutter.painting(rng), z=1.4, hung=True),
+    ]
+    return furnish_with(contents, *SMALLEST, rng)

@@ -1,0 +1,197 @@
+"""Processes that write the scenes of a benchmark folder together, and keep what is there already.
+
+A process stays with one scene for as long as something of it is left to write, because furnishing and lighting a room
+takes seconds; a process that finds no untouched scene helps with another's.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict
+from functools import partial
+from multiprocessing.connection import wait as wait_for_end
+from pathlib import Path
+
+import cv2
+from threadpoolctl import threadpool_limits
+from tqdm import tqdm
+
+from framework.atomic_files import written_whole
+from framework.errors import ConfigError, DataError
+from framework.scenenn.intrinsics import write_intrinsics
+from framework.synthetic.benchmark import SceneSpec
+from framework.synthetic.scenenn_scene import Recording, SceneNNScene, frame_files, trajectory_file
+
+GENERATION = 1  # of the rooms that this code makes: raise it when they change, so that none are mixed
+FRAMES_AT_ONCE = 8  # few, so that all processes end at about the same time
+
+Piece = Callable[[SceneNNScene], int]  # writes some files, returns how many of them are frames
+
+
+def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Recording, jobs: int) -> None:
+    """Writes the scenes into `root`, by `jobs` processes; what is there of the same recording is kept.
+
+    Raises ConfigError when `root` holds something else, DataError when a file or a process fails.
+    """
+    _begin(root, recording)
+    scenes = [_Scene(root / name, spec, recording) for name, spec in specs.items()]
+    missing = sum(scene.missing for scene in scenes)
+    total = len(scenes) * recording.frames
+    bar = tqdm(total=total, initial=total - missing, desc="rendering", unit=" frames", disable=None)
+    with ExitStack() as stack:
+        stack.enter_context(bar)
+        # Not forked: threads of numba and OpenCV do not survive that. One pool a process, so that each can be given
+        # the scene that it has in memory.
+        spawn = multiprocessing.get_context("spawn")
+        pools = [stack.enter_context(ProcessPoolExecutor(1, spawn, _begin_process)) for _ in range(jobs)]
+        running: dict[Future[int], ProcessPoolExecutor] = {}
+        last: dict[ProcessPoolExecutor, _Scene] = {}
+        idle = pools
+        while True:
+            for pool in idle:
+                scene = _choose(scenes, last.get(pool))
+                if scene is not None:
+                    running[pool.submit(_write, scene.folder, scene.spec, recording, scene.take())] = pool
+                    last[pool] = scene
+            if not running:
+                return
+            ended, _ = wait(running, return_when=FIRST_COMPLETED)
+            idle = [running.pop(future) for future in ended]
+            for future, pool in zip(ended, idle, strict=True):
+                bar.update(_result(future, last[pool].folder))
+                last[pool].running -= 1
+
+
+def _begin(root: Path, recording: Recording) -> None:
+    """The files that all scenes share; refuses a folder that holds anything else."""
+    made_by = root / "synthesize.json"
+    wanted = {"generation": GENERATION, **asdict(recording)}
+    if made_by.exists():
+        try:
+            found = json.loads(made_by.read_text("utf-8"))
+        except (OSError, ValueError) as error:
+            raise DataError(f"{made_by} is damaged; delete it with its folder, or choose another folder") from error
+        if found != wanted:
+            raise ConfigError(
+                f"{root} holds rooms of other parameters: found {found}, expected {wanted}; choose another folder"
+            )
+    elif root.exists() and (not root.is_dir() or any(root.iterdir())):
+        raise ConfigError(f"{root} must be a new or empty folder, or one that this command began; choose another")
+    (root / "intrinsic").mkdir(parents=True, exist_ok=True)
+    with written_whole(made_by) as temporary:
+        temporary.write_text(json.dumps(wanted) + "\n")
+    with written_whole(root / "release.txt") as temporary:
+        temporary.write_text(recording.release + "\n")
+    write_intrinsics(root / "intrinsic" / "asus.ini", recording.camera)
+
+
+class _Scene:
+    """What is left to write of one scene. The trajectory comes last: where it is, the scene is complete."""
+
+    def __init__(self, folder: Path, spec: SceneSpec, recording: Recording) -> None:
+        self.folder, self.spec = folder, spec
+        self.running = 0  # pieces being written
+        self.touched = False
+        self.missing = 0  # frames
+        self._left: list[Piece] = []
+        self._complete = trajectory_file(folder).exists()
+        if self._complete:
+            return
+        files = (frame_files(folder, index) for index in range(recording.frames))
+        frames = [index for index, pair in enumerate(files) if not all(path.exists() for path in pair)]
+        self.missing = len(frames)
+        chunks = (frames[at : at + FRAMES_AT_ONCE] for at in range(0, len(frames), FRAMES_AT_ONCE))
+        self._left = [_write_truth, *(partial(_write_frames, frames=chunk) for chunk in chunks)]
+
+    @property
+    def ready(self) -> int:
+        """How many pieces can be written now."""
+        waiting_for_walk = not self._left and not self.running and not self._complete
+        return len(self._left) + waiting_for_walk
+
+    def take(self) -> Piece:
+        self.running += 1
+        self.touched = True
+        if self._left:
+            return self._left.pop(0)
+        self._complete = True
+        return _write_walk
+
+
+def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
+    """The scene that a process goes on with, given its `last`: that one, else an untouched one, else the longest."""
+    if last is not None and last.ready:
+        return last
+    ready = [scene for scene in scenes if scene.ready]
+    untouched = [scene for scene in ready if not scene.touched]
+    return untouched[0] if untouched else max(ready, key=lambda scene: scene.ready, default=None)
+
+
+def _result(future: Future[int], folder: Path) -> int:
+    try:
+        return future.result()
+    except BrokenProcessPool as error:
+        raise DataError(
+            f"a process that wrote {folder} was ended from outside, perhaps for want of memory; run the same command "
+            "again: it goes on from here"
+        ) from error
+
+
+def _write_frames(scene: SceneNNScene, frames: Sequence[int]) -> int:
+    for index in frames:
+        scene.write_frame(index)
+    return len(frames)
+
+
+def _write_truth(scene: SceneNNScene) -> int:
+    scene.write_truth()
+    return 0
+
+
+def _write_walk(scene: SceneNNScene) -> int:
+    scene.write_walk()
+    return 0
+
+
+def _begin_process() -> None:
+    """One thread for each process, Ctrl-C only while it works, and an end when its parent has ended."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+    threadpool_limits(1)
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    if parent is not None:
+        wait_for_end([parent.sentinel])
+        os._exit(1)
+
+
+_in_memory: list[SceneNNScene] = []  # of this process: the scene that it wrote last, if any
+
+
+def _write(folder: Path, spec: SceneSpec, recording: Recording, piece: Piece) -> int:
+    """Writes a piece of the scene, in one of the processes."""
+    with _interruptible():
+        if not _in_memory or _in_memory[0].folder != folder:
+            _in_memory.clear()
+            _in_memory.append(SceneNNScene(folder, spec, recording))
+        return piece(_in_memory[0])
+
+
+@contextmanager
+def _interruptible() -> Iterator[None]:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -1,0 +1,169 @@
+"""One room of the synthetic benchmark as a recording in SceneNN's own files.
+
+SceneNN's world is y-up and the room is z-up, so everything that is written is turned by a quarter about x.
+"""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from framework.atomic_files import written_whole
+from framework.data import Array, Box, Camera, Float32, Int32
+from framework.errors import ConfigError
+from framework.geometry import transform
+from framework.label_spaces import SCENENN_TO_COCO
+from framework.ply import write_ply
+from framework.scenenn.annotation import Annotated, write_annotation
+from framework.scenenn.trajectory_log import write_trajectory_log
+from framework.synthetic.benchmark import SceneSpec, plan_scene
+from framework.synthetic.camera_path import FRAME_RATE
+from framework.synthetic.labeled_mesh import visible_mesh
+from framework.synthetic.renderer import Renderer
+from framework.synthetic.sensor import MIN_RANGE, DepthSensor, noisy_color
+
+ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
+NOISE, MAX_RANGE = 1.0, 6.0  # the sensor's noise, 1 = a Kinect v1; its range, m
+TRUTH_VIEWS = 60  # frames whose view makes up the labelled mesh; neighbours show nearly the same
+LARGEST_ID = 934338  # of SceneNN's own labels, which have no order
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
+"""Noisy pictures hold nothing that a search for repetitions finds: this is as small as the slow ways, in 15 ms."""
+
+T_YUP_ZUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+"""From the room's axes to SceneNN's. It only swaps and negates, so that nothing is rounded."""
+
+_COCO_TO_SCENENN = {coco: name for name, coco in SCENENN_TO_COCO.items()}
+_NYU_CLASSES = {
+    "cardboard box": "box",
+    "ceiling lamp": "lamp",
+    "clothes": "clothes",
+    "cupboard": "cabinet",
+    "cushion": "pillow",
+    "door": "door",
+    "floor lamp": "lamp",
+    "kitchen counter": "counter",
+    "low board": "dresser",
+    "nightstand": "night stand",
+    "picture": "picture",
+    "pouf": "otherfurniture",
+    "rug": "floor mat",
+    "table lamp": "lamp",
+    "window": "window",
+}
+"""What NYU calls clutter. The rest has a text and no nyu_class, as much has in SceneNN."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """What all scenes of one benchmark folder have in common."""
+
+    seed: int = 0
+    frames: int = 240  # of each scene, at 30 Hz
+    width: int = 640  # px, the height is 3/4 of it
+
+    def __post_init__(self) -> None:
+        for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
+            if getattr(self, name) < lowest:
+                raise ConfigError(f"{name} must be at least {lowest}, found {getattr(self, name)}")
+        if self.width % 4:
+            raise ConfigError(f"width must be a multiple of 4, so that the picture is 4:3; found {self.width}")
+
+    @property
+    def camera(self) -> Camera:
+        return ASUS.scaled(self.width / ASUS.width)
+
+    @property
+    def release(self) -> str:
+        """What tables call the annotation."""
+        return f"synthetic, seed {self.seed}, {self.frames} frames"
+
+
+class SceneNNScene:
+    """One furnished room and the walk through it, written piece by piece to its folder, in any order."""
+
+    def __init__(self, folder: Path, spec: SceneSpec, recording: Recording) -> None:
+        self.folder, self.recording = folder, recording
+        for kind in ("image", "depth"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+        self.camera = recording.camera
+        self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
+        scene = plan_scene(spec, self._stream, recording.frames)
+        self.room, self.path = scene.room, scene.path
+        self.renderer = Renderer(self.room.surfaces, list(self.room.lamps), casting_threads=1)
+        self._sensor = DepthSensor(NOISE, MAX_RANGE)
+        ids = 1 + scene.rng.choice(LARGEST_ID, len(self.room.objects), replace=False)
+        ids[0] = 0  # the shell is no instance
+        self.labels = ids.astype(np.int32)  # (N + 1,) what each instance id of the room is called in the files
+        self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB, of each
+
+    def write_frame(self, index: int) -> None:
+        """Colour and depth of frame `index`, counted from 0."""
+        T_world_camera = self.path.pose(index)
+        picture = self.renderer.render(self.camera, T_world_camera)
+        rng = np.random.default_rng([*self._stream, index])
+        depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng)
+        color = noisy_color(picture.color, NOISE, rng)
+        color_file, depth_file = frame_files(self.folder, index)
+        _write_png(depth_file, np.rint(1000 * depth).astype(np.uint16))
+        _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
+
+    def write_truth(self) -> None:
+        """The labelled mesh and what its labels mean."""
+        frames, name = self.recording.frames, self.folder.name
+        every = -(-frames // TRUTH_VIEWS)
+        views = (self.path.pose(index) for index in range(0, frames, every))
+        caster = self.renderer.caster
+        mesh = visible_mesh(self.room.surfaces, caster, self.camera, views, (MIN_RANGE, MAX_RANGE))
+        vertices = transform(T_YUP_ZUP, mesh.vertices)
+        write_ply(self.folder / f"{name}.ply", vertices, mesh.triangles, {"label": self.labels[mesh.instance_ids]})
+        write_annotation(self.folder / f"{name}.xml", self._annotated(vertices, mesh.instance_ids))
+
+    def _annotated(self, vertices: Float32, instance_ids: Int32) -> list[Annotated]:
+        """The objects of which the mesh shows something, by label; `vertices` (V, 3) m are y-up."""
+        annotated = []
+        for instance, piece in self.room.objects[1:]:
+            points = vertices[instance_ids == instance].astype(np.float64)
+            if not len(points):
+                continue
+            low, high = points.min(axis=0), points.max(axis=0)
+            red, green, blue = self.colors[instance]
+            class_name = piece.class_name
+            annotated.append(
+                Annotated(
+                    id=int(self.labels[instance]),
+                    text=piece.kind,
+                    nyu_class=_NYU_CLASSES.get(piece.kind, "") if class_name is None else _COCO_TO_SCENENN[class_name],
+                    color=(int(red), int(green), int(blue)),
+                    aabb=np.stack([low, high]),
+                    obb=Box((low + high) / 2, high - low, np.eye(3)),  # furniture stands along the walls
+                )
+            )
+        return sorted(annotated, key=lambda one: one.id)
+
+    def write_walk(self) -> None:
+        """The timestamps and the trajectory, which come last: where the trajectory is, the scene is complete."""
+        frames = range(self.recording.frames)
+        with written_whole(self.folder / "timestamp.txt") as temporary:
+            times = [round(1e6 * index / FRAME_RATE) for index in frames]
+            temporary.write_text("".join(f"{k} {time} {time}\n" for k, time in enumerate(times, start=1)))
+        poses = {index: T_YUP_ZUP @ self.path.pose(index) for index in frames}
+        write_trajectory_log(trajectory_file(self.folder), poses)
+
+
+def frame_files(folder: Path, index: int) -> tuple[Path, Path]:
+    """Colour and depth of frame `index`, which counts from 0: the files' names count from 1."""
+    return folder / "image" / f"image{index + 1:05d}.png", folder / "depth" / f"depth{index + 1:05d}.png"
+
+
+def trajectory_file(folder: Path) -> Path:
+    return folder / "trajectory.log"
+
+
+def _write_png(path: Path, image: Array) -> None:
+    _, data = cv2.imencode(".png", image, PNG)
+    with written_whole(path) as temporary:
+        temporary.write_bytes(data.tobytes())

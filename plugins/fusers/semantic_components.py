@@ -1,0 +1,62 @@
+"""A rival: fusion of classes alone, with connected components for instances, in the manner of SemanticFusion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Float64, Frame, PointClusters, Pose
+from framework.mapping.association import list_points_by_pixel
+from framework.mapping.class_evidence import mask_classes
+from framework.mapping.integration import Integrator
+from framework.mapping.semantic_map import SemanticMap
+from framework.mapping.tsdf_fuser import VoxelHashingFuser, require_same_classes
+from framework.parameters import check_bounds
+
+
+@dataclass
+class SemanticComponents(VoxelHashingFuser):
+    """Voxels keep a distribution over classes and background, and nothing else: there is no data association.
+
+    A re-implementation after SemanticFusion (McCormac et al. 2017) and Pham et al. (2019). Theirs are distributions of
+    a network that labels every pixel; ours come from masks. A pixel has the distribution of the mask with the best
+    score over it, in which the background has what the network gave to no class. Under no mask it is background,
+    unless the detector missed an object. Two objects of one class that touch are one instance: the idea's limit.
+
+    The smoothing by a CRF, which both have, is left out; majorities over mesh neighbours in its place changed the mean
+    AP50 of three synthetic rooms by 0.01 at most. `missed` was tuned on two of them, from 0.1 to 1: this value is best
+    for masks as detected, and with refiner=chain 0.01 AP50 below the best.
+    """
+
+    class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
+    missed: float = 0.7  # in (0, 1]: P(no mask | surface of any class) over that of the background; 1 = says nothing
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_bounds(self, class_floor=(1e-6, 0.999), missed=(1e-6, 1.0))
+        self.scene: SemanticMap = SemanticMap(self.voxel_size, self.sensor, self.max_blocks, self.missed, self.min_area)
+        self._integrator = Integrator(self.scene.voxels, self.scene.sensor)
+
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        if not self.scene.classes:
+            self.scene.begin(clusters.classes)
+        require_same_classes(self.scene.classes, clusters.classes)
+        points = list_points_by_pixel(clusters, frame.depth.shape)
+        masks = mask_classes(self._log_ratio(clusters), clusters, points, frame.index)
+        seen = self._integrator.integrate(frame, pose.T_world_camera, self.label_band * self.voxel_size)
+        self.scene.labels.update(seen, masks)
+        self.scene.changed(seen.blocks)
+
+    def _log_ratio(self, clusters: PointClusters) -> Float64:
+        """(N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, as eq. [7] takes it, with a floor.
+
+        A detector's score is its probability of the best class, and its distribution leaves the background out: the
+        share of the classes together is what scales the one to the other.
+        """
+        p = clusters.class_probabilities.astype(np.float64)
+        objects = np.minimum(clusters.scores[:, None] / p.max(axis=1, keepdims=True, initial=1e-6), 1.0)
+        uniform = self.class_floor / (1 + p.shape[1])
+        of_classes = (1 - self.class_floor) * objects * p + uniform
+        of_background = (1 - self.class_floor) * (1 - objects) + uniform
+        return np.asarray(np.log(of_classes / of_background))

@@ -1,0 +1,125 @@
+"""Several processes write the same bytes as one, and go on where they stopped."""
+
+from __future__ import annotations
+
+import json
+import os
+from functools import partial
+from pathlib import Path
+
+import pytest
+
+from framework.errors import ConfigError, DataError
+from framework.synthetic.benchmark import SceneSpec
+from framework.synthetic.groups import toilet_group
+from framework.synthetic.scene_writers import FRAMES_AT_ONCE, GENERATION, _choose, _Scene, write_scenes
+from framework.synthetic.scenenn_scene import Recording, SceneNNScene, frame_files, trajectory_file
+
+SPEC = SceneSpec("bathroom", (toilet_group,), {"toilet": 1})
+SPECS = {"007": SPEC, "008": SPEC}
+RECORDING = Recording(seed=1, frames=FRAMES_AT_ONCE + 2, width=64)
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+def times(folder: Path) -> dict[str, int]:
+    return {str(path.relative_to(folder)): path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("benchmark") / "rooms"
+    write_scenes(root, SPECS, RECORDING, jobs=2)
+    return root
+
+
+def test_two_processes_write_what_one_writes(root: Path, tmp_path: Path) -> None:
+    alone = SceneNNScene(tmp_path / "008", SPEC, RECORDING)
+    alone.write_walk()
+    for index in reversed(range(RECORDING.frames)):
+        alone.write_frame(index)
+    alone.write_truth()
+    written = contents(root / "008")
+    assert set(written) == set(contents(tmp_path / "008"))
+    assert written == contents(tmp_path / "008")
+    assert len(written) == 2 * RECORDING.frames + 4
+
+
+def test_two_scenes_of_one_spec_differ(root: Path) -> None:
+    assert trajectory_file(root / "007").read_bytes() != trajectory_file(root / "008").read_bytes()
+
+
+def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Path) -> None:
+    before, written = times(root), contents(root)
+    color_file, _ = frame_files(root / "007", 4)
+    for path in (trajectory_file(root / "007"), color_file):
+        path.unlink()
+    assert _Scene(root / "007", SPEC, RECORDING).missing == 1
+    assert _Scene(root / "008", SPEC, RECORDING).missing == 0
+    write_scenes(root, SPECS, RECORDING, jobs=1)
+    assert contents(root) == written
+    after = times(root)
+    assert {name for name in after if name.endswith(".png") and after[name] != before[name]} == {
+        f"007/{kind}/{kind}00005.png" for kind in ("image", "depth")
+    }
+    assert all(after[name] == before[name] for name in after if name.startswith("008"))
+
+
+def test_what_all_scenes_share(root: Path) -> None:
+    assert (root / "release.txt").read_text() == "synthetic, seed 1, 10 frames\n"
+    assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION
+    assert "fx 54.447329\n" in (root / "intrinsic" / "asus.ini").read_text()
+    assert not list(root.rglob(".*")), "nothing unfinished is left"
+
+
+@pytest.mark.parametrize("other", [Recording(seed=2, frames=10, width=64), Recording(seed=1, frames=9, width=64)])
+def test_rooms_of_other_parameters_are_not_mixed(root: Path, other: Recording) -> None:
+    before = times(root)
+    with pytest.raises(ConfigError, match=r"other parameters.*choose another folder"):
+        write_scenes(root, SPECS, other, jobs=1)
+    assert times(root) == before
+
+
+def test_a_folder_of_something_else_is_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "011.ply").write_text("a scan")
+    with pytest.raises(ConfigError, match="new or empty folder"):
+        write_scenes(tmp_path, SPECS, RECORDING, jobs=1)
+    assert [path.name for path in tmp_path.iterdir()] == ["011.ply"]
+    with pytest.raises(ConfigError, match="new or empty folder"):
+        write_scenes(tmp_path / "011.ply", SPECS, RECORDING, jobs=1)
+    (tmp_path / "synthesize.json").write_text("{")
+    with pytest.raises(DataError, match=r"synthesize\.json is damaged"):
+        write_scenes(tmp_path, SPECS, RECORDING, jobs=1)
+
+
+def killed(status: int, rng: object) -> None:
+    os._exit(status)
+
+
+def test_a_process_that_dies_is_one_line(tmp_path: Path) -> None:
+    deadly = SceneSpec("trap", (partial(killed, 9),), {})
+    with pytest.raises(DataError, match=r"rooms/666 was ended from outside.*run the same command again"):
+        write_scenes(tmp_path / "rooms", {"666": deadly}, RECORDING, jobs=1)
+
+
+def test_a_process_stays_with_its_scene_then_takes_an_untouched_one_then_helps(tmp_path: Path) -> None:
+    recording = Recording(frames=3 * FRAMES_AT_ONCE, width=64)
+    first, second = (_Scene(tmp_path / name, SPEC, recording) for name in ("007", "008"))
+    scenes = [first, second]
+    assert _choose(scenes, None) is first
+    first.take()
+    assert _choose(scenes, first) is first
+    assert _choose(scenes, None) is second
+    second.take()
+    for _ in range(3):
+        first.take()
+    assert first.ready == 0, "the walk waits for what other processes still write"
+    assert _choose(scenes, first) is second
+    first.running = 0
+    assert first.ready == 1
+    first.take()
+    assert first.ready == 0
+    first.running = 0
+    assert first.ready == 0

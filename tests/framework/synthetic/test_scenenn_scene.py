@@ -1,0 +1,138 @@
+"""A room as SceneNN's files: what is written is what the renderer saw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import check_rigid
+from framework.datasets.image_files import read_color, read_uint16
+from framework.errors import ConfigError
+from framework.geometry import inverse
+from framework.label_spaces import SCENENN_TO_COCO, SPACES
+from framework.ply import PlyMesh, read_ply
+from framework.scenenn.annotation import read_annotation
+from framework.scenenn.trajectory_log import read_trajectory_log
+from framework.synthetic.benchmark import SceneSpec
+from framework.synthetic.cluttered_groups import chair_row
+from framework.synthetic.groups import toilet_group
+from framework.synthetic.ray_caster import NO_TRIANGLE, RayCaster, image_rays
+from framework.synthetic.scenenn_scene import (
+    _NYU_CLASSES,
+    ASUS,
+    T_YUP_ZUP,
+    Recording,
+    SceneNNScene,
+    frame_files,
+    trajectory_file,
+)
+
+SPEC = SceneSpec("bathroom", (toilet_group, lambda rng: chair_row(rng, 2)), {"toilet": 1, "chair": 2})
+RECORDING = Recording(seed=3, frames=9, width=160)
+SHOWN = (0, 4, 8)
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> SceneNNScene:
+    scene = SceneNNScene(tmp_path_factory.mktemp("rooms") / "007", SPEC, RECORDING)
+    for index in SHOWN:
+        scene.write_frame(index)
+    scene.write_truth()
+    scene.write_walk()
+    return scene
+
+
+@pytest.fixture(scope="module")
+def mesh(scene: SceneNNScene) -> PlyMesh:
+    return read_ply(scene.folder / "007.ply")
+
+
+def poses(scene: SceneNNScene):
+    return read_trajectory_log(trajectory_file(scene.folder)).poses
+
+
+def test_files_are_named_and_counted_as_scenenns(scene: SceneNNScene) -> None:
+    names = {str(path.relative_to(scene.folder)) for path in scene.folder.rglob("*.*")}
+    numbered = {f"{kind}/{kind}{k + 1:05d}.png" for k in SHOWN for kind in ("image", "depth")}
+    assert names == numbered | {"007.ply", "007.xml", "timestamp.txt", "trajectory.log"}
+    lines = (scene.folder / "timestamp.txt").read_text().splitlines()
+    assert lines[:3] == ["1 0 0", "2 33333 33333", "3 66667 66667"]
+    assert len(lines) == RECORDING.frames
+
+
+def test_poses_are_rigid_and_the_world_is_y_up(scene: SceneNNScene) -> None:
+    found = poses(scene)
+    assert list(found) == list(range(RECORDING.frames))
+    for index, T_world_camera in found.items():
+        check_rigid(f"pose {index}", T_world_camera)
+        np.testing.assert_allclose(inverse(T_YUP_ZUP) @ T_world_camera, scene.path.pose(index), atol=1e-6)
+        assert 1.2 < T_world_camera[1, 3] < 1.8, "eyes above the floor"
+        assert T_world_camera[1, 1] < -0.8, "the camera's y points down"
+    assert np.linalg.det(T_YUP_ZUP) == 1.0
+
+
+def test_the_floor_is_at_zero_and_is_no_instance(mesh: PlyMesh) -> None:
+    floor = np.abs(mesh.vertices[:, 1]) < 1e-4
+    assert floor.sum() > 1000
+    assert (mesh.properties["label"][floor] == 0).mean() > 0.95
+    assert mesh.vertices[:, 1].min() > -1e-3
+    assert mesh.vertices[:, 1].max() < 2.6
+
+
+def test_labels_of_the_annotation_are_those_of_the_mesh(scene: SceneNNScene, mesh: PlyMesh) -> None:
+    annotated = read_annotation(scene.folder / "007.xml")
+    labels = mesh.properties["label"]
+    assert sorted(one.id for one in annotated) == sorted(set(labels.tolist()) - {0})
+    assert max(one.id for one in annotated) > 1000, "ids are no small numbers"
+    names = [one.nyu_class for one in annotated if one.nyu_class in SCENENN_TO_COCO]
+    assert sorted(names) == ["chair", "chair", "toilet"]
+    for one in annotated:
+        assert one.text
+        points = mesh.vertices[labels == one.id]
+        np.testing.assert_allclose(one.aabb, [points.min(axis=0), points.max(axis=0)], atol=1e-6)
+    of_pieces = [scene.room.surfaces.class_names[k] for k in np.argsort(scene.labels)[1:]]
+    assert of_pieces != sorted(of_pieces, key=str), "the order of ids says nothing"
+
+
+def test_clutter_never_has_the_name_of_a_class() -> None:
+    assert set(_NYU_CLASSES.values()) <= {*SPACES["nyu40"]} - set(SCENENN_TO_COCO)
+
+
+@pytest.mark.parametrize("index", SHOWN)
+def test_the_mesh_shows_what_the_renderer_sees(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
+    depth, instance_ids = scene.renderer.depth_and_ids(scene.camera, scene.path.pose(index))
+    hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
+    met = hits.triangle != NO_TRIANGLE
+    assert met.mean() > 0.97, "holes only along what hides something"
+    same = met & (np.abs(hits.distance - depth) < 1e-3)
+    assert same.sum() > 0.985 * met.sum()
+    labels = mesh.properties["label"][mesh.triangles[hits.triangle, 0]]
+    assert (labels[same] == scene.labels[instance_ids][same]).mean() > 0.9995
+
+
+@pytest.mark.parametrize("index", SHOWN)
+def test_depth_is_in_millimetres_and_agrees_with_the_mesh(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
+    color_file, depth_file = frame_files(scene.folder, index)
+    depth_mm = read_uint16(depth_file).astype(np.float64)
+    assert depth_mm.max() <= 6000
+    hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
+    read = (depth_mm > 0) & (hits.triangle != NO_TRIANGLE)
+    error = np.abs(depth_mm[read] - 1000 * hits.distance[read])
+    assert read.mean() > 0.7
+    assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m: the sensor's noise grows with the square"
+    color = read_color(color_file)
+    assert color.shape == (*scene.camera.shape, 3)
+    assert color.std() > 10
+
+
+def test_the_camera_is_scenenns() -> None:
+    assert Recording().camera == ASUS
+    assert RECORDING.camera.shape == (120, 160)
+    assert RECORDING.camera.fx == pytest.approx(544.47329 / 4)
+    assert RECORDING.release == "synthetic, seed 3, 9 frames"
+
+
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"frames": 0}, {"width": 8}, {"width": 162}])
+def test_impossible_recordings_are_refused(wrong: dict[str, int]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(wrong))):
+        Recording(**wrong)

@@ -1,0 +1,333 @@
+"""The rival with one volume an object, on boxes that a perfect camera sees under masks as bad as a test wants them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from framework.data import Frame, PointClusters, Pose
+from framework.errors import ConfigError, DataError, MapFullError
+from framework.geometry import lift
+from framework.mapping.association import OverlapRule
+from plugins.fusers.object_volumes import ObjectVolumes, existence
+from tests.box_scene import CAMERA, BoxScene, bled, detected, look_from
+
+BOXES = BoxScene([[(-0.8, 0.2, 0.0, -0.2, 0.8, 0.6)], [(0.3, 0.2, 0.0, 0.9, 0.8, 0.6)]])
+VOXEL = 0.04  # m
+MASK_FUSION = {"overlap_rule": OverlapRule.CLUSTER, "overlap": 0.05, "same_class": True}
+
+
+def new_fuser(**parameters: object) -> ObjectVolumes:
+    return ObjectVolumes(voxel_size=VOXEL, **parameters)  # type: ignore[arg-type]
+
+
+def pan(width: float) -> list[Frame]:
+    """Ten views of both boxes, `width` m from the first to the last."""
+    places = np.linspace(-width / 2, width / 2, 10)
+    return [BOXES.frame(look_from(x, -1.4, 1.5, (0.0, 0.6, 0.2)), k) for k, x in enumerate(places)]
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return pan(1.6)
+
+
+def masks_of(frame: Frame) -> list[np.ndarray]:
+    assert frame.truth is not None
+    return [frame.truth.instance_ids == k for k in (1, 2)]
+
+
+def clusters_of(frame: Frame, masks: list[np.ndarray], class_ids: list[int] | None = None) -> PointClusters:
+    assert frame.T_world_camera is not None
+    return lift(detected(masks, class_ids or [0] * len(masks)), frame, Pose(frame.T_world_camera))
+
+
+def fuse(
+    fuser: ObjectVolumes, frame: Frame, masks: list[np.ndarray], class_ids: list[int] | None = None
+) -> ObjectVolumes:
+    assert frame.T_world_camera is not None
+    fuser.fuse(frame, Pose(frame.T_world_camera), clusters_of(frame, masks, class_ids))
+    return fuser
+
+
+@pytest.fixture(scope="module")
+def mapped(frames: list[Frame]) -> ObjectVolumes:
+    fuser = new_fuser()
+    for k, frame in enumerate(frames):
+        fuse(fuser, frame, masks_of(frame)[:: -1 if k % 2 else 1])
+    return fuser
+
+
+# What is mapped
+
+
+def test_each_box_is_one_object_on_its_surface(mapped: ObjectVolumes) -> None:
+    scene = mapped.scene
+    mesh, instances = scene.mesh(), scene.instances()
+    assert sorted(instances) == [1, 2]
+    assert {record.observations for record in scene.table.records.values()} == {10}
+    for key, instance in instances.items():
+        points = mesh.vertices[instance.vertices].astype(np.float64)
+        owners = BOXES.owners(points, VOXEL / 2)
+        assert np.isin(owners, (key, -1)).mean() > 0.97, "-1: where the box stands on the floor"
+        assert (owners == key).sum() > 300
+
+
+def test_no_surface_of_an_object_is_left_without_its_label(mapped: ObjectVolumes) -> None:
+    """Or the nearest vertex to a true point would be the background's in one case of two."""
+    mesh = mapped.scene.mesh()
+    owners = BOXES.owners(mesh.vertices.astype(np.float64), VOXEL / 4)
+    for key in (1, 2):
+        assert (mesh.instance_ids[owners == key] == key).mean() > 0.97
+
+
+def test_rendered_ids_are_those_of_the_boxes(mapped: ObjectVolumes, frames: list[Frame]) -> None:
+    frame = frames[4]
+    assert frame.truth is not None
+    assert frame.T_world_camera is not None
+    view = mapped.scene.render(CAMERA, frame.T_world_camera)
+    assert (view.instance_ids == frame.truth.instance_ids).mean() > 0.98
+    assert (view.class_ids == np.where(view.instance_ids > 0, 0, -1)).all()
+
+
+def test_bytes_and_voxels_are_those_of_all_volumes(mapped: ObjectVolumes) -> None:
+    scene = mapped.scene
+    objects = sum(volume.block_count for volume in scene.volumes.values())
+    assert scene.voxel_count == 512 * (scene.voxels.block_count + objects)
+    per_object_voxel = 8 + 4  # a grid's, and the two counts
+    assert scene.byte_count > 8 * 512 * scene.voxels.block_count + per_object_voxel * 512 * objects
+    assert 0 < objects < scene.voxels.block_count
+
+
+def share_of_the_room(fuser: ObjectVolumes) -> float:
+    """The share of the first object's vertices that are the floor's or the wall's, a voxel away from all boxes."""
+    mesh = fuser.scene.mesh()
+    points = mesh.vertices[mesh.instance_ids == 1].astype(np.float64)
+    return float((BOXES.owners(points, VOXEL) == 0).mean())
+
+
+def test_a_mask_that_bleeds_once_leaves_nothing_and_one_that_always_bleeds_does() -> None:
+    """What was never seen without the mask stays in either case: so the camera hardly moves."""
+    once, always = new_fuser(), new_fuser()
+    for k, frame in enumerate(pan(0.1)):
+        mask = masks_of(frame)[0]
+        fuse(once, frame, [bled(mask, 12) if k == 3 else mask])
+        fuse(always, frame, [bled(mask, 12)])
+    assert share_of_the_room(once) < 0.02
+    assert share_of_the_room(always) > 0.2, "the weakness: nothing is cleaned, so what is always wrong stays"
+
+
+def test_what_bled_over_the_wall_goes_once_it_is_seen_twice_without_a_mask(frames: list[Frame]) -> None:
+    """Beta(1 + 1, 1 + 0), then Beta(2, 2), which is not above 1/2."""
+    frame, fuser = frames[0], new_fuser(min_observations=1)
+    mask = masks_of(frame)[0]
+    fuse(fuser, frame, [bled(mask, 12)])
+    assert share_of_the_room(fuser) > 0.2
+    fuse(fuser, replace(frame, index=1), [mask])
+    assert share_of_the_room(fuser) < 0.02
+
+
+def test_only_frames_that_detect_an_object_change_its_volume(frames: list[Frame]) -> None:
+    fuser = fuse(new_fuser(), frames[0], masks_of(frames[0]))
+    first, second = ({k: a.copy() for k, a in v.arrays().items()} for v in fuser.scene.volumes.values())
+    fuse(fuser, frames[1], masks_of(frames[1])[:1])
+    assert not np.array_equal(fuser.scene.volumes[1].arrays()["weight"], first["weight"])
+    for name, array in fuser.scene.volumes[2].arrays().items():
+        assert np.array_equal(array, second[name]), name
+
+
+# Association
+
+
+def part_of(mask: np.ndarray, share: float) -> np.ndarray:
+    """The first `share` of a mask's pixels, row by row."""
+    v, u = np.nonzero(mask)
+    part = np.zeros_like(mask)
+    part[v[: round(share * len(v))], u[: round(share * len(v))]] = True
+    return part
+
+
+@pytest.mark.parametrize(
+    ("parameters", "share", "class_id", "same"),
+    [
+        ({}, 0.25, 0, True),  # IoU 0.25 > 0.2
+        ({}, 0.15, 0, False),
+        ({}, 0.25, 1, True),
+        (MASK_FUSION, 0.15, 0, True),  # all of the detection lies on the object
+        (MASK_FUSION, 0.15, 1, False),  # of another class
+    ],
+)
+def test_a_part_of_an_object_belongs_to_it_by_the_rule(
+    frames: list[Frame], parameters: dict[str, object], share: float, class_id: int, same: bool
+) -> None:
+    fuser = new_fuser(**parameters)
+    whole = masks_of(frames[0])[0]
+    fuse(fuser, frames[0], [whole])
+    fuse(fuser, replace(frames[0], index=1), [part_of(whole, share)], [class_id])
+    assert len(fuser.scene.table.records) == (1 if same else 2)
+
+
+def test_a_large_mask_over_a_small_object_belongs_to_it_by_neither_rule(frames: list[Frame]) -> None:
+    whole = masks_of(frames[0])[0]
+    for parameters in ({}, MASK_FUSION):
+        fuser = new_fuser(**parameters)
+        fuse(fuser, frames[0], [part_of(whole, 0.02)])
+        fuse(fuser, replace(frames[0], index=1), [whole])
+        assert len(fuser.scene.table.records) == 2
+
+
+def test_a_detection_belongs_to_the_object_that_it_overlaps_most_with(frames: list[Frame]) -> None:
+    frame = frames[4]
+    left, right = masks_of(frame)
+    fuser = fuse(new_fuser(), frame, [left, right])
+    fuse(fuser, replace(frame, index=1), [part_of(left, 0.4) | right])
+    assert [record.observations for record in fuser.scene.table.records.values()] == [1, 2]
+
+
+def test_two_detections_of_one_object_are_one_observation_and_their_union_one_mask(frames: list[Frame]) -> None:
+    frame, fuser = frames[0], new_fuser()
+    whole = masks_of(frame)[0]
+    fuse(fuser, frame, [whole])
+    first = part_of(whole, 0.5)
+    fuse(fuser, replace(frame, index=1), [first, whole & ~first])
+    (record,) = fuser.scene.table.records.values()
+    assert (record.observations, record.detections, record.visible) == (2, 3, 2)
+    counts = fuser.scene.volumes[1].arrays()
+    assert (counts["foreground"][counts["foreground"] > 0] == 2).mean() > 0.95, "every voxel is in the second mask too"
+
+
+def test_a_weak_detection_creates_nothing_and_one_out_of_range_neither(frames: list[Frame]) -> None:
+    frame = frames[0]
+    mask = masks_of(frame)[0]
+    for fuser in (new_fuser(create_score=0.9), new_fuser(max_depth=0.9)):
+        fuse(fuser, frame, [mask])
+        assert not fuser.scene.table.records
+        assert not fuser.scene.volumes
+
+
+# What is known of an object
+
+
+def test_classes_are_the_mean_of_the_detections(frames: list[Frame]) -> None:
+    fuser = new_fuser(min_observations=1)
+    for k, class_id in enumerate([0, 1, 1]):
+        fuse(fuser, replace(frames[0], index=k), masks_of(frames[0])[:1], [class_id])
+    (instance,) = fuser.scene.instances().values()
+    expected = np.array([[0.6, 0.2, 0.2], [0.2, 0.6, 0.2], [0.2, 0.6, 0.2]]).mean(axis=0)
+    np.testing.assert_allclose(instance.class_probabilities, expected, atol=1e-6)
+    mesh = fuser.scene.mesh()
+    assert set(mesh.class_ids[mesh.instance_ids == 1]) == {1}
+
+
+def test_a_false_detection_goes_when_it_should_have_been_seen_again(frames: list[Frame]) -> None:
+    """Detected once and missed n times it exists with probability 2 / (3 + n), which is below 0.1 from n = 18 on."""
+    frame, fuser = frames[0], new_fuser(min_observations=1)
+    wall = np.zeros(CAMERA.shape, np.bool_)
+    wall[10:50, 100:180] = True
+    fuse(fuser, frame, [wall])
+    assert existence(fuser.scene.table.records[1]) == 2 / 3
+    elsewhere = replace(frame, depth=np.zeros_like(frame.depth))
+    for k in range(30):
+        fuse(fuser, replace(elsewhere, index=1 + k), [])
+    assert set(fuser.scene.instances()) == {1}, "nobody has looked there"
+    for k in range(17):
+        fuse(fuser, replace(frame, index=31 + k), [])
+    assert set(fuser.scene.instances()) == {1}
+    fuse(fuser, replace(frame, index=48), [])
+    assert not fuser.scene.instances()
+    assert not fuser.scene.volumes
+    assert (fuser.scene.mesh().instance_ids == 0).all()
+    fuse(fuser, replace(frame, index=49), [wall])
+    assert set(fuser.scene.table.records) == {2}, "ids are never used again"
+
+
+def test_a_small_object_does_not_count(frames: list[Frame]) -> None:
+    fuser = new_fuser(min_observations=1, min_area=40.0)
+    fuse(fuser, frames[0], masks_of(frames[0]))
+    assert not fuser.scene.instances()
+    assert (fuser.scene.mesh().instance_ids == 0).all()
+
+
+# The map
+
+
+def test_the_mesh_kept_up_to_date_is_that_of_a_map_read_from_a_file(frames: list[Frame], tmp_path: Path) -> None:
+    fuser = new_fuser(min_observations=1)
+    for frame in frames[::3]:
+        fuse(fuser, frame, masks_of(frame)[: 1 + frame.index % 2])
+        fuser.scene.mesh()
+    fuser.scene.save(tmp_path / "map.npz")
+    loaded = type(fuser.scene).load(tmp_path / "map.npz")
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        assert np.array_equal(getattr(loaded.mesh(), name), getattr(fuser.scene.mesh(), name)), name
+    assert loaded.byte_count == fuser.scene.byte_count
+    assert loaded.instances()[2].confidence == fuser.scene.instances()[2].confidence
+    loaded.save(tmp_path / "again.npz")
+    assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+
+
+def test_overlapping_objects_both_have_their_surface(frames: list[Frame]) -> None:
+    """One detection a frame, now of the whole and now of a small part: what an IoU rule makes of a partial mask."""
+    fuser = new_fuser(min_observations=1)
+    whole = masks_of(frames[0])[0]
+    for k, mask in enumerate([whole, part_of(whole, 0.15)]):
+        fuse(fuser, replace(frames[0], index=k), [mask])
+    mesh = fuser.scene.mesh()
+    first, second = (mesh.vertices[mesh.instance_ids == k] for k in (1, 2))
+    shared = (np.abs(first[:, None] - second[None]).max(axis=2) < 1e-6).any(axis=0)
+    assert shared.mean() > 0.2
+    assert len(second) > 20
+
+
+def test_where_objects_overlap_the_more_probable_one_is_seen_and_of_equal_ones_the_first(frames: list[Frame]) -> None:
+    frame, scene = frames[0], new_fuser().scene
+    T = frame.T_world_camera
+    assert T is not None
+    mask = masks_of(frame)[0]
+    first, second = scene.create(0), scene.create(0)
+    for ids, expected in [((first, second), first), ((second,), second), ((first,), first)]:
+        scene.integrate(frame, T, dict.fromkeys(ids, mask), 2 * VOXEL)
+        seen = scene.instances_seen(frame.camera, T, frame.depth, 2)
+        assert (seen[mask[::2, ::2]] == expected).mean() > 0.9, expected
+
+
+def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame], tmp_path: Path) -> None:
+    default = numba.get_num_threads()
+    if default < 2:
+        pytest.skip("this machine has one core")
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            fuser = new_fuser()
+            for frame in frames[::2]:
+                fuse(fuser, frame, [bled(mask, 3) for mask in masks_of(frame)])
+            fuser.scene.save(tmp_path / f"{threads}.npz")
+    finally:
+        numba.set_num_threads(default)
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+
+
+def test_a_full_map_says_so(frames: list[Frame]) -> None:
+    background = fuse(new_fuser(), frames[0], []).scene.voxels.block_count
+    with pytest.raises(MapFullError, match=f"more than {background} blocks in the background and 2 objects"):
+        fuse(new_fuser(max_blocks=background), frames[0], masks_of(frames[0]))
+
+
+def test_a_pixel_out_of_the_image_and_other_classes_are_refused(frames: list[Frame]) -> None:
+    frame = frames[0]
+    clusters = clusters_of(frame, masks_of(frame))
+    fuser = fuse(new_fuser(), frame, [])
+    with pytest.raises(DataError, match="must lie in the image"):
+        fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, pixels=clusters.pixels + 200))
+    with pytest.raises(DataError, match="others"):
+        fuser.fuse(frame, Pose(np.eye(4)), replace(clusters, classes=("a", "b", "c")))
+
+
+def test_parameters_are_checked() -> None:
+    for wrong in ({"overlap": 1.5}, {"min_existence": -0.1}, {"create_points": 0}, {"label_band": 9.0}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            ObjectVolumes(**wrong)  # type: ignore[arg-type]

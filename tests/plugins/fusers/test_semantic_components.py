@@ -1,0 +1,283 @@
+"""The semantic rival on scenes of a few boxes and spheres, and beside the recursion written out voxel by voxel."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from framework.data import Detections, Frame, Pose
+from framework.errors import ConfigError, DataError
+from framework.geometry import lift
+from framework.mapping.integration import Integrator
+from framework.mapping.semantic_map import SemanticMap
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.fusers.semantic_components import SemanticComponents
+from tests import box_scene
+from tests.analytic_scene import CAMERA, room, walk
+from tests.box_scene import BoxScene, look_from
+from tests.true_masks import CLASSES, PROBABILITIES, fuse_masks, masks_of
+
+VIEWS = [look_from(x, -1.5, 1.6, (0.0, 1.0, 0.3)) for x in (-1.0, -0.3, 0.4, 1.1)]
+LEFT, RIGHT = (-0.6, 0.8, 0.0, -0.1, 1.2, 0.5), (0.2, 0.8, 0.0, 0.7, 1.2, 0.5)
+SECOND_FOUND = (1, 3, 5)  # frames
+TOUCHING = (-0.1, 0.8, 0.0, 0.4, 1.2, 0.5)  # the left box's side
+
+
+def new_fuser(**parameters: object) -> SemanticComponents:
+    return SemanticComponents(voxel_size=0.03, max_depth=4.0, **parameters)  # type: ignore[arg-type]
+
+
+def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
+    """The boxes on the floor, seen from all views under their true masks.
+
+    A hidden side of which one view sees a sliver is a piece of its own: `min_area` leaves it out.
+    """
+    scene, fuser = BoxScene([[box] for box in boxes]), new_fuser(min_area=0.03)
+    for k, T in enumerate(VIEWS):
+        frame = scene.frame(T, k)
+        assert frame.truth is not None
+        masks = [frame.truth.instance_ids == i for i in range(1, len(boxes) + 1)]
+        fuser.fuse(frame, Pose(T), lift(box_scene.detected(masks, class_ids), frame, Pose(T)))
+    return fuser.scene
+
+
+@pytest.fixture(scope="module")
+def frames() -> list[Frame]:
+    return [room().frame(T, k) for k, T in enumerate(walk(10))]
+
+
+@pytest.fixture(scope="module")
+def mapped(frames: list[Frame]) -> SemanticMap:
+    """The three spheres: the first is detected in all frames, the second in three, the third in none."""
+    fuser = new_fuser()
+    for k, frame in enumerate(frames):
+        found = 1 + (k in SECOND_FOUND)
+        fuse_masks(fuser, frame, masks_of(frame)[:found], [0.6, 0.68][:found])
+    return fuser.scene
+
+
+# What is an instance
+
+
+def test_two_boxes_of_a_class_apart_are_two_instances() -> None:
+    instances = mapped_boxes([LEFT, RIGHT], [0, 0]).instances()
+    assert list(instances) == [1, 2]
+    for instance, box in zip(sorted(instances.values(), key=lambda i: i.aabb.center[0]), [LEFT, RIGHT], strict=True):
+        np.testing.assert_allclose(instance.aabb.center[[0, 2]], np.add(box[:3], box[3:])[[0, 2]] / 2, atol=0.06)
+        assert instance.class_probabilities.argmax() == 0
+
+
+def test_two_boxes_of_a_class_that_touch_are_one_which_is_the_limit_of_the_idea() -> None:
+    [instance] = mapped_boxes([LEFT, TOUCHING], [0, 0]).instances().values()
+    assert instance.aabb.extent[0] == pytest.approx(1.0, abs=0.1)
+
+
+def test_two_boxes_of_different_classes_that_touch_are_two_instances() -> None:
+    scene = mapped_boxes([LEFT, TOUCHING], [0, 1])
+    instances = scene.instances()
+    assert sorted(i.class_probabilities.argmax() for i in instances.values()) == [0, 1]
+    mesh = scene.mesh()
+    for instance in instances.values():
+        assert set(mesh.class_ids[instance.vertices]) == {instance.class_probabilities.argmax()}
+        assert instance.aabb.extent[0] == pytest.approx(0.5, abs=0.1)
+
+
+@pytest.mark.parametrize("when", [0, 9])
+def test_a_false_detection_in_one_of_ten_frames_vanishes(frames: list[Frame], when: int) -> None:
+    fuser = new_fuser()
+    for k, frame in enumerate(frames):
+        found = [masks_of(frame)[0]] if k == when else []
+        fuse_masks(fuser, frame, found, [0.5] * len(found))
+        if when == k == 0:
+            assert len(fuser.scene.instances()) == 1
+    assert not fuser.scene.instances()
+    class_ids = fuser.scene.render(CAMERA, walk(10)[5]).class_ids
+    assert (class_ids >= 0).sum() < 0.01 * masks_of(frames[5])[0].sum(), "on the silhouette, what that frame alone saw"
+
+
+def test_what_no_mask_says_nothing_of_keeps_its_class(frames: list[Frame]) -> None:
+    fuser = new_fuser(missed=1.0)
+    for k, frame in enumerate(frames):
+        found = [masks_of(frame)[0]] if k == 0 else []
+        fuse_masks(fuser, frame, found, [0.6] * len(found))
+    assert len(fuser.scene.instances()) == 1
+
+
+def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
+    fuser = new_fuser(min_area=40.0)
+    fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [0.6])
+    assert not fuser.scene.instances()
+    assert (fuser.scene.mesh().class_ids == -1).all()
+    assert (fuser.scene.render(CAMERA, walk(10)[0]).class_ids == 0).any(), "voxels know nothing of areas"
+
+
+# What is said of one
+
+
+def test_each_voxel_has_the_product_of_what_its_pixels_said(mapped: SemanticMap, frames: list[Frame]) -> None:
+    """Against eq. [7] over classes and background, by projecting the voxel into each frame."""
+    grid, evidence, fuser = mapped.voxels.grid, mapped.labels.evidence, new_fuser()
+    rows = np.flatnonzero(grid.label_row[: mapped.voxels.block_count] >= 0)
+    rng = np.random.default_rng(0)
+    differing = seen = 0
+    for block, n in zip(rng.choice(rows, 600), rng.integers(0, 512, 600), strict=True):
+        voxel = (8 * grid.block_coords[block] + (n & 7, (n >> 3) & 7, n >> 6)) * 0.03
+        log, masked, unmasked = np.zeros(3), 0, 0  # two classes and the background
+        for k, frame in enumerate(frames):
+            assert frame.T_world_camera is not None
+            x, y, z = np.linalg.inv(frame.T_world_camera)[:3] @ [*voxel, 1]
+            u, v = (round(f * a / z + c) for f, a, c in ((CAMERA.fx, x, CAMERA.cx), (CAMERA.fy, y, CAMERA.cy)))
+            if not (z > 0.2 and 0 <= u < CAMERA.width and 0 <= v < CAMERA.height):
+                continue
+            if not (0.2 < frame.depth[v, u] < 4.0 and abs(frame.depth[v, u] - z) <= 0.06):
+                continue
+            under = [mask[v, u] for mask in masks_of(frame)[: 1 + (k in SECOND_FOUND)]]
+            if any(under):
+                objects = (0.6 if under[0] else 0.68) / max(PROBABILITIES)
+                p = [objects * PROBABILITIES[0], objects * PROBABILITIES[1], 1 - objects]
+                log += np.log(0.9 * np.array(p) + 0.1 / 3)
+                masked += 1
+            else:
+                log += np.log([fuser.missed, fuser.missed, 1])
+                unmasked += 1
+        row = grid.label_row[block]
+        held = np.zeros(2)
+        for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
+            if label < 2:
+                held[label] = ratio
+        held += np.log(fuser.missed) * evidence.unmasked[block, n]
+        seen += masked > 0
+        same = (evidence.masked[row, n], evidence.unmasked[block, n]) == (masked, unmasked)
+        differing += not (same and np.allclose(held, log[:2] - log[2], atol=1e-3))
+    assert seen > 50
+    assert differing <= 6, "pixels on the edge of two, in float32"
+
+
+def test_an_instances_numbers_are_those_of_its_voxels(mapped: SemanticMap) -> None:
+    grid, evidence, mesh = mapped.voxels.grid, mapped.labels.evidence, mapped.mesh()
+    voxels = mapped._surface.extract().voxels
+    instances = mapped.instances()
+    assert list(instances) == list(range(1, 1 + mapped.instance_count))
+    assert len(instances) >= 1
+    for instance in instances.values():
+        posteriors, counts, firsts, lasts = [], [0], [], []
+        for block, n in (divmod(int(voxel), 512) for voxel in voxels[instance.vertices]):
+            row = grid.label_row[block]
+            if row < 0:
+                posteriors.append(np.zeros(2))
+                continue
+            log = np.array([evidence.rest[row, n]] * 2 + [0.0])
+            for label, ratio in zip(evidence.class_ids[row, n], evidence.log_ratio[row, n], strict=True):
+                if label < 2:
+                    log[label] = ratio
+            log[:2] += np.log(mapped.missed) * evidence.unmasked[block, n]
+            posteriors.append((np.exp(log) / np.exp(log).sum())[:2])
+            counts.append(evidence.masked[row, n])
+            firsts += [evidence.first_frame[row, n]] if counts[-1] else []
+            lasts += [evidence.last_frame[row, n]] if counts[-1] else []
+        mean = np.mean(posteriors, axis=0)
+        np.testing.assert_allclose(instance.class_probabilities, mean / mean.sum(), atol=1e-4)
+        assert instance.confidence == pytest.approx(mean[mesh.class_ids[instance.vertices[0]]], abs=1e-4)
+        assert (instance.observations, instance.first_frame, instance.last_frame) == (
+            max(counts),
+            min(firsts),
+            max(lasts),
+        )
+
+
+def test_the_spheres_that_were_detected_are_the_instances(mapped: SemanticMap) -> None:
+    first, second = sorted(mapped.instances().values(), key=lambda instance: -instance.observations)
+    assert (first.observations, first.first_frame, first.last_frame) == (10, 0, 9)
+    assert (second.observations, second.first_frame, second.last_frame) == (3, 1, 5)
+    center, radius = room().spheres[0]
+    points = mapped.mesh().vertices[first.vertices]
+    assert np.quantile(np.abs(np.linalg.norm(points - center, axis=1) - radius), 0.9) < 0.03
+    view = mapped.render(CAMERA, walk(10)[5])
+    assert (view.class_ids[masks_of(room().frame(walk(10)[5]))[0]] == 0).mean() > 0.9
+    assert not view.instance_ids.any(), "voxels know of no instance"
+
+
+def test_a_score_is_the_probability_of_the_best_class(frames: list[Frame]) -> None:
+    """Of a best class of 0.7, score 0.33 leaves the background more than half, and 0.6 a seventh."""
+    for score, label in ((0.33, -1), (0.6, 0)):
+        fuser = new_fuser()
+        fuse_masks(fuser, frames[0], masks_of(frames[0])[:1], [score])
+        view = fuser.scene.render(CAMERA, walk(10)[0])
+        assert np.median(view.class_ids[masks_of(frames[0])[0]]) == label
+
+
+# The map as such
+
+
+def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -> None:
+    default = numba.get_num_threads()
+    if default < 2:
+        pytest.skip("this machine has one core")
+    maps = []
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            fuser = new_fuser()
+            for frame in frames[:5]:
+                fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
+            mesh = fuser.scene.mesh()
+            maps.append([array.tobytes() for array in fuser.scene.labels.saved().values()])
+            maps[-1] += [mesh.vertices.tobytes(), mesh.instance_ids.tobytes(), mesh.class_ids.tobytes()]
+    finally:
+        numba.set_num_threads(default)
+    assert maps[0] == maps[1]
+
+
+def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: SemanticMap, tmp_path: Path) -> None:
+    mapped.save(tmp_path / "map.npz")
+    loaded = SemanticMap.load(tmp_path / "map.npz")
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        assert np.array_equal(getattr(mapped.mesh(), name), getattr(loaded.mesh(), name)), name
+    for ours, theirs in itertools.zip_longest(mapped.instances().values(), loaded.instances().values()):
+        assert (ours.confidence, ours.observations, ours.last_frame) == (
+            theirs.confidence,
+            theirs.observations,
+            theirs.last_frame,
+        )
+    assert (loaded.missed, loaded.min_area, loaded.byte_count) == (mapped.missed, mapped.min_area, mapped.byte_count)
+    loaded.save(tmp_path / "again.npz")
+    assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
+
+
+def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> None:
+    whole, resumed = new_fuser(), new_fuser()
+    for k, frame in enumerate(frames[:4]):
+        if k == 2:
+            resumed.scene.save(tmp_path / "map.npz")
+            resumed.scene = SemanticMap.load(tmp_path / "map.npz")
+            resumed._integrator = Integrator(resumed.scene.voxels, resumed.scene.sensor)
+            resumed._integrator.frames = k  # on which the rounding of averages depends
+        for fuser in (whole, resumed):
+            fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
+    ours, theirs = whole.scene.labels.saved(), resumed.scene.labels.saved()
+    assert all(np.array_equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_a_map_of_instances_is_refused(tmp_path: Path) -> None:
+    BayesianTsdf().scene.save(tmp_path / "map.npz")
+    with pytest.raises(DataError, match="map format 4, this version reads semantic 1"):
+        SemanticMap.load(tmp_path / "map.npz")
+
+
+def test_another_label_space_is_refused(frames: list[Frame]) -> None:
+    fuser = new_fuser()
+    fuse_masks(fuser, frames[0], [], [])
+    assert fuser.scene.classes == CLASSES
+    clusters = lift(Detections.none(CAMERA.shape, ("chair",)), frames[1], Pose(np.eye(4)))
+    with pytest.raises(DataError, match="2 classes and this frame's clusters have 1"):
+        fuser.fuse(frames[1], Pose(np.eye(4)), clusters)
+
+
+def test_parameters_are_checked() -> None:
+    for wrong in ({"missed": 0.0}, {"class_floor": 1.0}, {"max_weight": 256.0}, {"voxel_size": float("nan")}):
+        with pytest.raises(ConfigError, match=next(iter(wrong))):
+            SemanticComponents(**wrong)  # type: ignore[arg-type]
