@@ -19,12 +19,12 @@ from tests.boxes_room import BoxesRoom, furnished, walk
 SIZE = (160, 120)
 
 
-def stored(ids: Mapping[int, int], frames: int = 20) -> StoredMap:
-    """The room's map with the boxes' ids (1 red, 2 blue) named anew, of the walk's first frames."""
+def stored(ids: Mapping[int, int]) -> StoredMap:
+    """The room's map with the ids (0 room, 1 red box, 2 blue box) named anew."""
     mesh = furnished()
-    labels = np.array([0, ids.get(1, 0), ids.get(2, 0)], np.int32)[mesh.instance_ids]
+    labels = np.array([ids.get(k, 0) for k in range(3)], np.int32)[mesh.instance_ids]
     names = {key: f"thing {key}" for key in ids.values() if key}
-    return StoredMap(replace(mesh, instance_ids=labels), labels, names, walk()[:frames], Record(Path(), {}, {}, 0.0))
+    return StoredMap(replace(mesh, instance_ids=labels), labels, names, walk(), Record(Path(), {}, {}, 0.0))
 
 
 def hue(color: np.ndarray) -> np.ndarray:
@@ -90,8 +90,20 @@ def test_equal_maps_have_no_window_and_no_paths(truth: SceneTruth) -> None:
     assert [panel.path for panel in line.maps if panel] == [None, None]
 
 
+def test_what_only_a_map_has_does_not_draw_the_window(truth: SceneTruth) -> None:
+    line = panel_line([stored({0: 9, 1: 7}), stored({1: 1, 2: 2})], truth, SIZE, zoom=True)
+    assert line.truth is not None
+    assert line.window is not None
+    v, u = place_of(line.truth, "couch")
+    assert 0 < u - line.window.left < line.window.width
+    assert 0 < v - line.window.top < line.window.height
+
+
 def test_maps_of_different_lengths_show_the_path_inside_of_the_picture(truth: SceneTruth) -> None:
-    line = panel_line([stored({1: 7}, frames=8), stored({1: 1, 2: 2})], truth, SIZE, zoom=False)
+    poses = walk()
+    poses[10:, 2, 3] = 9  # far above the room
+    maps = [stored({1: 7}), stored({1: 1, 2: 2})]
+    line = panel_line([replace(maps[0], poses=poses[:8]), replace(maps[1], poses=poses)], truth, SIZE, zoom=False)
     first, second = (panel.path for panel in line.maps if panel)
     assert first is not None
     assert second is not None
