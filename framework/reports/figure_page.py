@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,8 @@ PNG_DPI = 200
 PDF_DPI = 300  # of the rasters in it
 NOTE_LINE_MM = 2.35  # from one line of small type to the next
 MARGIN_MM = 1.0
+
+logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells a hundred lines about each font in a PDF
 
 
 class Page:
