@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from framework.command_line import CONF, EXIT_FAILED, Jobs
-from framework.experiment import WriteTables, with_row
-from framework.figures import WriteFigures
+from framework.command_line import CONF, Jobs
+from framework.directory_lock import locked
+from framework.experiment import with_row
 from framework.reports.records import is_recorded
+from framework.sweep import ending
 
 jobs = Jobs()
 
@@ -24,18 +24,22 @@ def job(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
-    if config.get("resume") and is_recorded(directory, config):
-        return
-    from framework.run import run  # here, so that a misspelt name is answered before the heavy libraries load
+    with locked(directory, wait=config.resume):  # where the sweep was killed and not its workers, they go on
+        if config.resume and is_recorded(directory, config):
+            return
+        from framework.run import run  # here, so that a misspelt name is answered before the heavy libraries load
 
-    run(config, directory, choices)
+        run(config, directory, choices)
 
 
 def main() -> None:
     """The console script `instancemap`."""
-    jobs.run(job)
-    if WriteTables.failed or WriteFigures.failed:
-        sys.exit(EXIT_FAILED)
+    jobs.run(job_or_sweep)
+
+
+def job_or_sweep() -> None:
+    with ending:
+        job()
 
 
 if __name__ == "__main__":

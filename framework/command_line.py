@@ -8,11 +8,12 @@ import sys
 import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
@@ -64,7 +65,6 @@ class Jobs:
     """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and counts the failed."""
 
     failed: int = 0
-    process: int = field(default_factory=os.getpid)
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
         """`job`, with its faults in the log: one line for a known error, the traceback for others and with `debug`."""
@@ -76,8 +76,8 @@ class Jobs:
             except Exception as error:
                 known = isinstance(error, KNOWN_ERRORS)
                 _log_error(one_line(error), error if config.get("debug") or not known else None)
-                if os.getpid() != self.process:  # a worker of a parallel launcher: Hydra carries the error to where
-                    raise  # somebody counts
+                if _in_worker():  # Hydra carries the error, if it can be pickled, to where the sweep was started
+                    raise InstanceMapError(f"a run failed: {one_line(error)}") from None
                 self.failed += 1
 
         return reported_job
@@ -88,6 +88,13 @@ class Jobs:
             command()
         if self.failed:
             sys.exit(EXIT_FAILED)
+
+
+def _in_worker() -> bool:
+    """Whether a job runs in another process than the sweep: in one of a launcher that is not Hydra's own."""
+    own = HydraConfig.get()
+    of_sweep = not OmegaConf.is_missing(own.job, "num")
+    return of_sweep and not str(own.launcher._target_).endswith(".BasicLauncher")
 
 
 def one_line(error: BaseException) -> str:
@@ -105,10 +112,17 @@ def one_line(error: BaseException) -> str:
     return _joined(str(error)) or type(error).__name__
 
 
+_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
+"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
+
+
 def _no_such_option(error: MissingConfigException) -> str:
     group, _, name = str(error.missing_cfg_file).rpartition("/")
     if not group:
         return _joined(str(error))
+    if group == "hydra/launcher" and name in _EXTRAS:
+        extra = _EXTRAS[name]
+        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
     options = list(error.options or ())
     close = get_close_matches(name, options, n=1)
     suggestion = f"; did you mean {close[0]}?" if close else "."

@@ -6,21 +6,15 @@ Hydra's own sweeper varies one key at a time and makes products of them. An expe
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Mapping
-from pathlib import Path
-from typing import Any, ClassVar
 
 from hydra import compose
 from hydra.conf import HydraConf
-from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from framework.errors import ConfigError, InstanceMapError
+from framework.errors import ConfigError
 from framework.reports.comparison import TableChoice
 from framework.reports.figure_choice import FigureChoice
-
-log = logging.getLogger(__name__)
 
 Choices = Mapping[str, str | None]
 
@@ -49,20 +43,3 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
     with open_dict(composed):
         del composed["hydra"]
     return composed, choices
-
-
-class WriteTables(Callback):
-    """Makes the tables when the sweep has ended, from all records in its place."""
-
-    failed: ClassVar[bool] = False  # whether there is a table that could not be made: Hydra keeps callbacks' errors
-
-    def on_multirun_end(self, config: DictConfig, **_: Any) -> None:
-        from framework.reports.tables import (
-            write_tables,  # here: every job makes a callback, none but the sweep calls it
-        )
-
-        try:
-            print(write_tables(Path(config.hydra.sweep.dir)))
-        except InstanceMapError as error:  # Hydra would make a warning of many lines of it
-            log.error("no table: %s", error)
-            WriteTables.failed = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -78,8 +79,9 @@ class Journal:
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
+        quiet = os.environ.get("TQDM_DISABLE") == "1"  # tqdm itself does not look where `disable` is given
         self._bar = self._screen.enter_context(
-            tqdm(total=self.frames_expected, unit=" frames", disable=None, dynamic_ncols=True)
+            tqdm(total=self.frames_expected, unit=" frames", disable=quiet or None, dynamic_ncols=True)
         )
         if not self._bar.disable:
             self._screen.enter_context(logging_redirect_tqdm())

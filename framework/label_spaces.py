@@ -39,7 +39,8 @@ COCO = SPACES["coco"]
 SCENENN_TO_COCO = {name: coco for name, coco in _SECTIONS["scenenn"].items() if coco is not None}
 """The nine classes that the paper evaluates on SceneNN, and what COCO calls them."""
 
-_MEANINGS = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
+MEANINGS: Mapping[str, str | None] = {name: coco for names in _SECTIONS.values() for name, coco in names.items()}
+"""What any name of any space means, in lower case: a COCO name, None = no object class that COCO knows."""
 
 
 @dataclass(frozen=True)
@@ -95,13 +96,13 @@ def to_coco(labels: Sequence[str]) -> LabelMapping:
     ConfigError, naming all labels that the file does not have; also when none means an object class.
     """
     keys = [label.partition(",")[0].strip().lower() for label in labels]
-    unknown = [label for label, key in zip(labels, keys, strict=True) if key not in _MEANINGS]
+    unknown = [label for label, key in zip(labels, keys, strict=True) if key not in MEANINGS]
     if unknown:
         raise ConfigError(
             f"{len(unknown)} of {len(labels)} labels are in no label space: {', '.join(map(repr, unknown))};"
             f" framework/{Path(__file__).stem}.yaml says what a name means: add them there"
         )
-    meanings = [_MEANINGS[key] for key in keys]
+    meanings = [MEANINGS[key] for key in keys]
     classes = tuple(name for name in COCO if name in meanings)
     if not classes:
         raise ConfigError(f"none of the {len(labels)} labels means an object class of COCO")

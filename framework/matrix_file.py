@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Float64
+from framework.data import Camera, Float64
 from framework.errors import DataError
 from framework.geometry import nearest_rigid
 
 
 @dataclass(frozen=True)
 class PrintedMatrix:
-    """A matrix as it stands in a file; whether its numbers are a pose is only told when that is asked for."""
+    """A matrix as it stands in a file; what its numbers mean is only checked when that is asked for."""
 
     where: str  # file, and line where it has many
     values: Float64  # (4, 4), may be NaN
@@ -23,6 +23,16 @@ class PrintedMatrix:
         """The rigid (4, 4) motion that it means. Raises DataError, naming the place, when it is none."""
         try:
             return nearest_rigid(self.values)
+        except DataError as error:
+            raise DataError(f"{self.where}: {error}") from error
+
+    def camera(self, width: int, height: int) -> Camera:
+        """The pinhole camera that it means, for images of this size. Raises DataError, naming the place."""
+        (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
+        if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
+            raise DataError(f"{self.where}: expected intrinsics, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1")
+        try:
+            return Camera(width, height, fx, fy, cx, cy)
         except DataError as error:
             raise DataError(f"{self.where}: {error}") from error
 

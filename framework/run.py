@@ -87,7 +87,8 @@ class Settings:
         threadpool_limits(threads)  # OpenMP and BLAS, as far as they are loaded
         random.seed(self.seed)
         np.random.seed(self.seed % 2**32)  # noqa: NPY002
-        if self.threads or "torch" in sys.modules:  # else not loaded for nothing: all cores is its own default
+        os.environ["OMP_NUM_THREADS"] = str(threads)  # read by those that are loaded later; torch takes seconds
+        if "torch" in sys.modules:
             import torch
 
             torch.set_num_threads(threads)

@@ -14,31 +14,39 @@ from framework.errors import FrameError
 
 def read_color(path: Path) -> UInt8:
     """The (H, W, 3) uint8 RGB of a JPEG or PNG file. Raises FrameError when it is damaged or not 8-bit."""
-    image = _decode(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
+    return decode_color(path, _read(path))
+
+
+def decode_color(name: Path | str, data: bytes) -> UInt8:
+    """Likewise, of what such a file holds; `name` is for messages."""
+    image = _decode(name, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
-        raise FrameError(f"{path}: colour must be 8 bits a channel, found {image.dtype}")
+        raise FrameError(f"{name}: colour must be 8 bits a channel, found {image.dtype}")
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
 
 
 def read_uint16(path: Path) -> UInt16:
     """The (H, W) uint16 values of a PNG file. Raises FrameError when it is damaged or of another type."""
-    image = _decode(path, cv2.IMREAD_UNCHANGED)
+    image = _decode(path, _read(path), cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise FrameError(f"{path} must be a PNG with one channel of uint16, found {channels} of {image.dtype}")
     return np.asarray(image, np.uint16)
 
 
-def _decode(path: Path, flags: int) -> Array:
+def _read(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise FrameError(f"{path} could not be read: {error.strerror or error}") from error
-    check_image(path, data)
+
+
+def _decode(name: Path | str, data: bytes, flags: int) -> Array:
+    check_image(name, data)
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
         image = None
     if image is None:
-        raise FrameError(f"{path} could not be decoded: the file is damaged")
+        raise FrameError(f"{name} could not be decoded: the file is damaged")
     return np.asarray(image)

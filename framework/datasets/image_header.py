@@ -15,24 +15,24 @@ JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers SO
 JPEG_SCAN = 0xDA  # the marker SOS: the picture begins
 
 
-def check_image(path: Path, data: bytes) -> None:
+def check_image(name: Path | str, data: bytes) -> None:
     """Raises FrameError, naming the byte, unless `data` is a whole PNG or JPEG file with a picture of a usual size.
 
     OpenCV decodes a JPEG that ends too early without a word (seen in 4.x) and allocates whatever a header claims.
     """
     if not data:
-        raise FrameError(f"{path} is empty")
+        raise FrameError(f"{name} is empty")
     if data.startswith(PNG_START):
-        width, height = _png_size(path, data)
+        width, height = _png_size(name, data)
     elif data.startswith(JPEG_START):
-        width, height = _jpeg_size(path, data)
+        width, height = _jpeg_size(name, data)
     else:
-        raise FrameError(f"{path} is neither a JPEG nor a PNG file")
+        raise FrameError(f"{name} is neither a JPEG nor a PNG file")
     if not 0 < width * height <= MOST_PIXELS:
-        raise FrameError(f"{path} claims to be {width}x{height} px; it is damaged, or larger than {MOST_PIXELS} px")
+        raise FrameError(f"{name} claims to be {width}x{height} px; it is damaged, or larger than {MOST_PIXELS} px")
 
 
-def _png_size(path: Path, data: bytes) -> tuple[int, int]:
+def _png_size(name: Path | str, data: bytes) -> tuple[int, int]:
     """(width, height) of a PNG file whose every chunk is there, with the right checksum."""
     width = height = 0
     position = len(PNG_START)
@@ -41,10 +41,10 @@ def _png_size(path: Path, data: bytes) -> tuple[int, int]:
         checksum = position + 8 + length
         if checksum + 4 > len(data):
             raise FrameError(
-                f"{path} is truncated: it ends at byte {len(data)}, in the chunk that begins at {position}"
+                f"{name} is truncated: it ends at byte {len(data)}, in the chunk that begins at {position}"
             )
         if zlib.crc32(data[position + 4 : checksum]) != int.from_bytes(data[checksum : checksum + 4], "big"):
-            raise FrameError(f"{path}, byte {position}: the file is damaged: the checksum of this chunk is wrong")
+            raise FrameError(f"{name}, byte {position}: the file is damaged: the checksum of this chunk is wrong")
         if kind == PNG_HEADER and length >= 8:
             width, height = struct.unpack_from(">II", data, position + 8)
         if kind == PNG_END:
@@ -52,10 +52,10 @@ def _png_size(path: Path, data: bytes) -> tuple[int, int]:
         position = checksum + 4
 
 
-def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
+def _jpeg_size(name: Path | str, data: bytes) -> tuple[int, int]:
     """(width, height) of a JPEG file that has its end."""
     if not data[-64:].rstrip(b"\0").endswith(JPEG_END):  # some cameras pad their files with zeros
-        raise FrameError(f"{path} is truncated: it ends after {len(data)} bytes without its end marker")
+        raise FrameError(f"{name} is truncated: it ends after {len(data)} bytes without its end marker")
     position = len(JPEG_START)
     while position + 9 <= len(data) and data[position] == 0xFF and data[position + 1] != JPEG_SCAN:
         marker, length = struct.unpack_from(">xBH", data, position)
@@ -63,4 +63,4 @@ def _jpeg_size(path: Path, data: bytes) -> tuple[int, int]:
             height, width = struct.unpack_from(">HH", data, position + 5)
             return width, height
         position += 1 if marker == 0xFF else 2 + length  # 0xFF before a marker only fills
-    raise FrameError(f"{path}, byte {position}: the file is damaged: its picture's size should be told before this")
+    raise FrameError(f"{name}, byte {position}: the file is damaged: its picture's size should be told before this")

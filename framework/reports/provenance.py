@@ -17,8 +17,9 @@ import framework
 PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
-    *("hydra", "debug", "ahead", "detection_cache", "detection_cache_dir"),
-    *("row", "rows", "resume", "table", "figure"),  # of an experiment: what its runs are compared for
+    *("hydra", "debug", "resume", "ahead", "detection_cache", "detection_cache_dir"),
+    "threads",  # but for networks' last digits: a sweep goes on with another number of jobs at once
+    *("row", "rows", "table", "figure"),  # of an experiment: what its runs are compared for
 )
 """Keys of the config that change no result."""
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.errors import ConfigError
-from framework.label_spaces import _MEANINGS, _SECTIONS, COCO, SCENENN_TO_COCO, SPACES, read_labels, to_coco
+from framework.label_spaces import _SECTIONS, COCO, MEANINGS, SCENENN_TO_COCO, SPACES, read_labels, to_coco
 
 
 @pytest.mark.parametrize(
@@ -15,13 +15,15 @@ from framework.label_spaces import _MEANINGS, _SECTIONS, COCO, SCENENN_TO_COCO, 
         ("scenenn", 9, "bed", "bag"),
         ("ade20k", 150, "wall", "flag"),
         ("coco_panoptic", 133, "person", "rug-merged"),
+        ("scannet20", 20, "wall", "otherfurniture"),
+        ("scannet200", 200, "wall", "mattress"),
     ],
 )
 def test_every_space_is_complete(space, size, first, last):
     names = read_labels(space)
     assert len(set(names)) == len(names) == size
     assert (names[0], names[-1]) == (first, last)
-    assert set(SPACES) == {"coco", "nyu40", "scenenn", "ade20k", "coco_panoptic"}
+    assert set(SPACES) == {"coco", "nyu40", "scenenn", "ade20k", "coco_panoptic", "scannet20", "scannet200"}
 
 
 def test_orders_are_those_of_the_published_lists():
@@ -30,12 +32,15 @@ def test_orders_are_those_of_the_published_lists():
     assert [ade.index(name) for name in ("bed", "chair", "sofa", "toilet", "crt screen")] == [7, 19, 23, 65, 141]
     assert read_labels("coco_panoptic")[:81] == (*COCO, "banner")
     assert read_labels("nyu40").index("bag") == 36
+    assert set(read_labels("scannet20")) < set(read_labels("nyu40"))
+    scannet = read_labels("scannet200")
+    assert [scannet.index(name) for name in ("floor", "couch", "paper towel dispenser", "object")] == [2, 5, 71, 172]
 
 
 def test_a_name_means_the_same_in_every_section_and_only_what_coco_has():
     for section, names in _SECTIONS.items():
         for name, coco in names.items():
-            assert _MEANINGS[name] == coco, f"{section}: {name}"
+            assert MEANINGS[name] == coco, f"{section}: {name}"
             assert name == name.strip().lower()
             assert "," not in name
             assert coco is None or coco in COCO

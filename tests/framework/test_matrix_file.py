@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from framework.data import Camera
 from framework.errors import DataError
-from framework.matrix_file import read_matrix, read_matrix_lines
+from framework.matrix_file import PrintedMatrix, read_matrix, read_matrix_lines
 
 QUARTER_TURN = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
 ROWS = "0 -1 0 1\n1 0 0 2\n0 0 1 3\n0 0 0 1\n"
@@ -48,3 +49,16 @@ def test_files_that_are_no_text(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="could not be read as text"):
         read_matrix(tmp_path / "binary.txt")
     assert read_matrix_lines(Path("/dev/null")) == []
+
+
+def test_intrinsics_are_a_pinhole_camera_or_refused_with_their_place() -> None:
+    K = np.array([[585.0, 0, 320, 0], [0, 580, 240, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    assert PrintedMatrix("here", K).camera(640, 480) == Camera(640, 480, 585, 580, 320, 240)
+    for row, column, value in ((0, 1, 0.1), (2, 0, 1), (2, 2, 2), (0, 0, np.nan), (3, 3, 0)):
+        wrong = K.copy()
+        wrong[row, column] = value
+        with pytest.raises(DataError, match=r"^here: expected intrinsics"):
+            PrintedMatrix("here", wrong).camera(640, 480)
+    K[0, 0] = -585
+    with pytest.raises(DataError, match=r"^here: Camera: fx, fy must be positive"):
+        PrintedMatrix("here", K).camera(640, 480)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import sys
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,13 @@ from omegaconf import OmegaConf
 from PIL import Image
 
 from framework import figures
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.reports import map_figure
 from framework.reports.figure_choice import FigureChoice
 from framework.reports.figures import DRAWN, Pictured, write_figure
 from framework.reports.mesh_file import write_mesh
 from framework.reports.provenance import config_hash
+from framework.sweep import sweep_in
 from framework.trajectory_file import write_tum
 from tests.boxes_room import furnished, walk
 
@@ -216,13 +218,13 @@ def test_the_command(maps: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest
     assert said.err.splitlines()[-1] == f"error: {maps / 'nowhere'} is not a folder with records of runs"
 
 
-def test_the_end_of_a_sweep_draws_only_what_is_asked_for(maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(figures.WriteFigures, "failed", False)
-    callback = figures.WriteFigures()
-    callback.on_multirun_end(OmegaConf.create({"figure": None, "hydra": {"sweep": {"dir": str(maps)}}}))
-    assert not list(maps.glob("figure.*"))
-    callback.on_multirun_end(OmegaConf.create({"figure": {}, "hydra": {"sweep": {"dir": str(maps)}}}))
-    assert len(list(maps.glob("figure.*"))) == 2
-    assert not figures.WriteFigures.failed
-    callback.on_multirun_end(OmegaConf.create({"figure": {}, "hydra": {"sweep": {"dir": str(maps / "nowhere")}}}))
-    assert figures.WriteFigures.failed
+@pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])
+def test_a_sweep_ends_with_the_picture_but_for_ctrl_c(
+    maps: Path, error: BaseException | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # what a sweep changes for its process
+    monkeypatch.setenv("PYTHONWARNINGS", "")
+    with suppress(InstanceMapError, KeyboardInterrupt), sweep_in(maps, with_table=False, with_figure=True):
+        if error is not None:
+            raise error
+    assert len(list(maps.glob("figure.*"))) == (0 if isinstance(error, KeyboardInterrupt) else 2)

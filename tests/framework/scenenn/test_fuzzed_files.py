@@ -5,10 +5,8 @@
 
 from __future__ import annotations
 
-import os
 import re
 import struct
-import time
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -20,17 +18,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from framework.datasets.image_files import read_color, read_uint16
-from framework.errors import DataError
 from framework.ply import read_ply
 from framework.scenenn.annotation import read_annotation
 from framework.scenenn.intrinsics import read_intrinsics
 from framework.scenenn.trajectory_log import read_trajectory_log
+from tests.damaged_files import EXAMPLES, check, damaged
 
-EXAMPLES = int(os.environ.get("INSTANCEMAP_FUZZ", "60"))
-SLOWEST = 2.0  # s, for files of at most some 100 KB on a busy machine
-NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
-ODD_NUMBERS = (b"0", b"-1", b"3", b"65536", b"2147483648", b"4294967295", b"1" * 20, b"1" * 5000, b"1e400", b"-0.5")
-NO_NUMBERS = (b"nan", b"-inf", b"1_0", b"0x1p3", b"x", b"", b"\xff", b"\x00", b"1 1", b"\n")
 PLACE = re.compile(r"(line|byte) \d+")
 
 PLY_HEADER = b"""ply
@@ -129,51 +122,6 @@ FORMATS: dict[str, tuple[Callable[[Path], object], bytes, tuple[bytes, ...]]] = 
     "color.jpg": (read_color, cv2.imencode(".jpg", COLOR)[1].tobytes(), (b"\xff\xd9", b"\xff\xc0", b"\xff\xda")),
     "depth.png": (read_uint16, png(COLOR[..., 0].astype(np.uint16) * 20), (b"IHDR",)),
 }
-
-
-@st.composite
-def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes:
-    """`content` with one to four things done to it that disks, transfers, editors and attackers do."""
-    for _ in range(draw(st.integers(1, 4))):
-        first = draw(st.integers(0, max(len(content) - 1, 0)))
-        last = first + draw(st.integers(0, 30))
-        match draw(st.sampled_from(("flip", "delete", "insert", "repeat", "cut", "number", "token"))):
-            case "flip":
-                flipped = bytes(b ^ draw(st.integers(1, 255)) for b in content[first : first + 1])
-                content = content[:first] + flipped + content[first + 1 :]
-            case "delete":
-                content = content[:first] + content[last:]
-            case "insert":
-                content = content[:first] + draw(st.binary(max_size=20)) + content[first:]
-            case "repeat":
-                content = content[:last] + content[first:last] * draw(st.integers(1, 3)) + content[last:]
-            case "cut":
-                content = content[:first]
-            case "token":
-                content = content[:first] + draw(st.sampled_from(tokens)) + content[first:]
-            case "number":
-                numbers = list(NUMBER.finditer(content))
-                if numbers:
-                    start, end = draw(st.sampled_from(numbers)).span()
-                    content = content[:start] + draw(st.sampled_from(ODD_NUMBERS + NO_NUMBERS)) + content[end:]
-    return content
-
-
-def check(read: Callable[[Path], object], path: Path, content: bytes) -> str:
-    """Reads the file; "" or the error's line. Fails for everything else that can happen."""
-    path.write_bytes(content)
-    began = time.perf_counter()
-    try:
-        read(path)
-    except DataError as error:
-        line = str(error)
-    else:
-        line = ""
-    assert time.perf_counter() - began < SLOWEST
-    assert line.isprintable(), line
-    assert len(line) < 400 + len(str(path)), line
-    assert not line or str(path) in line
-    return line
 
 
 @pytest.mark.parametrize("name", FORMATS)

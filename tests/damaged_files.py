@@ -1,0 +1,64 @@
+"""What happens to files, for tests that a reader takes it or says in one line what is wrong."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from hypothesis import strategies as st
+
+from framework.errors import DataError
+
+EXAMPLES = int(os.environ.get("INSTANCEMAP_FUZZ", "60"))
+SLOWEST = 2.0  # s, for files of at most some 100 KB on a busy machine
+NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
+ODD_NUMBERS = (b"0", b"-1", b"3", b"65536", b"2147483648", b"4294967295", b"1" * 20, b"1" * 5000, b"1e400", b"-0.5")
+NO_NUMBERS = (b"nan", b"-inf", b"1_0", b"0x1p3", b"x", b"", b"\xff", b"\x00", b"1 1", b"\n")
+
+
+@st.composite
+def damaged(draw: st.DrawFn, content: bytes, tokens: tuple[bytes, ...]) -> bytes:
+    """`content` with one to four things done to it that disks, transfers, editors and attackers do."""
+    for _ in range(draw(st.integers(1, 4))):
+        first = draw(st.integers(0, max(len(content) - 1, 0)))
+        last = first + draw(st.integers(0, 30))
+        match draw(st.sampled_from(("flip", "delete", "insert", "repeat", "cut", "number", "token"))):
+            case "flip":
+                flipped = bytes(b ^ draw(st.integers(1, 255)) for b in content[first : first + 1])
+                content = content[:first] + flipped + content[first + 1 :]
+            case "delete":
+                content = content[:first] + content[last:]
+            case "insert":
+                content = content[:first] + draw(st.binary(max_size=20)) + content[first:]
+            case "repeat":
+                content = content[:last] + content[first:last] * draw(st.integers(1, 3)) + content[last:]
+            case "cut":
+                content = content[:first]
+            case "token":
+                content = content[:first] + draw(st.sampled_from(tokens)) + content[first:]
+            case "number":
+                numbers = list(NUMBER.finditer(content))
+                if numbers:
+                    start, end = draw(st.sampled_from(numbers)).span()
+                    content = content[:start] + draw(st.sampled_from(ODD_NUMBERS + NO_NUMBERS)) + content[end:]
+    return content
+
+
+def check(read: Callable[[Path], object], path: Path, content: bytes) -> str:
+    """Reads the file; "" or the error's line. Fails for everything else that can happen."""
+    path.write_bytes(content)
+    began = time.perf_counter()
+    try:
+        read(path)
+    except DataError as error:
+        line = str(error)
+    else:
+        line = ""
+    assert time.perf_counter() - began < SLOWEST
+    assert line.isprintable(), line
+    assert len(line) < 400 + len(str(path)), line
+    assert not line or str(path) in line
+    return line
