@@ -14,6 +14,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.errors import ConfigError
 from framework.reports.comparison import TableChoice
+from framework.reports.figure_choice import FigureChoice
 
 Choices = Mapping[str, str | None]
 
@@ -24,13 +25,16 @@ OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(by_name), rep
 def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, Choices]:
     """A job's config and choices by group, with the overrides of the experiment's row that the job is for.
 
-    Raises ConfigError for a row that the experiment does not have, and for a `table` that could not be made afterwards.
+    Raises ConfigError for a row that the experiment does not have, and for a `table` or a `figure` that could not
+    be made afterwards.
     """
     choices: Choices = dict(hydra_config.runtime.choices)
     rows = config.get("rows")
     if not rows:
         return config, choices
     TableChoice.of(config.table)
+    if config.get("figure") is not None:
+        FigureChoice.of(config.figure)
     if config.row not in rows:
         raise ConfigError(f"there is no row={config.row}; the experiment has {', '.join(map(str, rows))}")
     overrides = [*hydra_config.overrides.task, *rows[config.row]]

@@ -35,20 +35,20 @@ class SweepCallback(Callback):
     """How Hydra says that a sweep begins, and where. It calls this in the process that was started, not in workers."""
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        with_figure = config.get("figure") is not None
         try:
-            ending.enter_context(sweep_in(Path(config.hydra.sweep.dir), with_table="table" in config))
+            ending.enter_context(sweep_in(Path(config.hydra.sweep.dir), "table" in config, with_figure))
         except (InstanceMapError, OSError) as error:  # Hydra would make a warning of it, and go on
             sys.exit(f"error: {one_line(error)}")
 
 
 @contextmanager
-def sweep_in(directory: Path, with_table: bool) -> Iterator[None]:
+def sweep_in(directory: Path, with_table: bool, with_figure: bool) -> Iterator[None]:
     """Has `directory` to itself while the body runs, and prints the table of the runs in it however the body ends.
 
-    Raises InstanceMapError, in place of what the launchers raise when a worker is killed.
+    The picture of the runs is drawn, too, but for Ctrl-C, which shall end at once. Raises InstanceMapError, in place of
+    what the launchers raise when a worker is killed.
     """
-    from framework.reports.tables import write_tables  # here: workers import this module, and make no tables
-
     # `kill` ends a sweep like Ctrl-C: no worker is left behind
     signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     # joblib ends its workers without their help, and Python's own clean-up warns of that
@@ -57,17 +57,27 @@ def sweep_in(directory: Path, with_table: bool) -> Iterator[None]:
         try:
             yield
         except BaseException as error:
-            if with_table:
-                with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
-                    print(write_tables(directory))
+            with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
+                _report(directory, with_table, with_figure and isinstance(error, Exception))
             if _is_of_a_launcher(error):
                 told = textwrap.shorten(one_line(error), 300)
                 raise InstanceMapError(
                     f"the sweep ended early, and the same command goes on with it: {told}"
                 ) from error
             raise
-        if with_table:
-            print(write_tables(directory))
+        _report(directory, with_table, with_figure)
+
+
+def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
+    """Makes of the runs in `directory` what is asked for, here and not where workers import this module."""
+    if with_table:
+        from framework.reports.tables import write_tables
+
+        print(write_tables(directory))
+    if with_figure:
+        from framework.reports.figures import write_figure
+
+        print(*write_figure(directory), sep="\n")
 
 
 def _is_of_a_launcher(error: BaseException) -> bool:

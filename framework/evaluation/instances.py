@@ -297,13 +297,13 @@ def _paired(
 ) -> tuple[Int32, Int32]:
     """Predicted and true instance ids at the same points, after the transfer."""
     if transfer is Transfer.TO_TRUTH:
-        carried = _carry(predictions.points_world, predictions.instance_ids, truth.points_world, max_distance)
+        carried = carry(predictions.points_world, predictions.instance_ids, truth.points_world, max_distance)
         return carried, truth.instance_ids
-    carried = _carry(truth.points_world, truth.instance_ids, predictions.points_world, max_distance)
+    carried = carry(truth.points_world, truth.instance_ids, predictions.points_world, max_distance)
     return predictions.instance_ids, carried
 
 
-def _carry(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
+def carry(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
     """The label of the nearest of `points` for each target, 0 where none is within `max_distance`."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)

@@ -20,7 +20,7 @@ from framework.reports.drawing import (
     font_of,
     rgb_of,
 )
-from framework.reports.overview import INK, PAPER
+from framework.reports.palette import INK, PAPER
 
 HEIGHT_MAX = 660  # px
 STRIPE_PX = 5  # of the hatching

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from framework.data import Array, UInt8
-from framework.reports.overview import INK, PAPER
+from framework.reports.palette import INK, PAPER
 
 WIDTH, MARGIN, GAP = 1640, 20, 16  # px, of the whole picture
 PANEL_WIDTH = (WIDTH - 2 * MARGIN - GAP) // 2

@@ -3,29 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import matplotlib as mpl
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from framework.atomic_files import written_whole
-from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32, UInt8
-from framework.geometry import inverse, project, transform
-from framework.reports.palette import instance_colors
-from framework.reports.surface import FrontSides, Hits, Surface
+from framework.data import Float64, InstanceMesh, Int32, UInt8
+from framework.reports.camera_path import CameraPath
+from framework.reports.lit_view import LitView
+from framework.reports.palette import FAINT_INK, INK, PAPER, instance_colors
+from framework.reports.surface import Surface
 from framework.reports.viewpoint import best_view
 
 PANEL_WIDTH, PANEL_HEIGHT = 960, 760  # px
-SUPERSAMPLING = 2  # rays per pixel in either direction
 TITLE_HEIGHT = 56  # px
 LEGEND_ROW = 30  # px
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
-NOTHING = (229, 232, 236)  # where nothing was mapped: a shade off the paper, as mapped things may be white
-PAPER, INK, FAINT_INK = (250, 250, 248), (32, 36, 42), (120, 126, 134)
-PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
 LABEL_MOVES_PIXELS = 1500  # the name of an object that shows less stays on it or is left out
 LABEL_MIN_PIXELS = 250  # an object that shows less gets no name in the picture, only in the legend
@@ -65,96 +60,14 @@ def _panels(
 ) -> UInt8:
     surface = Surface.seen_from(mesh.vertices, mesh.triangles, poses)
     camera, T_world_camera = best_view(surface, ids, poses, PANEL_WIDTH, PANEL_HEIGHT)
-    sides = FrontSides(surface, T_world_camera[:3, 3])
-    fine = sides.seen_by(camera.scaled(SUPERSAMPLING), T_world_camera[:3, :3])
-    coarse = fine.every(SUPERSAMPLING)
-    normals = _normals_seen(fine, surface.vertex_normals(), T_world_camera)
-    openness = sides.openness(coarse, normals[::SUPERSAMPLING, ::SUPERSAMPLING])
-    light = _lighting(normals, T_world_camera) * cv2.resize(openness, fine.depth.shape[::-1])
-
-    color = fine.interpolated(mesh.colors.astype(np.float32))
-    instance_image = fine.nearest(ids)
-    palette = np.zeros((max([0, *colors]) + 1, 3), np.float32)
-    for key, rgb in colors.items():
-        palette[key] = rgb
-    gray = color.mean(axis=2, keepdims=True)
-    background = 0.22 * gray + 178.0  # pale, so that the instances stand out
-    painted = palette[instance_image] * (0.84 + 0.16 * gray / 140.0)  # some texture shows through
-    labeled = np.where(instance_image[..., None] > 0, painted, background)
-    labeled[_borders(instance_image)] *= 0.45
-
-    route = _Route.of(poses, camera, T_world_camera, coarse)
-    left = Image.fromarray(_developed(color * 1.08, light, fine))
-    right = Image.fromarray(_developed(labeled, light, fine))
-    route.draw(left)
-    route.draw(right)
-    _draw_names(right, coarse.nearest(ids), names)
+    view = LitView(surface, camera, T_world_camera)
+    path = CameraPath.of(poses, camera, T_world_camera, view.hits)
+    left = Image.fromarray(view.in_colors(mesh.colors))
+    right = Image.fromarray(view.in_instances(mesh.colors, ids, colors))
+    path.draw(left)
+    path.draw(right)
+    _draw_names(right, view.hits.nearest(ids), names)
     return np.concatenate([np.asarray(left), np.asarray(right)], axis=1)
-
-
-def _normals_seen(hits: Hits, vertex_normals: Float32, T_world_camera: Float64) -> Float32:
-    """(H, W, 3) smooth normals, turned towards the camera."""
-    normals = hits.interpolated(vertex_normals)
-    normals /= np.maximum(np.linalg.norm(normals, axis=2, keepdims=True), 1e-12)
-    towards = T_world_camera[:3, 3].astype(np.float32) - hits.points_world
-    away = (normals * towards).sum(axis=2, keepdims=True) < 0
-    return np.asarray(np.where(away, -normals, normals), np.float32)
-
-
-def _lighting(normals: Float32, T_world_camera: Float64) -> Float32:
-    """(H, W) brightness: a soft lamp over the viewer's left shoulder."""
-    lamp = T_world_camera[:3, :3] @ np.array([-0.45, -0.75, -0.6])
-    lamp /= np.linalg.norm(lamp)
-    return np.asarray(0.70 + 0.34 * np.clip(normals @ lamp.astype(np.float32), 0, 1), np.float32)
-
-
-def _borders(ids: Int32) -> Bool:
-    """(H, W) where an instance meets another one or the background."""
-    edge = np.zeros(ids.shape, np.bool_)
-    across, down = ids[:, 1:] != ids[:, :-1], ids[1:] != ids[:-1]
-    edge[:, 1:] |= across
-    edge[:, :-1] |= across
-    edge[1:] |= down
-    edge[:-1] |= down
-    return edge
-
-
-def _developed(color: Float32, light: Float32, hits: Hits) -> UInt8:
-    """The lit picture on paper, (H, W, 3), scaled down to the panel."""
-    lit = np.where(hits.seen[..., None], np.clip(color * light[..., None], 0, 255), np.array(NOTHING, np.float32))
-    panel = cv2.resize(lit.astype(np.float32), (PANEL_WIDTH, PANEL_HEIGHT), interpolation=cv2.INTER_AREA)
-    return np.asarray(panel, np.uint8)
-
-
-@dataclass(frozen=True)
-class _Route:
-    """The way of the camera, as seen in the picture."""
-
-    pixels: Float64  # (F, 2) u v
-    hidden: Bool  # (F,) behind the surface
-
-    @classmethod
-    def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> _Route:
-        positions = poses[:, :3, 3]
-        points = transform(inverse(T_world_camera), positions)
-        points = points[points[:, 2] > 0.05]
-        pixels = project(camera, points)
-        u, v = np.rint(pixels).astype(int).T
-        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        depth = np.zeros(len(points))
-        depth[inside] = hits.depth[v[inside], u[inside]]
-        return cls(np.asarray(pixels, np.float64), (depth > 0) & (depth < points[:, 2]))
-
-    def draw(self, image: Image.Image) -> None:
-        """Blue at its beginning, orange at its end; thin where something stands before it."""
-        canvas = ImageDraw.Draw(image)
-        share = np.linspace(0, 1, max(2, len(self.pixels)))[:, None]
-        shades = np.rint((1 - share) * np.array(PATH_START) + share * np.array(PATH_END)).astype(int)
-        points = [tuple(pixel) for pixel in self.pixels.tolist()]
-        for k in range(len(points) - 1):  # segments of a line, not pixels
-            canvas.line((points[k], points[k + 1]), tuple(shades[k].tolist()), width=1 if self.hidden[k] else 3)
-        for (u, v), color in zip(points[:1] + points[-1:], (PATH_START, PATH_END), strict=False):
-            canvas.ellipse((u - 6, v - 6, u + 6, v + 6), fill=color, outline=PAPER, width=2)
 
 
 def _draw_names(image: Image.Image, ids: Int32, names: Mapping[int, str]) -> None:

@@ -25,7 +25,7 @@ from framework.reports.drawing import (
     rgb_of,
     shortened,
 )
-from framework.reports.overview import FAINT_INK, INK, PAPER
+from framework.reports.palette import FAINT_INK, INK, PAPER
 from framework.reports.side_view import SideView, side_panel
 
 TITLE_HEIGHT, FIGURES_HEIGHT, ROW_HEIGHT = 52, 46, 30  # px

@@ -21,7 +21,8 @@ from framework.reports.drawing import (
     draw_heading,
     font_of,
 )
-from framework.reports.overview import FAINT_INK, INK, NOTHING, PAPER
+from framework.reports.lit_view import NOTHING
+from framework.reports.palette import FAINT_INK, INK, PAPER
 from framework.reports.point_cloud import orthographic, shading, splat
 from framework.reports.surface import Surface
 from framework.reports.viewpoint import looking, upward

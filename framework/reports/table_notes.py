@@ -25,7 +25,7 @@ def notes(comparison: Comparison) -> Iterator[str]:
     yield from _protocol(comparison)
     yield from _published(comparison)
     yield f"Code: {counted(record.commit for record in comparison.records)}."
-    yield f"Machine: {counted(_machine(record) for record in comparison.records)}."
+    yield f"Machine: {counted(machine(record) for record in comparison.records)}."
     yield f"Config: config.yaml beside each run; SHA-256 of all their hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
 
@@ -122,7 +122,8 @@ def _same(records: Sequence[Record]) -> str:
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
 
-def _machine(record: Record) -> str:
+def machine(record: Record) -> str:
+    """The cores, and how many threads they were given."""
     cores = f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
     threads = record.config.get("threads")
     return f"{cores}, threads={threads}" if threads else cores

@@ -68,6 +68,8 @@ def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path)
     assert "Not complete: row=broken,seed=3: failed: dataset" in text
     assert "half: refiner=identity dataset.frames=4" in text
     assert (out / "table.tex").read_text().count("\\begin{tabular}") == 2
+    assert {path.name for path in out.glob("figure.*")} == {"figure.png", "figure.pdf"}
+    assert "not in the picture: row=broken,seed=1: failed: " in first.stdout
     config = OmegaConf.load(out / "row=half,seed=3" / "config.yaml")
     assert (config.row, config.seed, config.dataset.frames) == ("half", 3, 4)
     assert config.refiner._target_ == "plugins.refiners.identity.Identity"
@@ -151,6 +153,11 @@ def test_the_command_line_wins_over_the_experiment() -> None:
     assert config.tracker._target_ == "plugins.trackers.voxel_hashing_icp.VoxelHashingIcp"
 
 
+def test_a_picture_that_cannot_be_drawn_is_told_before_anything_runs() -> None:
+    with pytest.raises(ConfigError, match=r"figure\.kind must be one of"):
+        composed(["experiment=figure4_progress", "row=whole", "figure.kind=pie"])
+
+
 def test_a_row_that_is_not_there_is_told() -> None:
     with pytest.raises(ConfigError, match="there is no row=chian; the experiment has chain, identity"):
         composed(["experiment=ablation_refiner", "row=chian"])
@@ -164,5 +171,5 @@ def test_a_run_without_experiment_is_left_alone() -> None:
 
 
 def test_what_an_experiment_compares_its_runs_for_changes_no_result() -> None:
-    told = {"row": "a", "rows": {"a": []}, "resume": True, "table": {"over": ["seed"]}}
+    told = {"row": "a", "rows": {"a": []}, "resume": True, "table": {"over": ["seed"]}, "figure": {"zoom": True}}
     assert config_hash({"seed": 1}) == config_hash({"seed": 1} | told)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import open3d as o3d
 import pytest
 from PIL import Image
 
@@ -15,44 +14,11 @@ from framework.reports import overview
 from framework.reports.palette import instance_colors
 from framework.reports.surface import FrontSides, Surface
 from framework.reports.viewpoint import best_view, fitted, looking, upward
+from tests.boxes_room import Z_UP, furnished, walk
 
 RNG = np.random.default_rng(0)
-Z_UP = np.eye(3)
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
-Triangles = tuple[np.ndarray, np.ndarray]
-
-
-def box(
-    center: tuple[float, ...], extent: tuple[float, ...], inside_out: bool = False
-) -> tuple[np.ndarray, np.ndarray]:
-    made = o3d.geometry.TriangleMesh.create_box(*extent).subdivide_midpoint(4)
-    triangles = np.asarray(made.triangles)
-    return np.asarray(made.vertices) - np.array(extent) / 2 + center, triangles[:, ::-1] if inside_out else triangles
-
-
-def furnished(R: np.ndarray = Z_UP) -> InstanceMesh:
-    """A 4 x 3 x 2.5 m room seen from inside, with a red box (1) and a blue one (2); R turns the world."""
-    parts = [box((0, 0, 1.25), (4, 3, 2.5), True), box((-1, 0, 0.4), (0.8,) * 3), box((1, 0.3, 0.4), (0.8,) * 3)]
-    offsets = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
-    ids = np.repeat([0, 1, 2], [len(vertices) for vertices, _ in parts]).astype(np.int32)
-    return InstanceMesh(
-        vertices=(np.concatenate([vertices for vertices, _ in parts]) @ R.T).astype(np.float32),
-        triangles=np.concatenate([t + o for (_, t), o in zip(parts, offsets, strict=False)]).astype(np.int32),
-        colors=np.array([[180, 180, 180], [220, 30, 30], [30, 30, 220]], np.uint8)[ids],
-        instance_ids=ids,
-        class_ids=ids - 1,
-        classes=("chair", "couch"),
-    )
-
-
-def walk(R: np.ndarray = Z_UP, n: int = 20) -> np.ndarray:
-    """Cameras at eye height that look about the room and a little down."""
-    poses = np.tile(np.eye(4), (n, 1, 1))
-    for pose, angle in zip(poses, np.linspace(0, 2 * np.pi, n, endpoint=False), strict=True):
-        pose[:3, :3] = R @ looking(np.array([np.cos(angle), np.sin(angle), -0.4]), np.array([0.0, 0, 1]))
-        pose[:3, 3] = R @ [0.3 * np.cos(angle), 0.3 * np.sin(angle), 1.5]
-    return poses
 
 
 @pytest.mark.parametrize("R", [Z_UP, Y_UP, Y_DOWN], ids=["z-up", "y-up", "y-down"])
