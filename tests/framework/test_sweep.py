@@ -46,7 +46,11 @@ def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablati
 
 
 def end(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
-    out, errors = process.communicate(timeout=PATIENCE_S)
+    try:
+        out, errors = process.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
     return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
 
 
@@ -98,7 +102,7 @@ def test_another_launcher_goes_on_where_the_first_ended(
 ) -> None:
     directory, _ = whole
     before = recorded(directory)
-    again = end(begin(directory, "row=half", "seed=1,2,3"))
+    again = end(begin(directory, "row=half", "seed=1,2,3", "threads=2"))
     assert again.returncode == 0, again.stderr
     assert again.stderr.count("kept: the complete record in") == 3
     assert recorded(directory) == before
