@@ -157,7 +157,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
 
 def _nyu_class(label: Annotated | None) -> str:
-    """ "" where nobody could name it."""
+    """Empty where nobody could name it."""
     if label is None or not label.text.strip():
         return ""
     name = label.nyu_class.strip().lower()

@@ -10,11 +10,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
 from framework.command_line import CONF
 from framework.errors import ConfigError, DataError
+from framework.parameters import checked_block
 from framework.reports.published import NOTHING_PUBLISHED, Published, read_published
 from framework.reports.records import Incomplete, Record, find_records, read_yaml
 from framework.reports.rows import Row, Run, natural, rows_of
@@ -74,16 +72,7 @@ class TableChoice:
     @classmethod
     def of(cls, node: Any) -> TableChoice:
         """The choice that a config's `table` describes. Raises ConfigError for keys and types that it does not have."""
-        if not isinstance(node, Mapping):
-            raise ConfigError(f"table must have keys and values, found {node!r}")
-        try:
-            checked = OmegaConf.merge(OmegaConf.structured(cls), OmegaConf.create(dict(node)))
-        except OmegaConfBaseException as error:
-            first_line = str(error).partition("\n")[0]
-            raise ConfigError(f"table: {first_line}") from error
-        content = OmegaConf.to_container(checked)
-        assert isinstance(content, dict)
-        return cls(**{str(key): value for key, value in content.items()})
+        return cls(**checked_block(cls, "table", node))
 
 
 @dataclass(frozen=True)

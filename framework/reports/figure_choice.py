@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from omegaconf import OmegaConf
-from omegaconf.errors import OmegaConfBaseException
-
 from framework.errors import ConfigError
+from framework.parameters import checked_block
 from framework.reports.rows import Row
 
 KINDS = ("stage_times", "maps")
@@ -37,14 +34,7 @@ class FigureChoice:
     @classmethod
     def of(cls, node: Any) -> FigureChoice:
         """What a config's `figure` describes. Raises ConfigError for keys and types that it does not have."""
-        if not isinstance(node, Mapping):
-            raise ConfigError(f"figure must have keys and values, found {node!r}")
-        try:
-            checked = OmegaConf.merge(OmegaConf.structured(cls), OmegaConf.create(dict(node)))
-        except OmegaConfBaseException as error:
-            first_line = str(error).partition("\n")[0]
-            raise ConfigError(f"figure: {first_line}") from error
-        return cls(checked.kind, checked.sequences, dict(checked.names), checked.zoom)
+        return cls(**checked_block(cls, "figure", node))
 
     def called(self, row: Row) -> str:
         """What a row is called in the picture."""
