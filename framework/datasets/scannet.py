@@ -23,11 +23,12 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Array, Camera, FrameTruth, SceneTruth
+from framework.data import Array, Camera
 from framework.datasets.color_registration import ColorRegistration, RegisteredImages
 from framework.datasets.image_files import read_color, read_uint16
 from framework.datasets.labeled_mesh import LabeledMesh
-from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
+from framework.datasets.labeled_recording import LabeledRecording, mesh_of
+from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
 from framework.datasets.scannet_annotation import LABEL_TABLE, read_label_table, read_labeled_mesh
 from framework.datasets.sens_file import SensFile, SensFrame, open_sens
 from framework.errors import DataError, FrameError
@@ -44,7 +45,7 @@ log = logging.getLogger(__name__)
 
 
 @dataclass
-class ScanNet(Recording):
+class ScanNet(LabeledRecording):
     """A scan of ScanNet v2, from its `.sens` file where there is one, otherwise from exported images.
 
     Extrinsics between the two cameras are not applied: its authors say that depth is registered to colour already, and
@@ -52,15 +53,14 @@ class ScanNet(Recording):
     labelled mesh, all of it, whatever frames are chosen.
     """
 
-    frame_truth: bool = False  # whether the labelled mesh is rendered into each frame, as some detectors need it
-
     def open(self) -> Contents:
-        self._mesh = self._optional_mesh()
-        if self._mesh is None and self.frame_truth:
+        files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
+        self.mesh = mesh_of(files, self._read_mesh)
+        if self.mesh is None and self.frame_truth:
             raise DataError(
                 f"dataset.frame_truth needs a labelled mesh: {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
             )
-        self.annotation = "ScanNet v2" if self._mesh else ""
+        self.annotation = "ScanNet v2" if self.mesh else ""
         sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
         if len(sens) > 1:
             raise DataError(f"{self.folder} holds {len(sens)} .sens files, {sens[0].name} and others; leave one")
@@ -72,26 +72,10 @@ class ScanNet(Recording):
             return _exported_contents(self.folder)
         raise DataError(f"{self.folder} holds neither {self.name}.sens nor color/; dataset.scene is like scene0000_00")
 
-    def truth_in(self, index: int) -> FrameTruth | None:
-        T_world_camera = self.contents.frames[index].T_world_camera
-        if self._mesh is None or not self.frame_truth or T_world_camera is None:
-            return None
-        return self._mesh.seen_by(self.camera, T_world_camera)
-
-    def scene_truth(self) -> SceneTruth | None:
-        return self._mesh.scene_truth() if self._mesh else None
-
-    def _optional_mesh(self) -> LabeledMesh | None:
-        """The labelled mesh; None, with a word in the log where only some are missing, without all of its files."""
-        mesh, segs, aggregation = paths = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
-        missing = [path for path in paths if not path.exists()]
-        if 0 < len(missing) < len(paths):
-            log.warning("no true instances: %s is missing", missing[0])
-        if missing:
-            return None
+    def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
         tables = [parent / LABEL_TABLE for parent in self.folder.resolve().parents[:2]]
         nyu40 = next((read_label_table(table) for table in tables if table.exists()), {})
-        return read_labeled_mesh(mesh, segs, aggregation, nyu40)
+        return read_labeled_mesh(mesh, segments, objects, nyu40)
 
 
 def _sens_contents(path: Path) -> Contents:

@@ -13,7 +13,6 @@ The images are those that the official play-back, or `python -m framework.conver
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
@@ -21,9 +20,10 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, FrameTruth, SceneTruth
+from framework.data import Camera
 from framework.datasets.labeled_mesh import LabeledMesh
-from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
+from framework.datasets.labeled_recording import LabeledRecording, mesh_of
+from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
 from framework.errors import DataError, FrameError
 from framework.label_spaces import SCENENN_TO_COCO
 from framework.ply import read_ply
@@ -35,8 +35,6 @@ from framework.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
 DEPTH_SCALE = 1000.0  # units a metre
 MOST_ID = np.iinfo(np.int32).max
 
-log = logging.getLogger(__name__)
-
 
 class Sensor(StrEnum):
     """The camera of a recording: SceneNN has a file of intrinsics for each."""
@@ -46,7 +44,7 @@ class Sensor(StrEnum):
 
 
 @dataclass
-class SceneNN(Recording):
+class SceneNN(LabeledRecording):
     """A sequence of SceneNN, or of what `python -m framework.synthesize` writes in its format.
 
     A frame that lacks an image, or a usable pose where there is a trajectory, cannot be used; a recording may have
@@ -55,7 +53,6 @@ class SceneNN(Recording):
 
     sensor: Sensor = Sensor.ASUS  # names the file of intrinsics
     release: str = ""  # of the annotation, for tables: two exist and give other results; "" = what release.txt says
-    frame_truth: bool = False  # whether the labelled mesh is rendered into each frame, as some detectors need it
 
     def open(self) -> Contents:
         number = self.folder.resolve().name
@@ -63,10 +60,10 @@ class SceneNN(Recording):
         depths = numbered_images(self.folder / "depth", (".png",))
         poses = _optional_poses(self.folder / "trajectory.log")
         times = _optional_times(self.folder / "timestamp.txt")
-        self._mesh = _optional_mesh(self.folder / f"{number}.ply", self.folder / f"{number}.xml")
-        if self._mesh is None and self.frame_truth:
+        self.mesh = mesh_of([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
+        if self.mesh is None and self.frame_truth:
             raise DataError(f"dataset.frame_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
-        self.annotation = self.release or _named_release(self.root) if self._mesh else ""
+        self.annotation = self.release or _named_release(self.root) if self.mesh else ""
         # a frame of which one image is missing is there: reading it says which
         frames = [
             _recorded(
@@ -82,15 +79,6 @@ class SceneNN(Recording):
         ]
         ini = self.root / "intrinsic" / f"{self.sensor}.ini"
         return Contents(_camera(ini, images.values()), "the first colour image", DEPTH_SCALE, frames)
-
-    def truth_in(self, index: int) -> FrameTruth | None:
-        T_world_camera = self.contents.frames[index].T_world_camera
-        if self._mesh is None or not self.frame_truth or T_world_camera is None:
-            return None
-        return self._mesh.seen_by(self.camera, T_world_camera)
-
-    def scene_truth(self) -> SceneTruth | None:
-        return self._mesh.scene_truth() if self._mesh else None
 
 
 def _recorded(images: ImageFiles, pose_id: int, poses: TrajectoryLog | None, timestamp: float) -> RecordedFrame:
@@ -122,14 +110,6 @@ def _optional_poses(path: Path) -> TrajectoryLog | None:
 
 def _optional_times(path: Path) -> Mapping[int, float]:
     return read_timestamps(path) if path.exists() else {}
-
-
-def _optional_mesh(mesh: Path, annotation: Path) -> LabeledMesh | None:
-    """The labelled mesh; None, with a word in the log where only one file is missing, without both of its files."""
-    missing = [path for path in (mesh, annotation) if not path.exists()]
-    if len(missing) == 1:
-        log.warning("no true instances: %s is missing", missing[0])
-    return None if missing else read_labeled_mesh(mesh, annotation)
 
 
 def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
