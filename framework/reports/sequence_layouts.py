@@ -1,6 +1,7 @@
 """How a comparison over sequences is laid out: a column for each sequence, or a group of lines for each.
 
-Lines of the same poses stand together, and the highest figure among them is in bold.
+Lines of the same poses stand together, and the highest figure among them is in bold: of those that are means of as many
+runs as the others, as one seed may be luckier than the mean of three.
 """
 
 from __future__ import annotations
@@ -40,10 +41,10 @@ def across_grid(comparison: Comparison) -> Grid:
                 _words(comparison, row),
                 [
                     *(_cell(row, means[row.name], sequence, seeds, places) for sequence in sequences),
-                    _mean_cell(overall[row.name], len(sequences), places),
+                    _mean_cell(overall[row.name], len(sequences), seeds, places),
                 ],
                 row.variant,
-                [*(_value(means[row.name], s) for s in sequences), _comparable(row, rows, overall)],
+                [*(_comparable(row, rows, means, s) for s in sequences), _comparable_mean(row, rows, overall)],
             )
             for row in rows
         ]
@@ -78,7 +79,7 @@ def by_grid(comparison: Comparison) -> Grid:
                 _words(comparison, row),
                 [_cell(row, means[key][row.name], sequence, seeds, places) for key in keys],
                 row.variant,
-                [_value(means[key][row.name], sequence) for key in keys],
+                [_comparable(row, rows, means[key], sequence) for key in keys],
             )
             for row in (rows if sequence in begun else ())
         ] + [
@@ -89,9 +90,9 @@ def by_grid(comparison: Comparison) -> Grid:
     sections["mean"] = [
         _Line(
             _words(comparison, row),
-            [_mean_cell(overall[key][row.name], found_in[key], places) for key in keys],
+            [_mean_cell(overall[key][row.name], found_in[key], seeds, places) for key in keys],
             row.variant,
-            [_comparable(row, rows, overall[key]) for key in keys],
+            [_comparable_mean(row, rows, overall[key]) for key in keys],
         )
         for row in rows
     ] + [
@@ -168,14 +169,19 @@ def _seeds(comparison: Comparison) -> int:
     return len({run[:-1] for row in comparison.rows for run in row.records})
 
 
-def _value(means: Mapping[str, Mean], sequence: str) -> float:
-    return means[sequence].value if sequence in means else math.nan
+def _comparable(row: Row, rows: Sequence[Row], means: Mapping[str, Mapping[str, Mean]], sequence: str) -> float:
+    """A row's mean in a sequence; NaN for that of fewer runs than a row has there that it competes with."""
+    rivals = [means[other.name] for other in rows if other.variant == row.variant]
+    most = max((found[sequence].count for found in rivals if sequence in found), default=0)
+    mean = means[row.name].get(sequence)
+    return mean.value if mean and mean.count == most else math.nan
 
 
-def _comparable(row: Row, rows: Sequence[Row], means: Mapping[str, SequenceMean]) -> float:
-    """A row's mean; NaN for that of fewer sequences than a row has that it competes with."""
-    most = max(means[other.name].count for other in rows if other.variant == row.variant)
-    return means[row.name].value if means[row.name].count == most else math.nan
+def _comparable_mean(row: Row, rows: Sequence[Row], means: Mapping[str, SequenceMean]) -> float:
+    """A row's mean; NaN for that of fewer sequences, or fewer runs of as many, than a row has that it competes with."""
+    most = max((means[other.name].count, means[other.name].runs) for other in rows if other.variant == row.variant)
+    mean = means[row.name]
+    return mean.value if (mean.count, mean.runs) == most else math.nan
 
 
 def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, places: int) -> str:
@@ -188,8 +194,14 @@ def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, places
     return _of(figure(mean.value, mean.deviation, places), mean.count, seeds)
 
 
-def _mean_cell(mean: SequenceMean, expected: int, places: int) -> str:
-    return _of(figure(mean.value, mean.deviation, places), mean.count, expected) if mean.count else NOTHING
+def _mean_cell(mean: SequenceMean, expected: int, seeds: int, places: int) -> str:
+    """Mean ± deviation over seeds; with the number of sequences where some are missing, else of runs where some are."""
+    if not mean.count:
+        return NOTHING
+    text = figure(mean.value, mean.deviation, places)
+    if mean.count == expected and mean.runs < expected * seeds:
+        return f"{text} ({mean.runs} of {expected * seeds} runs)"
+    return _of(text, mean.count, expected)
 
 
 def _of(text: str, count: int, expected: int) -> str:

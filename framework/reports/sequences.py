@@ -15,6 +15,7 @@ class SequenceMean:
     value: float  # NaN = of no sequence
     deviation: float  # sample standard deviation of the seeds' means over these sequences; NaN = of less than two seeds
     count: int  # sequences
+    runs: int  # of all of them
 
 
 def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
@@ -35,7 +36,7 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
     for run, value in values.items():
         seeds.setdefault(run[:-1], []).append(value)
     complete = Mean.of(Mean.of(found).value for found in seeds.values() if len(found) == len(means))
-    return SequenceMean(Mean.of(mean.value for mean in means.values()).value, complete.deviation, len(means))
+    return SequenceMean(Mean.of(mean.value for mean in means.values()).value, complete.deviation, len(means), len(values))
 
 
 def mean_difference(less: Mapping[Run, float]) -> Mean:

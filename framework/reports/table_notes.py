@@ -37,7 +37,7 @@ def _averaging(comparison: Comparison) -> Iterator[str]:
         yield (
             f"Mean ± sample standard deviation over {over}, where there are several. The mean is over the sequences "
             f"({choice.apart}), each of which counts as one; its deviation is over the runs that have all of them. "
-            "In bold: the highest of the same poses. missing: no complete run."
+            "In bold: the highest of the same poses, among means of as many runs. missing: no complete run."
         )
     else:
         yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
