@@ -30,7 +30,8 @@ class TableChoice:
     for each of its values.
     """
 
-    over: list[str] = field(default_factory=lambda: ["seed"])  # keys of the config; averaged over, paired by
+    # keys of the config, averaged over and paired by; runs that agree in the last of them are no independent evidence
+    over: list[str] = field(default_factory=lambda: ["seed"])
     across: str | None = None  # key of the config with a column for each value; None = columns are figures
     by: str | None = None  # key of the config with a group of lines for each value; None = a line is all of a row
     base: str | None = None  # name of the row that the others are compared with; None = the first

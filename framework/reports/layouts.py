@@ -71,14 +71,15 @@ def row_grid(comparison: Comparison) -> Grid:
 def difference_grid(comparison: Comparison) -> Grid:
     """Each row's mean difference to the base with its standard error."""
     compared = comparison.compared
-    mean = mean_difference if comparison.choice.by else (lambda less: Mean.of(less.values()))
-    columns = [_Column([mean(row.less(base, key)) for row, base in compared]) for key in comparison.choice.columns]
+    columns = [
+        _Column([mean_difference(row.less(base, key)) for row, base in compared]) for key in comparison.choice.columns
+    ]
     body = []
     for k, (row, base) in enumerate(compared):
-        pairs = len(set(row.records) & set(base.records))
-        expected = len({run[-1] for run in set(row.records) & set(base.records)}) if comparison.choice.by else pairs
+        pairs = set(row.records) & set(base.records)
+        expected = len({run[-1] for run in pairs})
         cells = [column.cell(k, column.means[k].error, expected, signed=True) for column in columns]
-        body.append([comparison.called(row), str(pairs), *cells])
+        body.append([comparison.called(row), str(len(pairs)), *cells])
     return Grid([f"less {comparison.base_called}", "pairs", *map(head, comparison.choice.columns)], body)
 
 

@@ -88,9 +88,6 @@ class Row:
         own, others = self.values(column), base.values(column)
         return {run: own[run] - others[run] for run in own if run in others}
 
-    def difference(self, base: Row, column: str) -> Mean:
-        return Mean.of(self.less(base, column).values())
-
 
 def rows_of(
     records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None

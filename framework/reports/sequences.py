@@ -36,12 +36,15 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
     for run, value in values.items():
         seeds.setdefault(run[:-1], []).append(value)
     complete = Mean.of(Mean.of(found).value for found in seeds.values() if len(found) == len(means))
-    return SequenceMean(Mean.of(mean.value for mean in means.values()).value, complete.deviation, len(means), len(values))
+    return SequenceMean(
+        Mean.of(mean.value for mean in means.values()).value, complete.deviation, len(means), len(values)
+    )
 
 
 def mean_difference(less: Mapping[Run, float]) -> Mean:
-    """The mean of paired differences, with a standard error over sequences.
+    """The mean of paired differences, with a standard error over sequences: over the last words of runs.
 
-    Seeds are averaged first: several runs of a sequence are no further evidence of what another sequence would show.
+    What is before that is averaged first: several seeds of a sequence are no further evidence of what another sequence
+    would show.
     """
     return Mean.of(mean.value for mean in mean_by_sequence(less).values())

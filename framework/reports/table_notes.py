@@ -44,10 +44,13 @@ def _averaging(comparison: Comparison) -> Iterator[str]:
     if not comparison.has_base:
         yield f"No differences: {comparison.base_name} is no row with a complete run; table.base=ROW names another."
     elif len(comparison.rows) > 1:
-        error = "mean ± standard error over the sequences, of each of which the runs are averaged first"
+        keys = [*choice.over, *filter(None, [choice.apart])]
+        error = "mean ± standard error"
+        if len(keys) > 1:
+            kinds = "the sequences" if choice.apart else f"the values of {keys[-1]}"
+            error += f" over {kinds}, of each of which the runs are averaged first"
         yield (
-            f"Differences are paired by {', '.join(filter(None, (over, choice.apart)))}: "
-            f"{error if choice.apart else 'mean ± standard error'}; "
+            f"Differences are paired by {', '.join(keys)}: {error}; "
             f"* where the {CONFIDENCE:.0%} interval of Student's t is without 0."
         )
         bases = [base for _, base in comparison.compared]

@@ -12,8 +12,8 @@ from framework.atomic_files import written_whole
 from framework.reports.comparison import Comparison
 from framework.reports.grid import Grid, latex_grid, markdown_grid
 from framework.reports.layouts import difference_grid, row_grid
-from framework.reports.rows import Mean
 from framework.reports.sequence_layouts import across_grid, by_grid, difference_across_grid
+from framework.reports.sequences import mean_difference
 from framework.reports.table_notes import counted, digest, notes
 
 
@@ -62,11 +62,8 @@ def grids(comparison: Comparison) -> Iterator[Grid]:
 
 def comma_separated_rows(comparison: Comparison) -> str:
     """One line a row, all digits; empty where nothing is known."""
-    figures: dict[str, Callable[[Mean], float]] = {"mean": lambda m: m.value, "sd": lambda m: m.deviation}
-    figures["n"] = lambda m: m.count
-    paired: dict[str, Callable[[Mean], float]] = {"difference": lambda m: m.value, "se": lambda m: m.error}
-    paired["pairs"] = lambda m: m.count
-    keys = [f"{column}.{name}" for column in comparison.choice.columns for name in (*figures, *paired)]
+    told = ("mean", "sd", "n", "difference", "se", "pairs")
+    keys = [f"{column}.{name}" for column in comparison.choice.columns for name in told]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["row", "runs", "poses", *keys, "code", "config"])
@@ -74,14 +71,13 @@ def comma_separated_rows(comparison: Comparison) -> str:
         line: list[float] = []
         base = row if comparison.base_name in (row.name, row.system) else comparison.base_of(row)
         for column in comparison.choice.columns:
-            line += [figure(row.mean(column)) for figure in figures.values()]
-            difference = row.difference(base, column) if base else Mean.of(())
-            line += [figure(difference) for figure in paired.values()]
+            mean, less = row.mean(column), row.less(base, column) if base else {}
+            difference = mean_difference(less)
+            line += [mean.value, mean.deviation, mean.count, difference.value, difference.error, len(less)]
+        figures = ["" if math.isnan(x) else repr(x) for x in line]
         records = list(row.records.values())
-        told = [counted(record.commit for record in records), digest(records)]
-        writer.writerow(
-            [row.name, len(records), row.pose_source, *("" if math.isnan(x) else repr(x) for x in line), *told]
-        )
+        code = counted(record.commit for record in records)
+        writer.writerow([row.name, len(records), row.pose_source, *figures, code, digest(records)])
     return text.getvalue()
 
 

@@ -22,10 +22,10 @@ TABLE = {"over": ["seed"], "base": "chain", "columns": ["instances.ap50", "stage
 ROWS = {"identity": ["refiner=identity"], "chain": [], "none_yet": ["refiner=none_yet"]}
 
 
-def run(root: Path, row: str, seed: int, ap: float | None, ms: float, **metrics: Any) -> Path:
-    directory = root / f"row={row},seed={seed}"
+def run(root: Path, row: str, seed: int, ap: float | None, ms: float, scene: str = "", **metrics: Any) -> Path:
+    directory = root / f"row={row},seed={seed}{scene}"
     directory.mkdir()
-    config = {"row": row, "seed": seed, "refiner": {"kind": row}}
+    config = {"row": row, "seed": seed, "scene": scene, "refiner": {"kind": row}}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     told = {
         **{"instances.ap50": ap, "stage_ms.refine.median": ms, "pose_source": "ground_truth", "choice.fuser": "f"},
@@ -73,6 +73,23 @@ def test_every_figure_by_hand(sweep: Path) -> None:
     assert float(first["instances.ap50.difference"]) == pytest.approx(-0.3)
     assert float(first["instances.ap50.se"]) == pytest.approx(0.1 / 3**0.5)
     assert first["instances.ap50.pairs"] == "3"
+
+
+def test_seeds_of_a_scene_are_no_independent_evidence(tmp_path: Path) -> None:
+    """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, whatever the number of seeds."""
+    table = {"over": ["seed", "scene"], "columns": ["instances.ap50"]}
+    (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": {"chain": [], "other": []}}))
+    for row, scene, ap in (("chain", "a", 0.5), ("chain", "b", 0.5), ("other", "a", 0.8), ("other", "b", 0.6)):
+        for seed in range(3):
+            run(tmp_path, row, seed, ap, 1.0, scene=scene)
+    text = write_tables(tmp_path)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # over six runs, it would be 0.045 and called significant
+    assert "paired by seed, scene: mean ± standard error over the values of scene, of each of which the runs" in text
+    with (tmp_path / "table.csv").open() as file:
+        _, other = csv.DictReader(file)
+    assert float(other["instances.ap50.se"]) == pytest.approx(0.1)
+    assert other["instances.ap50.pairs"] == "6"
 
 
 def test_what_is_missing_is_said(sweep: Path) -> None:
