@@ -98,7 +98,10 @@ def _published(comparison: Comparison) -> Iterator[str]:
 
 
 def _missing(comparison: Comparison) -> Iterator[str]:
-    """The rows, sequences and runs of which there is no record, and those that did not end well."""
+    """The figures, rows, sequences and runs of which there is no record, and the runs that did not end well."""
+    keys_told = {key for record in comparison.records for key in record.metrics}
+    if absent := [key for key in comparison.choice.columns if key not in keys_told]:
+        yield f"No run has a figure of this name: {', '.join(absent)}."
     begun = {row.system for row in comparison.rows}
     if absent := [name for name in comparison.overrides if name not in begun]:
         yield f"Without a complete run: {', '.join(absent)}."

@@ -158,7 +158,9 @@ def test_a_split_row_is_compared_with_the_base_of_its_kind(tmp_path: Path) -> No
 
 def test_a_figure_that_nobody_knows_is_a_dash(sweep: Path) -> None:
     (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
-    assert "| identity |    3 |       – | ground_truth |" in write_tables(sweep)
+    text = write_tables(sweep)
+    assert "| identity |    3 |       – | ground_truth |" in text
+    assert "- No run has a figure of this name: no.such." in text, "it may be misspelt"
 
 
 def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
