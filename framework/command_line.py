@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import argparse
 import logging
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -58,6 +60,21 @@ def one_line_errors() -> Iterator[None]:
             traceback.print_exception(error)
         print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
+
+
+def quiet_when_cut_off() -> None:
+    """Lets `| head` end this process without a word."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+
+
+def print_for_directories(command: str, description: str, place: str, write: Callable[[Path], str]) -> None:
+    """The command `command DIR...`: prints what `write` returns for each directory, which is a `place`."""
+    parser = argparse.ArgumentParser(prog=command, description=description)
+    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help=place)
+    asked = parser.parse_args()
+    with one_line_errors():
+        for directory in asked.directory:
+            print(write(directory))
 
 
 @dataclass

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import signal
 import sys
 from collections.abc import Iterator, Sequence
 from itertools import groupby
@@ -12,7 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from framework.command_line import EXIT_FAILED, KNOWN_ERRORS, one_line, one_line_errors
+from framework.command_line import EXIT_FAILED, KNOWN_ERRORS, one_line, one_line_errors, quiet_when_cut_off
 from framework.evaluation.instances import Transfer
 from framework.reports.layouts import head
 from framework.reports.metrics import MAIN_FIGURES
@@ -117,5 +116,5 @@ def _refuse(reason: str) -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it silently
+    quiet_when_cut_off()
     main()

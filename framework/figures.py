@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
-from framework.command_line import one_line_errors
+from framework.command_line import print_for_directories, quiet_when_cut_off
 from framework.reports.figures import write_figure
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m framework.figures",
-        description="Writes figure.png and figure.pdf into DIR, from the records of the experiment's runs below it.",
+    print_for_directories(
+        "python -m framework.figures",
+        "Writes figure.png and figure.pdf into DIR, from the records of the experiment's runs below it.",
+        "where an experiment's runs went",
+        lambda directory: "\n".join(map(str, write_figure(directory))),
     )
-    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help="where an experiment's runs went")
-    asked = parser.parse_args()
-    with one_line_errors():
-        for directory in asked.directory:
-            for path in write_figure(directory):
-                print(path)
 
 
 if __name__ == "__main__":
+    quiet_when_cut_off()
     main()

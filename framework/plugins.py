@@ -10,7 +10,6 @@ import dataclasses
 import importlib.resources
 import inspect
 import re
-import signal
 import textwrap
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -24,7 +23,7 @@ from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from framework.build import STAGES, find_class, plugin_fields
-from framework.command_line import CONF, one_line, one_line_errors
+from framework.command_line import CONF, one_line, one_line_errors, quiet_when_cut_off
 from framework.errors import ConfigError
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -141,5 +140,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it silently
+    quiet_when_cut_off()
     main()

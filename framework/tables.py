@@ -2,26 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
-import signal
-from pathlib import Path
-
-from framework.command_line import one_line_errors
+from framework.command_line import print_for_directories, quiet_when_cut_off
 from framework.reports.tables import write_tables
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m framework.tables",
-        description="Writes table.md, table.tex and table.csv into DIR, from the records of the runs below it.",
+    print_for_directories(
+        "python -m framework.tables",
+        "Writes table.md, table.tex and table.csv into DIR, from the records of the runs below it.",
+        "where a sweep or several runs went",
+        write_tables,
     )
-    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help="where a sweep or several runs went")
-    asked = parser.parse_args()
-    with one_line_errors():
-        for directory in asked.directory:
-            print(write_tables(directory))
 
 
 if __name__ == "__main__":
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # `| head` ends it silently
+    quiet_when_cut_off()
     main()

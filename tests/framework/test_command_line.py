@@ -1,6 +1,13 @@
-"""Names of a sweep's directories."""
+"""Names of a sweep's directories, and how commands end."""
 
 from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
 
 from framework.command_line import directory_name
 
@@ -14,3 +21,14 @@ def test_long_overrides_stay_distinct_and_short() -> None:
     names = [directory_name("dataset.root=" + 300 * "x" + f",seed={seed}") for seed in range(2)]
     assert names[0] != names[1]
     assert all(len(name) <= 200 for name in names)
+
+
+@pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
+def test_a_command_whose_reader_has_gone_ends_without_a_word(command: str) -> None:
+    """As in `python -m framework.tables DIR | head -1`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    arguments = [sys.executable, "-m", f"framework.{command}", "--help"]
+    ended = subprocess.run(arguments, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGPIPE, b"")
