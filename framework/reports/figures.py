@@ -60,9 +60,16 @@ class Pictured:
         """
         if not directory.is_dir():
             raise DataError(f"{directory} is not a folder with records of runs")
+        if not (directory / SWEEP).exists():
+            raise DataError(
+                f"{directory} has no {SWEEP}: pictures are of experiments, like experiment=figure4_progress"
+            )
         sweep = read_yaml(directory / SWEEP)
         if not sweep.get(NAME):
-            raise DataError(f"{directory / SWEEP} has no block `{NAME}:`, which says what to draw")
+            raise DataError(
+                f"{directory / SWEEP} has no block `{NAME}:`, which says what to draw: only some experiments have one, "
+                "like experiment=figure4_progress"
+            )
         choice = FigureChoice.of(sweep[NAME])
         overrides = sweep.get("rows") or {}
         records, incomplete = find_records(directory)

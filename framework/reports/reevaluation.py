@@ -12,6 +12,7 @@ from omegaconf import OmegaConf
 
 from framework.build import build
 from framework.data import SceneTruth
+from framework.directory_lock import locked
 from framework.errors import DataError
 from framework.evaluation.instances import PredictedInstances
 from framework.interfaces import RGBDSequence
@@ -86,14 +87,15 @@ class Reevaluation:
         Raises DataError when the run has begun again meanwhile.
         """
         path = self.record.directory / METRICS
-        try:
-            before = path.stat()
-        except OSError:
-            before = None
-        if before is None or before.st_mtime != self.record.written:
-            raise DataError(f"{path} has changed while it was evaluated: the run has begun again; evaluate it later")
-        write_json(path, self.metrics)
-        os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+        with locked(self.record.directory):  # a run that begins now waits, or it would end up with these figures
+            try:
+                before = path.stat()
+            except OSError:
+                before = None
+            if before is None or before.st_mtime != self.record.written:
+                raise DataError(f"{path} has changed: the run has begun again meanwhile; evaluate it later")
+            write_json(path, self.metrics)
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
 
 
 def read_predictions(record: Record) -> PredictedInstances:

@@ -15,6 +15,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework import evaluate
+from framework.directory_lock import locked
 from framework.reports import reevaluation, run_record
 from framework.reports.provenance import config_hash
 from framework.run import run
@@ -224,7 +225,7 @@ def test_a_run_that_begins_again_meanwhile_is_left_alone(
     monkeypatch.setattr(CornerRoom, "scene_truth", begins_again)
     status, out, err = command(stored)
     assert (status, out) == (1, "")
-    assert "the run has begun again" in err
+    assert "the run has begun again meanwhile" in err
     assert not (stored / "metrics.json").exists()
 
 
@@ -251,3 +252,15 @@ def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
     assert done.stdout == "run: unchanged\n", done.stderr
     assert done.stderr == "refused: absent: there is no run at or below it\n"
     assert done.returncode == 1
+
+
+def test_a_run_that_is_at_work_in_the_directory_is_left_alone(stored: Path, command) -> None:
+    """Between its look at the file and its own writing of it, nobody may begin the run again."""
+    write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.5})
+    before = (stored / "metrics.json").read_bytes()
+    with locked(stored):
+        status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert f"refused: {stored} is in use by process {os.getpid()}" in err
+    assert (stored / "metrics.json").read_bytes() == before
+    assert command(stored)[0] == 0

@@ -193,7 +193,7 @@ def test_a_choice_that_is_nonsense_is_one_line(figure: Any, said: str) -> None:
 def test_nothing_to_draw_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="is not a folder"):
         write_figure(tmp_path / "nowhere")
-    with pytest.raises(DataError, match=r"multirun.yaml is missing"):
+    with pytest.raises(DataError, match=r"has no multirun.yaml: pictures are of experiments"):
         write_figure(tmp_path)
     root = experiment(tmp_path / "none")
     with pytest.raises(DataError, match="has no block `figure:`"):
