@@ -10,6 +10,7 @@ import numpy as np
 from framework.data import Camera, Float64
 from framework.errors import DataError
 from framework.geometry import nearest_rigid
+from framework.number_lines import numbers, read_lines
 
 
 @dataclass(frozen=True)
@@ -42,30 +43,15 @@ def read_matrix(path: Path) -> PrintedMatrix:
     lines = _lines(path)
     if len(lines) != 4:
         raise DataError(f"{path}: expected 4 lines of 4 numbers, found {len(lines)} lines")
-    return PrintedMatrix(str(path), np.array([_numbers(f"{path}, line {n}", words, 4) for n, words in lines]))
+    return PrintedMatrix(str(path), np.array([numbers(f"{path}, line {n}", words, 4) for n, words in lines]))
 
 
 def read_matrix_lines(path: Path) -> list[PrintedMatrix]:
     """The matrix of each line. Raises DataError, naming file and line, when one does not hold 16 numbers."""
     places = [(f"{path}, line {n}", words) for n, words in _lines(path)]
-    return [PrintedMatrix(where, np.array(_numbers(where, words, 16)).reshape(4, 4)) for where, words in places]
+    return [PrintedMatrix(where, np.array(numbers(where, words, 16)).reshape(4, 4)) for where, words in places]
 
 
 def _lines(path: Path) -> list[tuple[int, list[str]]]:
     """The words of each line that is not empty, with its number in the file, from 1."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise DataError(f"{path} does not exist") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
-    return [(n, line.split()) for n, line in enumerate(lines, start=1) if line.strip()]
-
-
-def _numbers(where: str, words: list[str], count: int) -> list[float]:
-    if len(words) != count:
-        raise DataError(f"{where}: expected {count} numbers, found {len(words)}")
-    try:
-        return [float(word) for word in words]
-    except ValueError as error:
-        raise DataError(f"{where}: expected {count} numbers: {error}") from error
+    return [(n, line.split()) for n, line in enumerate(read_lines(path), start=1) if line.strip()]

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from framework.atomic_files import written_whole
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
+from framework.number_lines import numbers, read_lines
 
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits and not another kind of number
@@ -64,12 +65,7 @@ def read_tum_lines(path: Path) -> list[TumLine]:
 
     Raises DataError, naming file and line, when one does not hold eight numbers, the first of them finite.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise DataError(f"{path} does not exist: expected a trajectory in TUM format") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
+    lines = read_lines(path, missing="does not exist: expected a trajectory in TUM format")
     words = [line.split("#", 1)[0].split() for line in lines]
     return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
@@ -92,12 +88,7 @@ def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence
 
 
 def _line(path: Path, number: int, words: list[str]) -> TumLine:
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise DataError(f"{path}, line {number}: expected 8 numbers ({COLUMNS}): {error}") from error
-    if len(values) != len(COLUMNS.split()):
-        raise DataError(f"{path}, line {number}: expected 8 numbers ({COLUMNS}), found {len(values)}")
+    values = numbers(f"{path}, line {number}", words, len(COLUMNS.split()), COLUMNS)
     if not math.isfinite(values[0]):
         raise DataError(f"{path}, line {number}: the timestamp is not finite")
     return TumLine(path, number, values[0], tuple(values[1:4]), tuple(values[4:]))

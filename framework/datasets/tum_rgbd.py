@@ -24,10 +24,12 @@ from framework.data import Camera, Float64
 from framework.datasets.recording import Contents, ImageFiles, RecordedFrame, Recording
 from framework.errors import ConfigError, DataError
 from framework.geometry import interpolate
+from framework.number_lines import SHOWN, read_lines
 from framework.parameters import require
 from framework.trajectory_file import TumLine, read_tum_lines
 
 DEPTH_SCALE = 5000.0  # units a metre
+LONGEST_NAME = 255  # characters of an image's
 
 log = logging.getLogger(__name__)
 
@@ -161,12 +163,7 @@ def _named(folder: str) -> Intrinsics:
 
 def _read_list(path: Path) -> list[ListedImage]:
     """The images that a list names. Raises DataError, naming file and line, when one is not `timestamp filename`."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise DataError(f"{path} is missing: it lists the images' times, a line each: timestamp filename") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
+    lines = read_lines(path, missing="is missing: it lists the images' times, a line each: timestamp filename")
     listed = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")]
     if not listed:
         raise DataError(f"{path} lists no image")
@@ -179,6 +176,6 @@ def _listed(path: Path, number: int, line: str) -> ListedImage:
         timestamp = float(words[0])
     except ValueError:
         timestamp = math.nan
-    if len(words) < 2 or not math.isfinite(timestamp) or "\0" in line:
-        raise DataError(f"{path}, line {number}: expected `timestamp filename`, found {line.strip()!r}")
+    if len(words) < 2 or not math.isfinite(timestamp) or not words[1].isprintable() or len(words[1]) > LONGEST_NAME:
+        raise DataError(f"{path}, line {number}: expected `timestamp filename`, found {line.strip()[:SHOWN]!r}")
     return ListedImage(timestamp, path.parent / words[1].strip())

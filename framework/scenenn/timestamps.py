@@ -8,6 +8,7 @@ from pathlib import Path
 
 from framework.atomic_files import written_whole
 from framework.errors import DataError
+from framework.number_lines import SHOWN, read_lines
 
 MICROSECONDS = 1e6  # a second
 
@@ -17,19 +18,16 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
 
     Raises DataError, naming file and line, when a line does not hold a number and two times, or has an earlier number.
     """
-    try:
-        lines = path.read_text("utf-8").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
     times: dict[int, float] = {}
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_lines(path), start=1):
         words = line.split()
         if not words:
             continue
         try:
             image, _color, depth = int(words[0]), *map(float, words[1:])
         except ValueError as error:
-            raise DataError(f"{path}, line {number}: expected `number colour_us depth_us`, found {line!r}") from error
+            told = f"expected `number colour_us depth_us`, found {line[:SHOWN]!r}"
+            raise DataError(f"{path}, line {number}: {told}") from error
         if not math.isfinite(depth):
             raise DataError(f"{path}, line {number}: the time is not finite")
         if image in times:

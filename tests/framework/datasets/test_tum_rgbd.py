@@ -175,12 +175,17 @@ def test_a_missing_list_is_named(folder: Path, name: str) -> None:
         TumRgbd(folder)
 
 
-@pytest.mark.parametrize("line", ["1305031102.2", "yesterday rgb/1.png", "nan rgb/1.png", "1.5 rgb/\0.png"])
+@pytest.mark.parametrize(
+    "line",
+    ["1305031102.2", "yesterday rgb/1.png", "nan rgb/1.png", "1.5 rgb/\0.png", "1.5 r\bgb/1.png", "1.5 " + "1" * 5000],
+)
 def test_a_bad_line_of_a_list_is_named(folder: Path, line: str) -> None:
     text = (folder / "rgb.txt").read_text()
     (folder / "rgb.txt").write_text(text + line + "\n")
-    with pytest.raises(DataError, match=r"rgb\.txt, line 7: expected `timestamp filename`"):
+    with pytest.raises(DataError, match=r"rgb\.txt, line 7: expected `timestamp filename`") as caught:
         TumRgbd(folder)
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < 300
 
 
 def test_a_bad_line_of_the_poses_is_named(folder: Path) -> None:

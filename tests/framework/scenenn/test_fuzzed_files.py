@@ -21,6 +21,7 @@ from framework.datasets.image_files import read_color, read_uint16
 from framework.ply import read_ply
 from framework.scenenn.annotation import read_annotation
 from framework.scenenn.intrinsics import read_intrinsics
+from framework.scenenn.timestamps import read_timestamps
 from framework.scenenn.trajectory_log import read_trajectory_log
 from tests.damaged_files import EXAMPLES, check, damaged
 
@@ -117,6 +118,7 @@ FORMATS: dict[str, tuple[Callable[[Path], object], bytes, tuple[bytes, ...]]] = 
     "big.ply": (read_ply, binary_ply(">"), PLY_TOKENS),
     "011.xml": (read_annotation, ANNOTATION, XML_TOKENS),
     "trajectory.log": (read_trajectory_log, TRAJECTORY, (b"\n", b"6 6 7\n", b"\r\n", b"0 0 0 0\n")),
+    "timestamp.txt": (read_timestamps, b"1 0 0\n2 33312 33333\n3 66700 66667\n", (b"\n", b"3 1 1\n")),
     "asus.ini": (read_intrinsics, INTRINSICS, (b"fx", b"=", b"#", b"cy = 3\n")),
     "color.png": (read_color, png(COLOR), (b"IDAT", b"\x00\x00\x00\x00IEND\xaeB`\x82")),
     "color.jpg": (read_color, cv2.imencode(".jpg", COLOR)[1].tobytes(), (b"\xff\xd9", b"\xff\xc0", b"\xff\xda")),

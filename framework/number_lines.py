@@ -1,0 +1,37 @@
+"""Text files with some numbers in each line, as datasets publish times and poses."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from framework.errors import DataError
+
+SHOWN = 60  # characters of what a file holds that an error repeats
+
+
+def read_lines(path: Path, missing: str = "does not exist") -> list[str]:
+    """The lines of a text file. Raises DataError, naming it; `missing` is what is said of one that is not there."""
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError as error:
+        raise DataError(f"{path} {missing}") from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise DataError(f"{path} could not be read as text: {error}") from error
+
+
+def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:
+    """The words of a line as so many numbers, NaN among them. Raises DataError, naming the place, when they are not.
+
+    `names` are what the numbers are called.
+    """
+    expected = f"{where}: expected {count} numbers{f' ({names})' if names else ''}"
+    if len(words) != count:
+        raise DataError(f"{expected}, found {len(words)}")
+    values = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError as error:
+            raise DataError(f"{expected}, found {word[:SHOWN]!r}") from error
+    return values
