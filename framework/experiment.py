@@ -13,6 +13,7 @@ from hydra.conf import HydraConf
 from omegaconf import DictConfig, OmegaConf, open_dict
 
 from framework.errors import ConfigError
+from framework.parameters import checked_rows
 from framework.reports.comparison import TableChoice
 from framework.reports.figure_choice import FigureChoice
 
@@ -29,15 +30,16 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
     be made afterwards.
     """
     choices: Choices = dict(hydra_config.runtime.choices)
-    rows = config.get("rows")
+    rows = checked_rows(config.get("rows"))
     if not rows:
         return config, choices
     TableChoice.of(config.table)
     if config.get("figure") is not None:
         FigureChoice.of(config.figure)
-    if config.row not in rows:
-        raise ConfigError(f"there is no row={config.row}; the experiment has {', '.join(map(str, rows))}")
-    overrides = [*hydra_config.overrides.task, *rows[config.row]]
+    row = str(config.row)
+    if row not in rows:
+        raise ConfigError(f"there is no row={row}; the experiment has {', '.join(rows)}")
+    overrides = [*hydra_config.overrides.task, *rows[row]]
     composed = compose(hydra_config.job.config_name, overrides, return_hydra_config=True)
     choices = dict(composed.hydra.runtime.choices)
     with open_dict(composed):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -22,6 +22,21 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
     """Raises ConfigError unless the condition holds, in one line like "detector.nms must be in (0, 1], found 2"."""
     if not holds:
         raise ConfigError(f"{name} must be {allowed}, found {value}")
+
+
+def checked_rows(node: Any) -> dict[str, list[str]]:
+    """The overrides of each of an experiment's rows, by name; none without `rows`.
+
+    Raises ConfigError when those of a row are no list of texts.
+    """
+    if node is not None and not isinstance(node, Mapping):
+        raise ConfigError(f"rows must have names with overrides, like mine: [refiner=identity], found {node!r}")
+    rows = {str(name): overrides for name, overrides in (node or {}).items()}
+    for name, overrides in rows.items():
+        listed = isinstance(overrides, Sequence) and not isinstance(overrides, str)
+        if not listed or not all(isinstance(one, str) for one in overrides):
+            raise ConfigError(f"rows.{name} must be a list of overrides, like [refiner=identity], found {overrides!r}")
+    return {name: list(overrides) for name, overrides in rows.items()}
 
 
 def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:

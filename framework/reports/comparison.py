@@ -12,7 +12,7 @@ from typing import Any
 
 from framework.command_line import CONF
 from framework.errors import ConfigError, DataError
-from framework.parameters import checked_block
+from framework.parameters import checked_block, checked_rows
 from framework.reports.published import NOTHING_PUBLISHED, Published, read_published
 from framework.reports.records import Incomplete, Record, find_records, read_yaml
 from framework.reports.rows import Row, Run, natural, rows_of
@@ -98,7 +98,7 @@ class Comparison:
             raise DataError(f"{directory} is not a folder with records of runs")
         sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
         choice = TableChoice.of(sweep.get("table") or read_yaml(DEFAULT_CHOICE)["table"])
-        overrides = sweep.get("rows") or {}
+        overrides = checked_rows(sweep.get("rows"))
         records, incomplete = find_records(directory)
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])

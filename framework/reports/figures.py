@@ -12,6 +12,7 @@ from tqdm import tqdm
 
 from framework.data import SceneTruth
 from framework.errors import DataError, InstanceMapError
+from framework.parameters import checked_rows
 from framework.reports.comparison import SWEEP
 from framework.reports.figure_choice import FigureChoice
 from framework.reports.figure_page import Page
@@ -71,7 +72,7 @@ class Pictured:
                 "like experiment=figure4_progress"
             )
         choice = FigureChoice.of(sweep[NAME])
-        overrides = sweep.get("rows") or {}
+        overrides = checked_rows(sweep.get("rows"))
         records, incomplete = find_records(directory)
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])

@@ -130,7 +130,14 @@ def read_yaml(path: Path) -> dict[str, Any]:
         raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold keys and values, found a list")
-    return {str(key): value for key, value in content.items()}
+    return {str(key): _with_text_keys(value) for key, value in content.items()}
+
+
+def _with_text_keys(node: Any) -> Any:
+    """With text for every key, as in JSON: YAML takes 1 and true for something else, and such keys have no order."""
+    if isinstance(node, dict):
+        return {str(key): _with_text_keys(value) for key, value in node.items()}
+    return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
 
 
 def _read_flat(path: Path) -> dict[str, Any]:

@@ -59,6 +59,7 @@ def test_the_config_comes_back_with_the_hash_that_it_was_written_with(directory:
         ("config.yaml", "seed: [", "config.yaml cannot be read"),
         ("config.yaml", "word", "is not of the config beside it"),
         ("config.yaml", "- 1", "config.yaml must hold keys and values"),
+        ("config.yaml", "fuser: {true: 1, voxel_size: 2}", "is not of the config beside it"),
     ],
 )
 def test_a_broken_record_is_one_line(directory: Path, name: str, content: str, said: str) -> None:
