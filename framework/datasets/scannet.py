@@ -8,7 +8,7 @@
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
                                         optional: the mesh, its segments, and the objects made of these
     scannetv2-labels.combined.tsv       optional, in the folder of the scenes or the one above: which class is meant by
-                                        what the annotators wrote
+                                        what the annotators wrote; without it fewer objects are evaluated
 
 Colour (1296x968) is moved into the depth camera (640x480), which is that of the frames.
 """
@@ -54,13 +54,17 @@ class ScanNet(LabeledRecording):
     """
 
     def open(self) -> Contents:
+        tables = [parent / LABEL_TABLE for parent in self.folder.resolve().parents[:2]]
+        self._label_table = next((table for table in tables if table.exists()), None)
         files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
         self.mesh = mesh_of(files, self._read_mesh)
         if self.mesh is None and self.frame_truth:
             raise DataError(
                 f"dataset.frame_truth needs a labelled mesh: {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
             )
-        self.annotation = "ScanNet v2" if self.mesh else ""
+        if self.mesh and self._label_table is None:
+            log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[0])
+        self.annotation = f"ScanNet v2{'' if self._label_table else ', no label table'}" if self.mesh else ""
         sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
         if len(sens) > 1:
             raise DataError(f"{self.folder} holds {len(sens)} .sens files, {sens[0].name} and others; leave one")
@@ -73,8 +77,7 @@ class ScanNet(LabeledRecording):
         raise DataError(f"{self.folder} holds neither {self.name}.sens nor color/; dataset.scene is like scene0000_00")
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
-        tables = [parent / LABEL_TABLE for parent in self.folder.resolve().parents[:2]]
-        nyu40 = next((read_label_table(table) for table in tables if table.exists()), {})
+        nyu40 = read_label_table(self._label_table) if self._label_table else {}
         return read_labeled_mesh(mesh, segments, objects, nyu40)
 
 

@@ -243,6 +243,19 @@ def test_truth_is_the_labelled_mesh(tmp_path: Path, write: Writer) -> None:
     np.testing.assert_array_equal(seen.instance_ids[12, sure], expected[sure])
 
 
+def test_without_the_label_table_it_is_another_annotation(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Of the same map it gives other figures, so tables must not mix the two."""
+    as_sens(tmp_path / SCENE, shots())
+    write_labels(tmp_path / SCENE)
+    (tmp_path / "scannetv2-labels.combined.tsv").unlink()
+    sequence = ScanNet(tmp_path, SCENE)
+    assert sequence.annotation == "ScanNet v2, no label table"
+    assert f"{tmp_path / 'scannetv2-labels.combined.tsv'} is missing: only objects" in caplog.text
+    truth = sequence.scene_truth()
+    assert truth is not None
+    assert set(truth.class_names.values()) == {None}, "nobody else knows what a folding chair is"
+
+
 def test_truth_without_all_of_its_files_is_none_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     as_sens(tmp_path / SCENE, shots(1))
     write_labels(tmp_path / SCENE)
