@@ -6,7 +6,6 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numba
 import numpy as np
 import pytest
 
@@ -16,6 +15,7 @@ from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from tests import detector_files, registered
 from tests.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
+from tests.thread_counts import by_one_thread_and_two
 
 
 def built(stage: str, name: str, *overrides: str) -> Any:
@@ -206,16 +206,9 @@ def test_refiner_is_repeatable(refiner: ClusterRefiner, room: CornerRoom) -> Non
 
 
 def test_refiner_does_not_depend_on_the_number_of_threads(refiner: ClusterRefiner, room: CornerRoom) -> None:
-    threads = numba.get_num_threads()
-    if threads < 2:
-        pytest.skip("this machine has one core")
     clusters = bleeding(room[1])
-    by_all = refiner.refine(clusters, room[1])
-    numba.set_num_threads(1)
-    try:
-        assert same(by_all, refiner.refine(clusters, room[1]))
-    finally:
-        numba.set_num_threads(threads)
+    by_one, by_two = by_one_thread_and_two(lambda: refiner.refine(clusters, room[1]))
+    assert same(by_one, by_two)
 
 
 def test_refiner_takes_no_clusters(refiner: ClusterRefiner, room: CornerRoom) -> None:

@@ -1,6 +1,5 @@
 """The TSDF against a slow reference and against exact surfaces."""
 
-import numba
 import numpy as np
 import pytest
 
@@ -10,6 +9,7 @@ from framework.mapping.integration import GOLDEN, LEAST_BEHIND, Integrator
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
 from tests.analytic_scene import CAMERA, pose, room, walk
+from tests.thread_counts import by_one_thread_and_two
 
 SENSOR = Sensor(*map(np.float32, (0.08, 0.01, 0.2, 4.0, 100.0, 1.5)))
 VOXEL = 0.02
@@ -198,19 +198,14 @@ def test_carving_removes_what_is_seen_through() -> None:
     assert before > 0
 
 
-@pytest.mark.parametrize("threads", [1, 2])
-def test_the_map_does_not_depend_on_the_number_of_threads(threads: int) -> None:
-    default = numba.get_num_threads()
-    if default < 2:
-        pytest.skip("this machine has one core")
-    results = []
-    for count in (default, threads):
-        numba.set_num_threads(count)
+def test_the_map_does_not_depend_on_the_number_of_threads() -> None:
+    def integrated() -> list[bytes]:
         integrator = new_integrator()
         for k, T in enumerate(walk(4)):
             integrator.integrate(room().frame(T, k), T, VOXEL)
         n = integrator.voxels.block_count
         grid = integrator.voxels.grid
-        results.append([a[:n].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color)])
-    numba.set_num_threads(default)
-    assert results[0] == results[1]
+        return [a[:n].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color)]
+
+    by_one, by_two = by_one_thread_and_two(integrated)
+    assert by_one == by_two

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 from scipy import ndimage
@@ -10,6 +9,7 @@ from scipy import ndimage
 from framework.data import Camera
 from framework.refinement import convexity
 from framework.refinement.convexity import Limits, normal_sigma, segments
+from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(160, 120, 135.0, 135.0, 79.5, 59.5)
 LIMITS = Limits(noise_factor=3.0, min_noise=0.0, max_slope=4.0, max_angle=np.deg2rad(15.0))
@@ -239,12 +239,4 @@ def test_a_scratch_of_missing_readings_cuts_nothing():
 def test_same_segments_with_one_thread_and_with_two():
     boxes = np.array([[0.15, 0.3, 1.1, 0.55, 0.6, 1.5], [-0.5, 0.4, 1.0, -0.2, 0.6, 1.2]])
     depth = noisy(rendered(boxes, 0.6, 0.5)[0], 1.0)
-    threads, results = numba.get_num_threads(), []
-    try:
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            results.append(cut(depth)[0])
-    finally:
-        numba.set_num_threads(threads)
-    for result in results[1:]:
-        np.testing.assert_array_equal(results[0], result)
+    np.testing.assert_array_equal(*by_one_thread_and_two(lambda: cut(depth)[0]))

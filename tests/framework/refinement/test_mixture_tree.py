@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import pytest
 
 from framework.refinement import mixture, mixture_tree
 from framework.refinement.mixture_tree import Level, MixtureTree
+from tests.thread_counts import by_one_thread_and_two
 
 FLOOR = 0.02**2  # m^2
 
@@ -252,14 +252,10 @@ def test_too_little_for_a_tree():
 
 def test_same_result_with_one_thread_and_with_two():
     points, starts = surface(3, 6000), np.array([0, 2000, 6000])
-    threads, results = numba.get_num_threads(), []
-    try:
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            tree = grown(points, starts)
-            results.append((tree.levels[-1].means, tree.log_likelihoods(points, starts)))
-    finally:
-        numba.set_num_threads(threads)
-    for means, log_likelihoods in results[1:]:
-        np.testing.assert_array_equal(means, results[0][0])
-        np.testing.assert_array_equal(log_likelihoods, results[0][1])
+
+    def grow():
+        tree = grown(points, starts)
+        return tree.levels[-1].means, tree.log_likelihoods(points, starts)
+
+    for one, other in zip(*by_one_thread_and_two(grow), strict=True):
+        np.testing.assert_array_equal(one, other)

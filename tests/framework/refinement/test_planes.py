@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
 from framework.data import Camera, Frame
 from framework.geometry import back_project
 from framework.refinement.planes import Planes, find_planes, plane_image
+from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # 1/m, n / d
@@ -143,16 +143,12 @@ def test_no_reading_is_on_a_plane_without_reading():
 def test_same_with_one_thread_and_two():
     exact = depth_of(FLOOR, WALL)
     frame = frame_of(exact + np.random.default_rng(0).normal(0, 0.002, exact.shape) * exact**2)
-    threads = numba.get_num_threads()
-    results = []
-    try:
-        for n in (1, threads):
-            numba.set_num_threads(n)
-            planes = find_planes(frame, 0.02, 0.003, 0.5)
-            results.append([*vars(planes).values(), plane_image(frame, planes, 0.02)])
-    finally:
-        numba.set_num_threads(threads)
-    for one, other in zip(*results, strict=True):
+
+    def find():
+        planes = find_planes(frame, 0.02, 0.003, 0.5)
+        return [*vars(planes).values(), plane_image(frame, planes, 0.02)]
+
+    for one, other in zip(*by_one_thread_and_two(find), strict=True):
         np.testing.assert_array_equal(one, other)
 
 

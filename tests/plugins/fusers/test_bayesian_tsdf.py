@@ -1,12 +1,12 @@
 """The map that the paper's fuser writes: its budget, its rows of evidence, the same with any number of threads."""
 
-import numba
 import pytest
 
 from framework.data import Frame
 from framework.errors import ConfigError, MapFullError
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.analytic_scene import room, walk
+from tests.thread_counts import by_one_thread_and_two
 from tests.true_masks import fuse_masks, masks_of
 
 
@@ -34,25 +34,17 @@ def test_parameters_are_checked() -> None:
 
 
 def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -> None:
-    default = numba.get_num_threads()
-    if default < 2:
-        pytest.skip("this machine has one core")
-    maps = []
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            fuser = new_fuser()
-            for frame in frames:
-                fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.5, 0.4])
-            grid, labels = fuser.scene.voxels.grid, fuser.scene.labels
-            b, r = fuser.scene.voxels.block_count, labels.row_count
-            maps.append(
-                [a[:b].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color, grid.label_row)]
-            )
-            maps[-1] += [a[:r].tobytes() for a in labels.evidence]
-    finally:
-        numba.set_num_threads(default)
-    assert maps[0] == maps[1]
+    def mapped() -> list[bytes]:
+        fuser = new_fuser()
+        for frame in frames:
+            fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.5, 0.4])
+        grid, labels = fuser.scene.voxels.grid, fuser.scene.labels
+        b, r = fuser.scene.voxels.block_count, labels.row_count
+        of_grid = [a[:b].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color, grid.label_row)]
+        return of_grid + [a[:r].tobytes() for a in labels.evidence]
+
+    by_one, by_two = by_one_thread_and_two(mapped)
+    assert by_one == by_two
 
 
 def test_only_what_becomes_an_instance_takes_rows_of_evidence(frames: list[Frame]) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from pathlib import Path
 
-import numba
 import numpy as np
 import pytest
 
@@ -19,6 +18,7 @@ from plugins.fusers.semantic_components import SemanticComponents
 from tests import box_scene
 from tests.analytic_scene import CAMERA, room, walk
 from tests.box_scene import BoxScene, look_from
+from tests.thread_counts import by_one_thread_and_two
 from tests.true_masks import CLASSES, PROBABILITIES, fuse_masks, masks_of
 
 VIEWS = [look_from(x, -1.5, 1.6, (0.0, 1.0, 0.3)) for x in (-1.0, -0.3, 0.4, 1.1)]
@@ -214,22 +214,15 @@ def test_a_score_is_the_probability_of_the_best_class(frames: list[Frame]) -> No
 
 
 def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -> None:
-    default = numba.get_num_threads()
-    if default < 2:
-        pytest.skip("this machine has one core")
-    maps = []
-    try:
-        for threads in (1, 2):
-            numba.set_num_threads(threads)
-            fuser = new_fuser()
-            for frame in frames[:5]:
-                fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
-            mesh = fuser.scene.mesh()
-            maps.append([array.tobytes() for array in fuser.scene.labels.saved().values()])
-            maps[-1] += [mesh.vertices.tobytes(), mesh.instance_ids.tobytes(), mesh.class_ids.tobytes()]
-    finally:
-        numba.set_num_threads(default)
-    assert maps[0] == maps[1]
+    def mapped() -> list[bytes]:
+        fuser = new_fuser()
+        for frame in frames[:5]:
+            fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
+        mesh, labels = fuser.scene.mesh(), fuser.scene.labels.saved().values()
+        return [array.tobytes() for array in (*labels, mesh.vertices, mesh.instance_ids, mesh.class_ids)]
+
+    by_one, by_two = by_one_thread_and_two(mapped)
+    assert by_one == by_two
 
 
 def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: SemanticMap, tmp_path: Path) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numba
 import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
@@ -13,6 +12,7 @@ from sklearn.cluster import DBSCAN
 from framework.data import Camera, Frame, PointClusters
 from framework.errors import ConfigError
 from plugins.refiners.dbscan import Dbscan, dense_pieces
+from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(90, 60, 50.0, 50.0, 44.5, 29.5)
 FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np.float32), CAMERA)
@@ -139,15 +139,7 @@ def test_exact_clusters_and_points_of_no_cluster_stay():
 
 def test_same_with_one_thread_and_two():
     clusters = clusters_of(*(blobs(seed) for seed in range(5)))
-    threads = numba.get_num_threads()
-    results = []
-    try:
-        for n in (1, threads):
-            numba.set_num_threads(n)
-            results.append(Dbscan().refine(clusters, FRAME).points_world)
-    finally:
-        numba.set_num_threads(threads)
-    np.testing.assert_array_equal(*results)
+    np.testing.assert_array_equal(*by_one_thread_and_two(lambda: Dbscan().refine(clusters, FRAME).points_world))
 
 
 @pytest.mark.parametrize(

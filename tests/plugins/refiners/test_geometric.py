@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
@@ -10,6 +9,7 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
 from framework.geometry import exp_se3, lift
 from plugins.refiners.geometric import Geometric
+from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 180.0, 180.0, 159.5, 119.5)
 POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))
@@ -153,16 +153,9 @@ def test_same_result_with_one_thread_and_with_two():
     noise = np.random.default_rng(0).normal(0, 0.003, depth.shape)
     frame = frame_of(depth + noise)
     before = lifted(np.stack([shifted(ids == 1, 0, 8), ids == 0]), frame)
-    threads, results = numba.get_num_threads(), []
-    try:
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            results.append(Geometric().refine(before, frame))
-    finally:
-        numba.set_num_threads(threads)
-    for result in results[1:]:
-        np.testing.assert_array_equal(results[0].pixels, result.pixels)
-        np.testing.assert_array_equal(results[0].points_world, result.points_world)
+    one, two = by_one_thread_and_two(lambda: Geometric().refine(before, frame))
+    np.testing.assert_array_equal(one.pixels, two.pixels)
+    np.testing.assert_array_equal(one.points_world, two.points_world)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 import pytest
 
@@ -11,6 +10,7 @@ from framework.errors import ConfigError
 from framework.geometry import exp_se3, lift
 from plugins.refiners.gmm_tree import GmmTree
 from plugins.refiners.identity import Identity
+from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 
@@ -126,15 +126,8 @@ def test_same_result_with_one_thread_and_with_two():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids > 0, 8), ids > 0]), frame)
-    threads, results = numba.get_num_threads(), []
-    try:
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            results.append(GmmTree(levels=3, min_node=16).refine(before, frame).pixels)
-    finally:
-        numba.set_num_threads(threads)
-    for result in results[1:]:
-        np.testing.assert_array_equal(results[0], result)
+    refiner = GmmTree(levels=3, min_node=16)
+    np.testing.assert_array_equal(*by_one_thread_and_two(lambda: refiner.refine(before, frame).pixels))
 
 
 @pytest.mark.parametrize(

@@ -16,6 +16,7 @@ from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.identity import Identity
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
+from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 REFINERS: list[Callable[[], ClusterRefiner]] = [Identity, GmmEm, KMeans, LargestComponent]
@@ -121,20 +122,10 @@ def test_does_not_depend_on_the_order_of_points_or_clusters_or_on_other_clusters
 
 @pytest.mark.parametrize("make", REFINERS)
 def test_same_result_with_one_thread_and_with_two(make):
-    numba = pytest.importorskip("numba")
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(np.stack([bleeding(ids == 1, 8), bleeding(ids == 2, 3)]), frame)
-    threads = numba.get_num_threads()
-    results = []
-    try:
-        for n in {1, threads}:
-            numba.set_num_threads(n)
-            results.append(make().refine(before, frame).pixels)
-    finally:
-        numba.set_num_threads(threads)
-    for result in results[1:]:
-        np.testing.assert_array_equal(results[0], result)
+    np.testing.assert_array_equal(*by_one_thread_and_two(lambda: make().refine(before, frame).pixels))
 
 
 @pytest.mark.parametrize("make", REFINERS)
