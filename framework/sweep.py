@@ -22,12 +22,17 @@ ending = ExitStack()
 """What this process still has to do when the sweep that it began has ended, in whatever way."""
 
 
+def cores_of(threads: int) -> int:
+    """How many cores a job of so many threads (0 = all) takes of this machine."""
+    return threads or len(os.sched_getaffinity(0))
+
+
 def jobs_at_once(threads: int) -> int:
-    """How many jobs of so many threads each (0 = all) the cores of this machine take."""
-    cores = len(os.sched_getaffinity(0))
-    return max(1, cores // (threads or cores))
+    """How many such jobs the cores of this machine take."""
+    return max(1, len(os.sched_getaffinity(0)) // cores_of(threads))
 
 
+OmegaConf.register_new_resolver("cores_of", cores_of, replace=True)
 OmegaConf.register_new_resolver("jobs_at_once", jobs_at_once, replace=True)
 
 
