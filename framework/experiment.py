@@ -19,7 +19,7 @@ from framework.reports.figure_choice import FigureChoice
 
 Choices = Mapping[str, str | None]
 
-OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(by_name), replace=True)
+OmegaConf.register_new_resolver("all_of", lambda by_name: ",".join(map(str, by_name)), replace=True)
 """`${all_of:${rows}}`: the names of all rows, as a choice for Hydra's sweeper."""
 
 

@@ -20,7 +20,6 @@ from framework.ply_format.text import TextBody
 
 AXES = ("x", "y", "z")
 INDICES = ("vertex_indices", "vertex_index")  # what writers call a face's list
-MOST_VERTICES = np.iinfo(np.int32).max
 TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # the classic names: float, not float32
 
 

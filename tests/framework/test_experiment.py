@@ -113,6 +113,10 @@ def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]
         return with_row(config, own)
 
 
+def test_a_row_may_be_called_by_a_number() -> None:
+    assert OmegaConf.create("{rows: {ours: [], 2: []}, all: '${all_of:${rows}}'}").all == "ours,2"
+
+
 @pytest.mark.parametrize("experiment", EXPERIMENTS)
 def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) -> None:
     """The command's own way of composing a row; the stages that the rows change are built, too."""
