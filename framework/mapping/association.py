@@ -237,3 +237,43 @@ def cover_another(clusters: PointClusters, points: PixelLists, threshold: float)
     rank = np.lexsort((np.arange(n), -clusters.scores)).argsort()
     better = rank[None, :] < rank[:, None]
     return np.asarray((better & (over_smaller > threshold)).any(axis=1))
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _keep_on_top(first, following, cluster, sizes, share, kept_first, kept_following):
+    """Copies each pixel's list without the points of clusters that one of less than `share` of their size lies on."""
+    for v in prange(first.shape[0]):
+        for u in range(first.shape[1]):
+            p = first[v, u]
+            smallest = np.float64(np.inf)
+            while p >= 0:
+                size = sizes[cluster[p]]
+                if size > 0:
+                    smallest = min(smallest, size)
+                p = following[p]
+            kept_first[v, u] = -1
+            last = np.int32(-1)
+            p = first[v, u]
+            while p >= 0:
+                if smallest >= share * sizes[cluster[p]]:
+                    if last < 0:
+                        kept_first[v, u] = p
+                    else:
+                        kept_following[last] = p
+                    kept_following[p] = -1
+                    last = p
+                p = following[p]
+
+
+def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32, share: float) -> PixelLists:
+    """`points` where small clusters have for themselves what large ones claim as well.
+
+    A network draws a large mask coarsely, over the small thing that lies on the object: a book on a couch. Under
+    overlapping clusters a pixel is left to those that are not more than 1 / `share` times as large as the smallest
+    there. Clusters without an instance (`instance_ids` (N,) 0) take nothing from others.
+    """
+    sizes = np.bincount(clusters.cluster[clusters.cluster >= 0], minlength=len(clusters))
+    sizes = np.where(instance_ids > 0, sizes, 0)
+    kept = PixelLists(np.empty_like(points.first), np.empty_like(points.next))
+    _keep_on_top(points.first, points.next, clusters.cluster, sizes, share, kept.first, kept.next)
+    return kept

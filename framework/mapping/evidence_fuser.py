@@ -9,12 +9,13 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Float32, Float64, Frame, Int32, PointClusters, Pose
-from framework.mapping.association import PixelLists
+from framework.mapping.association import PixelLists, keep_on_top
 from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
 from framework.mapping.instance_fuser import InstanceFuser
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.integration import Integrator
 from framework.mapping.tsdf_fuser import VoxelHashingFuser
+from framework.parameters import check_bounds
 
 EXACT_BITS = 16  # by which exact storage's units are finer
 
@@ -31,6 +32,7 @@ def only_best(clusters: PointClusters, weights: npt.NDArray[np.floating]) -> Flo
 class EvidenceFuser(VoxelHashingFuser, InstanceFuser):
     """A TSDF whose voxels carry evidence for instances and classes. A subclass says what counts as evidence."""
 
+    on_top: float = 0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     combine = Combine.SUM  # how new evidence for a label meets the old one
@@ -39,6 +41,7 @@ class EvidenceFuser(VoxelHashingFuser, InstanceFuser):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_bounds(self, on_top=(0.0, 1.0))
         sensor = self.sensor
         self.scene: InstanceMap = InstanceMap(
             self.voxel_size,
@@ -63,6 +66,8 @@ class EvidenceFuser(VoxelHashingFuser, InstanceFuser):
         self, frame: Frame, pose: Pose, clusters: PointClusters, points: PixelLists, instance_ids: Int32
     ) -> None:
         seen = self._integrator.integrate(frame, pose.T_world_camera, self.label_band * self.voxel_size)
+        if self.on_top > 0:
+            points = keep_on_top(clusters, points, instance_ids, self.on_top)
         self.scene.labels.update(seen, self._measurement(clusters, points, instance_ids))
         self.scene.changed(seen.blocks)
 

@@ -9,9 +9,11 @@ from framework.data import PointClusters
 from framework.errors import DataError
 from framework.mapping.association import (
     OverlapRule,
+    PixelLists,
     class_agreement,
     count_overlaps,
     cover_another,
+    keep_on_top,
     list_points_by_pixel,
     match_one_to_one,
 )
@@ -153,3 +155,43 @@ def test_points_of_no_cluster_have_no_say() -> None:
     # 4 of the 8 pixels of each are shared: columns 0, 2 against 2, 3
     assert cover_another(clusters, points, 0.49).tolist() == [False, True]
     assert cover_another(clusters, points, 0.5).tolist() == [False, False]
+
+
+def clusters_at(clusters: PointClusters, points: PixelLists) -> list[list[int]]:
+    """The clusters in each pixel's list, row by row."""
+    found = []
+    for p in points.first.ravel().tolist():
+        found.append([])
+        while p >= 0:
+            found[-1].append(int(clusters.cluster[p]))
+            p = int(points.next[p])
+    return found
+
+
+def test_a_book_on_a_table_has_its_pixels_for_itself() -> None:
+    table, book = columns(0, 5), columns(2, 3)
+    clusters = clusters_of([table, book], [0.9, 0.2])
+    points = list_points_by_pixel(clusters, SHAPE)
+    ids = np.int32([7, 9])
+    assert clusters_at(clusters, keep_on_top(clusters, points, ids, 0.25)) == 4 * [[0], [0], [1], [0], [0]]
+    assert clusters_at(clusters, keep_on_top(clusters, points, ids, 0.2)) == 4 * [[0], [0], [0, 1], [0], [0]]
+    unmatched = keep_on_top(clusters, points, np.int32([7, 0]), 0.25)
+    assert clusters_at(clusters, unmatched) == 4 * [[0], [0], [0, 1], [0], [0]], "it takes nothing"
+    assert clusters_at(clusters, points) == 4 * [[0], [0], [0, 1], [0], [0]], "the lists given stay as they are"
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10_000), st.floats(0, 1))
+def test_who_keeps_a_pixel_agrees_with_a_slow_reference(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    masks = [rng.random(SHAPE) < filled for filled in rng.random(4)]
+    clusters = clusters_of(masks, [1] * 4)
+    clusters.cluster[rng.random(len(clusters.cluster)) < 0.1] = -1
+    points = list_points_by_pixel(clusters, SHAPE)
+    ids = rng.integers(0, 3, 4).astype(np.int32)
+    sizes = [int((clusters.cluster == k).sum()) for k in range(4)]
+    expected = []
+    for at_pixel in clusters_at(clusters, points):
+        small = [sizes[k] for k in at_pixel if ids[k]]
+        expected.append([k for k in at_pixel if not ids[k] or all(size >= share * sizes[k] for size in small)])
+    assert clusters_at(clusters, keep_on_top(clusters, points, ids, share)) == expected

@@ -1,5 +1,8 @@
 """The map that the paper's fuser writes: its budget, its rows of evidence, the same with any number of threads."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 
 from framework.data import Frame
@@ -28,7 +31,7 @@ def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame]) -> None:
 
 
 def test_parameters_are_checked() -> None:
-    for wrong in ({"max_weight": 256.0}, {"class_floor": 0.0}, {"absence": float("nan")}):
+    for wrong in ({"max_weight": 256.0}, {"class_floor": 0.0}, {"absence": float("nan")}, {"on_top": 1.5}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             BayesianTsdf(**wrong)  # type: ignore[arg-type]
 
@@ -57,3 +60,23 @@ def test_only_what_becomes_an_instance_takes_rows_of_evidence(frames: list[Frame
     assert alone > 0
     fuse_masks(fuser, frames[0], [first, second], [0.9, 0.2])
     assert fuser.scene.labels.row_count == alone
+
+
+@pytest.mark.parametrize(("on_top", "of_the_book"), [(0.25, True), (0.0, False)])
+def test_a_book_stays_on_a_couch_that_is_seen_better(frames: list[Frame], on_top: float, of_the_book: bool) -> None:
+    """Half of the frames miss the book, and the couch's mask always covers it."""
+    fuser = new_fuser(on_top=on_top)
+    couch = masks_of(frames[0])[0]
+    v, u = np.nonzero(couch)
+    rows, columns = np.ogrid[: couch.shape[0], : couch.shape[1]]
+    side = np.sqrt(len(u)) / 4
+    book = couch & (np.abs(rows - np.median(v)) < side / 2) & (np.abs(columns - np.median(u)) < side / 2)
+    fuse_masks(fuser, frames[0], [couch & ~book, book], [0.9, 0.4])  # an instance of its own, which later masks find
+    for k in range(1, 9):
+        frame = dataclasses.replace(frames[0], index=k)
+        fuse_masks(fuser, frame, [couch, book] if k % 2 else [couch], [0.6, 0.5][: 1 + k % 2])
+    frame = frames[0]
+    assert frame.T_world_camera is not None
+    seen = fuser.scene.instances_seen(frame, frame.T_world_camera, 1)
+    assert (np.median(seen[book]) == 2) == of_the_book
+    assert (seen[book] == 2).any() == of_the_book
