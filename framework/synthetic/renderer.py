@@ -105,7 +105,8 @@ def depth_and_ids(
 ) -> tuple[Float32, Int32]:
     """What a Renderer's method of this name gives, without the light that a Renderer begins with."""
     hits = caster.cast(image_rays(camera, T_world_camera))
-    return _seen(hits.triangle, hits.distance, surfaces.instance_ids)
+    depth, ids = _seen(hits.triangle, hits.distance, surfaces.instance_ids)
+    return depth, ids
 
 
 # The kernels compute in float32, in this order: other code wrote pictures that these must equal to the last bit.

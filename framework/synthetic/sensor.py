@@ -151,7 +151,7 @@ def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> 
     x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)
     own, neighbour = depth[v, u], depth[y, x]
     across = abs(neighbour - own) > np.float32(EDGE_JUMP) * own
-    return neighbour if across and neighbour > 0 else own
+    return np.float32(neighbour if across and neighbour > 0 else own)
 
 
 @njit(cache=True, nogil=True)
