@@ -18,7 +18,8 @@ through these types, and the code behind them trusts what it gets.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import threading
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -77,11 +78,51 @@ class Camera:
 class FrameTruth:
     """The instances that are really visible in a frame: for ground-truth detectors and for evaluation only."""
 
-    instance_ids: Int32  # (H, W)
+    instance_ids: Int32 = field(repr=False)  # (H, W)
     class_names: Mapping[int, str | None]  # instance id -> class name; None = the class is not known, do not evaluate
 
     def __post_init__(self) -> None:
         _check("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(height, width)"""
+        return self.instance_ids.shape
+
+
+class DeferredTruth(FrameTruth):
+    """A FrameTruth that renders its ids when somebody first asks for them: once, from whatever thread.
+
+    What `render` raises is raised where the ids are asked for, each time. Raises DataError there when it returns
+    anything but (H, W) int32 of `shape`.
+    """
+
+    def __init__(
+        self,
+        render: Callable[[], Int32],
+        shape: tuple[int, int],  # (height, width) of what it will return
+        class_names: Mapping[int, str | None],
+        origin: str,  # a hash of all that the ids depend on: it tells two of them apart before there are any
+    ) -> None:
+        self._render = render
+        self._shape = shape
+        self._ids: Int32 | None = None
+        self._lock = threading.Lock()
+        self.origin = origin
+        object.__setattr__(self, "class_names", class_names)  # a field of the frozen base
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return self._shape
+
+    @property
+    def instance_ids(self) -> Int32:
+        with self._lock:
+            if self._ids is None:
+                ids = self._render()
+                _check("DeferredTruth.instance_ids", ids, self._shape, np.int32)
+                self._ids = ids
+            return self._ids
 
 
 @dataclass(frozen=True)
@@ -107,8 +148,8 @@ class Frame:
         # the kernels are compiled for this layout; a view such as bgr[..., ::-1] is copied into it
         object.__setattr__(self, "color", np.ascontiguousarray(self.color))
         object.__setattr__(self, "depth", np.ascontiguousarray(self.depth))
-        if self.truth is not None:
-            _check(where + "truth.instance_ids", self.truth.instance_ids, self.camera.shape, np.int32)
+        if self.truth is not None and self.truth.shape != self.camera.shape:
+            raise DataError(f"{where}truth.instance_ids must have shape {self.camera.shape}, found {self.truth.shape}")
 
 
 @dataclass(frozen=True)

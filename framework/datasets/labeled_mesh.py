@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, FrameTruth, Int32, SceneTruth
-from framework.synthetic.ray_caster import NO_TRIANGLE, RayCaster, image_rays
+from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
+from framework.datasets import rasterizer
+from framework.datasets.rasterizer import Rasterizer
+from framework.detection.fingerprint import file_hash
 
 
 @dataclass(frozen=True)
@@ -26,15 +30,28 @@ class LabeledMesh:
         return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names))
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
-        """The instances that `camera` would see, by ray-casting: those of the mesh's vertices nearest to the hits."""
-        hits = self._caster.cast(image_rays(camera, T_world_camera))
-        met = hits.triangle != NO_TRIANGLE
-        u, v = hits.uv[met].T
-        corner = np.stack([1 - u - v, u, v], axis=1).argmax(axis=1)
-        ids = np.zeros(camera.shape, np.int32)
-        ids[met] = self.instance_ids[self.triangles[hits.triangle[met], corner]]
-        return FrameTruth(ids, self.class_names)
+        """The instances that `camera` would see, rendered when they are asked for.
+
+        They are those of the mesh's vertices nearest to what the pixels meet.
+        """
+        return DeferredTruth(
+            render=lambda: self._rasterizer.draw(self.instance_ids, camera, T_world_camera),
+            shape=camera.shape,
+            class_names=self.class_names,
+            origin=f"{self._fingerprint} {camera!r} {T_world_camera.tobytes().hex()}",
+        )
 
     @cached_property
-    def _caster(self) -> RayCaster:
-        return RayCaster(self.vertices, self.triangles)
+    def _rasterizer(self) -> Rasterizer:
+        return Rasterizer(self.vertices, self.triangles)
+
+    @cached_property
+    def _fingerprint(self) -> str:
+        """SHA-256 (hex) of what is rendered, and of the code that does."""
+        told = hashlib.sha256()
+        for array in (self.vertices, self.triangles, self.instance_ids):
+            told.update(f"{array.dtype.str}{array.shape}".encode())
+            told.update(np.ascontiguousarray(array).data)
+        for source in (__file__, rasterizer.__file__):
+            told.update(file_hash(Path(source)).encode())
+        return told.hexdigest()

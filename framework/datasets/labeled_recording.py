@@ -21,7 +21,7 @@ class LabeledRecording(Recording):
     Truth is all of the mesh, whatever frames are chosen.
     """
 
-    frame_truth: bool = False  # whether the labelled mesh is rendered into each frame, as some detectors need it
+    frame_truth: bool = False  # whether frames have the true instances: the mesh is rendered for detectors that ask
 
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None

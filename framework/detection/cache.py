@@ -13,7 +13,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from framework.atomic_files import written_whole
-from framework.data import Array, Bool, Detections, Frame, FrameTruth, Int32
+from framework.data import Array, Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
@@ -137,12 +137,18 @@ def cache_directory(chosen: str | None) -> Path:
 
 
 def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
-    """SHA-256 (hex) of these fields of a frame. Faster than BLAKE2 wherever the processor knows SHA."""
+    """SHA-256 (hex) of these fields of a frame. Faster than BLAKE2 wherever the processor knows SHA.
+
+    Truth that is not rendered yet counts by its origin, so that a hit spares the rendering.
+    """
     told = hashlib.sha256()
     for name in sorted(reads):
         value = getattr(frame, name)
         if isinstance(value, FrameTruth):
-            _tell(told, name, value.instance_ids)
+            if isinstance(value, DeferredTruth):
+                told.update(f"{name} of {value.origin};".encode())
+            else:
+                _tell(told, name, value.instance_ids)
             # repr tells None from "None", and no order of insertion
             told.update(repr(sorted(value.class_names.items())).encode())
         elif isinstance(value, np.ndarray):

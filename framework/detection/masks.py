@@ -25,7 +25,7 @@ def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], thresh
 
 def tight_boxes(masks: Bool) -> Float32:
     """The (N, 4) boxes x1 y1 x2 y2 px of masks (N, H, W): first and last column and row inside; 0 for an empty mask."""
-    return np.asarray(_bounds(masks), np.float32)
+    return np.asarray(_bounds(masks.view(np.uint8)), np.float32)
 
 
 def mask_overlaps(masks: Bool) -> Float64:
@@ -52,17 +52,20 @@ def suppress_duplicates(masks: Bool, iou: float) -> Int32:
 
 @njit(cache=True, nogil=True)
 def _bounds(masks):
-    """From both ends of each row, so that a mask's inside is never read."""
+    """Each row is read whole first, 64 pixels at a time, as most rows are empty; then from both ends."""
     n, height, width = masks.shape
     bounds = np.zeros((n, 4), np.int64)
     for i in range(n):
         x1, y1, x2, y2 = width, height, -1, -1
         for v in range(height):
-            u = 0
-            while u < width and not masks[i, v, u]:
-                u += 1
-            if u == width:
+            filled = np.uint8(0)
+            for u in range(width):
+                filled = np.uint8(filled | masks[i, v, u])  # numba would go on in 64 bits
+            if not filled:
                 continue
+            u = 0
+            while not masks[i, v, u]:
+                u += 1
             x1, y1, y2 = min(x1, u), min(y1, v), v
             u = width - 1
             while not masks[i, v, u]:

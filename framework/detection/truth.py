@@ -32,7 +32,8 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     if frame.truth is None:
         raise DataError(
             f"frame {frame.index} has no instance ground truth, which this detector needs:"
-            " choose a dataset that has it, or another detector"
+            " set dataset.frame_truth=true where the dataset has a labelled mesh (scenenn, scannet),"
+            " or choose another dataset or detector"
         )
     index = {name: k for k, name in enumerate(classes)}
     names = {i: name for i, name in frame.truth.class_names.items() if i != 0 and name is not None}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d
+from numba import njit
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
 
@@ -53,19 +54,29 @@ class RayCaster:
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
-    """Rays (..., 6) through the image points u, v (px, pixel centres at integers).
+    """Rays (A, B, 6) through the image points u, v (px, pixel centres at integers), which broadcast to (A, B).
 
     The direction has length 1 along the optical axis, so that the distance of a hit is its depth.
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    R = T_world_camera[:3, :3]
-    rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)
-    rays[..., :3] = T_world_camera[:3, 3]
-    for c in range(3):  # without BLAS: its rounding may depend on the number of threads
-        rays[..., 3 + c] = R[c, 0] * x + (R[c, 1] * y + R[c, 2])
+    shape = np.broadcast_shapes(x.shape, y.shape)
+    rays = np.empty((*shape, 6), np.float32)
+    T_world_camera = np.ascontiguousarray(T_world_camera, np.float64)
+    _write_rays(np.broadcast_to(x, shape), np.broadcast_to(y, shape), T_world_camera, rays)
     return rays
 
 
 def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
     """The rays (H, W, 6) through all pixel centres."""
     return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])
+
+
+@njit(cache=True, nogil=True)
+def _write_rays(x: Float64, y: Float64, T_world_camera: Float64, rays: Float32) -> None:
+    """Without BLAS: its rounding may depend on the number of threads."""
+    T = T_world_camera
+    for i in range(x.shape[0]):
+        for j in range(x.shape[1]):
+            for c in range(3):
+                rays[i, j, c] = T[c, 3]
+                rays[i, j, 3 + c] = T[c, 0] * x[i, j] + (T[c, 1] * y[i, j] + T[c, 2])

@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numba import njit
 
 from framework.data import Bool, Camera, Float32, UInt8
 
@@ -28,19 +29,24 @@ EDGE_DROP = 0.5  # probability of no reading beside such a step
 GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # from all readings to none
 COLOR_SIGMA = 1.5  # grey levels of 255
 
+_SCALE = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)  # m, depth times steps of disparity
+_LARGEST_THETA = np.float32(np.deg2rad(80))  # the model of axial noise was fitted up to here and then diverges
 
-def axial_sigma(z: Float32, theta: Float32) -> Float32:
+
+@njit(cache=True, nogil=True)
+def axial_sigma(z: np.float32, theta: np.float32) -> np.float32:
     """The standard deviation (m) of depth z (m) at incidence angle theta (rad), Nguyen et al. 2012, eq. 2."""
-    theta = np.minimum(theta, np.float32(np.deg2rad(80)))  # the model was fitted up to here and then diverges
-    return np.asarray(
-        0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(np.maximum(z, 0.1)) * theta**2 / (np.pi / 2 - theta) ** 2,
-        np.float32,
-    )
+    theta = min(theta, _LARGEST_THETA)
+    beyond = z - np.float32(0.4)
+    upright = np.float32(np.pi / 2) - theta
+    slant = np.float32(0.0001) / np.sqrt(max(z, np.float32(0.1))) * (theta * theta) / (upright * upright)
+    return np.float32(np.float32(0.0012) + np.float32(0.0019) * (beyond * beyond) + slant)
 
 
-def depth_step(z: Float32) -> Float32:
+@njit(cache=True, nogil=True)
+def depth_step(z: np.float32) -> np.float32:
     """The distance (m) between neighbouring depth values at depth z (m)."""
-    return np.asarray(z * z / np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE), np.float32)
+    return np.float32(z * z / _SCALE)
 
 
 @dataclass(frozen=True)
@@ -52,72 +58,121 @@ class DepthSensor:
 
     def measure(self, depth: Float32, incidence: Float32, camera: Camera, rng: np.random.Generator) -> Float32:
         """The readings (H, W) m for exact `depth` (H, W) m seen under the cosines `incidence`, 0 = no reading."""
-        exact = np.where(depth <= self.max_range, depth, np.float32(0))
         if self.noise == 0:
-            return exact
-        valid = (exact > MIN_RANGE) & ~_in_projector_shadow(depth, camera)
-        theta = np.arccos(np.minimum(incidence, np.float32(1)))
+            return np.where(depth <= self.max_range, depth, np.float32(0))
         chance = rng.random(depth.shape, np.float32)
-        grazing = (theta - np.float32(GRAZING_START)) / np.float32(GRAZING_END - GRAZING_START)
-        lost = np.where(_beside_edge(depth), np.float32(EDGE_DROP), np.float32(0))
-        valid &= chance >= min(self.noise, 1.0) * np.maximum(lost, grazing)
-        shifted = self._shifted(depth, camera, rng)
-        reading = _quantised(shifted + self._axial(shifted, theta, rng))
-        valid &= (reading > MIN_RANGE) & (reading <= self.max_range)
-        return np.where(valid, reading, np.float32(0))
-
-    def _axial(self, z: Float32, theta: Float32, rng: np.random.Generator) -> Float32:
-        """Gaussian noise which, together with the quantisation that follows, has the measured deviation."""
-        variance = (self.noise * axial_sigma(z, theta)) ** 2 - depth_step(z) ** 2 / 12
-        return np.asarray(np.sqrt(np.maximum(variance, 0)) * rng.standard_normal(z.shape, np.float32), np.float32)
-
-    def _shifted(self, depth: Float32, camera: Camera, rng: np.random.Generator) -> Float32:
-        """Each pixel's depth, or a neighbour's, as the lateral noise falls."""
-        sigma = np.float32(self.noise * LATERAL_SIGMA * camera.width / 640)
-        offset = np.rint(sigma * rng.standard_normal((2, *depth.shape), np.float32)).astype(np.int32)
-        v = np.clip(np.arange(camera.height, dtype=np.int32)[:, None] + offset[0], 0, camera.height - 1)
-        u = np.clip(np.arange(camera.width, dtype=np.int32)[None, :] + offset[1], 0, camera.width - 1)
-        neighbour = depth[v, u]
-        # Only across an edge: within a smooth surface the axial noise already holds all measured deviation.
-        other = np.abs(neighbour - depth) > np.float32(EDGE_JUMP) * depth
-        return np.where(other & (neighbour > 0), neighbour, depth)
+        lateral = rng.standard_normal((2, *depth.shape), np.float32)
+        axial = rng.standard_normal(depth.shape, np.float32)
+        theta = np.arccos(np.minimum(incidence, np.float32(1)))
+        reading = np.zeros(depth.shape, np.float32)
+        _read(
+            depth,
+            theta,
+            chance,
+            lateral,
+            axial,
+            np.float32(self.noise),
+            np.float32(self.noise * LATERAL_SIGMA * camera.width / 640),
+            np.float32(camera.fx * BASELINE),
+            np.float32(self.max_range),
+            reading,
+        )
+        return reading
 
 
 def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
     """`color` with the grain of a camera indoors."""
     if noise == 0:
         return color
-    grain = np.float32(noise * COLOR_SIGMA) * rng.standard_normal(color.shape, np.float32)
-    return np.asarray(np.clip(np.rint(color + grain), 0, 255), np.uint8)
+    grain = rng.standard_normal(color.shape, np.float32)
+    noisy = np.empty_like(color)
+    _add(color.reshape(-1), grain.reshape(-1), np.float32(noise * COLOR_SIGMA), noisy.reshape(-1))
+    return noisy
 
 
-def _quantised(depth: Float32) -> Float32:
-    """Depth rounded to the nearest disparity step."""
-    scale = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)
-    steps = np.rint(scale / np.maximum(depth, np.float32(0.1)))
-    return np.asarray(scale / np.maximum(steps, 1), np.float32)
+# The kernels compute in float32, in this order: other code made readings that these must equal to the last bit.
 
 
-def _in_projector_shadow(depth: Float32, camera: Camera) -> Bool:
-    """Where something nearer stands between the projector, to the right of the camera, and the surface.
+@njit(cache=True, nogil=True)
+def _read(
+    depth: Float32,
+    theta: Float32,
+    chance: Float32,
+    lateral: Float32,
+    axial: Float32,
+    noise: np.float32,
+    lateral_sigma: np.float32,
+    disparity_scale: np.float32,
+    max_range: np.float32,
+    reading: Float32,
+) -> None:
+    """Writes the readings (H, W) m, where there is one.
 
-    Along a row the projector sees pixel u at u - f b / z. A pixel whose place there is not left of all those to its
-    right is hidden by them.
+    depth (H, W) m; theta (H, W) rad, of incidence; chance (H, W) in [0, 1); lateral (2, H, W), along y and x, and axial
+    (H, W): standard normal; lateral_sigma: px; disparity_scale: px m.
     """
-    disparity = np.where(depth > 0, np.float32(camera.fx * BASELINE) / np.maximum(depth, np.float32(0.1)), 0)
-    place = np.arange(camera.width, dtype=np.float32)[None, :] - disparity
-    smallest_to_the_right = np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1]
-    return np.asarray(place > smallest_to_the_right + np.float32(1.0))
+    height, width = depth.shape
+    beside_edge = _beside_edge(depth)
+    most_lost = min(noise, np.float32(1))
+    for v in range(height):
+        # Along a row the projector, to the right of the camera, sees pixel u at u - f b / z. What does not lie left of
+        # all that is to its right is hidden by it: something nearer stands between the projector and the surface.
+        leftmost = np.float32(np.inf)
+        for u in range(width - 1, -1, -1):
+            z = depth[v, u]
+            place = np.float32(u)
+            if z > 0:
+                place -= disparity_scale / max(z, np.float32(0.1))
+            leftmost = min(leftmost, place)
+            if place > leftmost + np.float32(1) or not np.float32(MIN_RANGE) < z <= max_range:
+                continue
+            lost = np.float32(EDGE_DROP) if beside_edge[v, u] else np.float32(0)
+            grazing = (theta[v, u] - np.float32(GRAZING_START)) / np.float32(GRAZING_END - GRAZING_START)
+            if chance[v, u] < most_lost * max(lost, grazing):
+                continue
+            seen = _shifted(depth, v, u, lateral_sigma * lateral[0, v, u], lateral_sigma * lateral[1, v, u])
+            # Gaussian noise which, together with the quantisation that follows, has the measured deviation
+            sigma, step = noise * axial_sigma(seen, theta[v, u]), depth_step(seen)
+            variance = sigma * sigma - step * step / np.float32(12)
+            seen += np.sqrt(max(variance, np.float32(0))) * axial[v, u]
+            steps = np.rint(_SCALE / max(seen, np.float32(0.1)))
+            quantised = _SCALE / max(steps, np.float32(1))
+            if np.float32(MIN_RANGE) < quantised <= max_range:
+                reading[v, u] = quantised
 
 
+@njit(cache=True, nogil=True)
+def _shifted(depth: Float32, v: int, u: int, dv: np.float32, du: np.float32) -> np.float32:
+    """A pixel's depth, or that of the neighbour (dv, du) px aside, rounded, where an edge is in between.
+
+    Only there: within a smooth surface the axial noise already holds all measured deviation.
+    """
+    y = min(max(v + int(np.rint(dv)), 0), depth.shape[0] - 1)
+    x = min(max(u + int(np.rint(du)), 0), depth.shape[1] - 1)
+    own, neighbour = depth[v, u], depth[y, x]
+    across = abs(neighbour - own) > np.float32(EDGE_JUMP) * own
+    return np.float32(neighbour if across and neighbour > 0 else own)
+
+
+@njit(cache=True, nogil=True)
 def _beside_edge(depth: Float32) -> Bool:
-    """The pixels on either side of a step of depth."""
-    edge = np.zeros(depth.shape, np.bool_)
-    for a, b in (
-        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
-    ):
-        step = np.abs(depth[a] - depth[b]) > np.float32(EDGE_JUMP) * np.minimum(depth[a], depth[b])
-        edge[a] |= step
-        edge[b] |= step
+    """The pixels (H, W) on either side of a step of depth."""
+    height, width = depth.shape
+    edge = np.zeros((height, width), np.bool_)
+    for v in range(height):
+        for u in range(width):
+            own = depth[v, u]
+            for y, x in ((v, u + 1), (v + 1, u)):
+                if y < height and x < width:
+                    other = depth[y, x]
+                    if abs(own - other) > np.float32(EDGE_JUMP) * min(own, other):
+                        edge[v, u] = edge[y, x] = True
     return edge
+
+
+@njit(cache=True, nogil=True)
+def _add(color: UInt8, grain: Float32, sigma: np.float32, noisy: UInt8) -> None:
+    """Writes `color` (N,) with `sigma` times `grain` (N,) added, rounded."""
+    for n in range(len(color)):
+        value = np.rint(np.float32(color[n]) + sigma * grain[n])
+        noisy[n] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))

@@ -7,6 +7,7 @@ from enum import IntEnum
 
 import cv2
 import numpy as np
+from numba import njit
 
 from framework.data import Bool, Detections, Float32, Float64, Frame, Int32
 from framework.detection.masks import paste_masks, tight_boxes
@@ -228,10 +229,8 @@ class SimulatedDetector(Detector):
         for k in range(int(random.poisson(self.false_positives))):
             a, b = np.exp(random.uniform(np.log(FALSE_SIZES[0]), np.log(FALSE_SIZES[1]), 2)) / 2
             x, y = random.uniform(0, width), random.uniform(0, height)
-            v, u = np.ogrid[:height, :width]
-            radius = np.hypot((u - x) / a, (v - y) / b)
             wobble = smooth_field(random, (height, width), self.boundary_scale) * (self.boundary_noise / min(a, b))
-            mask = self._coarsen(radius + wobble < 1)
+            mask = self._coarsen(ellipse(x, y, a, b, wobble))
             nothing = np.zeros_like(mask)
             candidates.append(Candidate(-1 - k, 0, int(random.integers(len(self.classes))), mask, nothing))
         return candidates
@@ -276,13 +275,27 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
 def touching_pairs(frame: Frame) -> Int32:
     """The pairs (M, 2) of instance ids, the smaller id first, that share a border without a step in depth."""
     assert frame.truth is not None
-    ids, depth = frame.truth.instance_ids, frame.depth
-    pairs = []
-    for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
-        near = np.abs(depth[here] - depth[there]) < CONTACT_DEPTH
-        contact = (ids[here] != ids[there]) & (ids[here] > 0) & (ids[there] > 0) & near
-        pairs.append(np.stack([ids[here][contact], ids[there][contact]], axis=1))
-    return np.asarray(np.unique(np.sort(np.concatenate(pairs), axis=1), axis=0), np.int32)
+    return np.asarray(np.unique(_contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _contacts(ids, depth):
+    """The pairs (M, 2) of neighbouring pixels' instances, the smaller id first, some of them more than once."""
+    height, width = ids.shape
+    pairs = np.empty((2 * height * width, 2), np.int32)
+    n = 0
+    for v in range(height):
+        for u in range(width):
+            own = ids[v, u]
+            if own <= 0:
+                continue
+            for y, x in ((v, u + 1), (v + 1, u)):
+                if y == height or x == width or ids[y, x] <= 0 or ids[y, x] == own:
+                    continue
+                if abs(depth[v, u] - depth[y, x]) < np.float32(CONTACT_DEPTH):
+                    pairs[n, 0], pairs[n, 1] = min(own, ids[y, x]), max(own, ids[y, x])
+                    n += 1
+    return pairs[:n].copy()
 
 
 def signed_distance(mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Float32:
@@ -308,6 +321,20 @@ def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
     """(C,) a draw from the Dirichlet; a single positive alpha gives that class all."""
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
+
+
+def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
+    """The mask (H, W) of the ellipse about (x, y) with half axes a, b (px), which shrinks by `wobble` (H, W) radii."""
+    mask = np.zeros(wobble.shape, np.bool_)
+    reach = max(0.0, 1.0 - float(wobble.min()))  # radii, at most
+    window = tuple(
+        slice(max(0, int(middle - half * reach)), max(0, int(middle + half * reach) + 2))
+        for middle, half in ((y, b), (x, a))
+    )
+    v, u = (np.arange(side)[part] for side, part in zip(wobble.shape, window, strict=True))
+    radius = np.hypot((u - x)[None, :] / a, (v - y)[:, None] / b)
+    mask[window] = radius + wobble[window] < 1
+    return mask
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:

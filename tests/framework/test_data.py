@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +14,7 @@ import pytest
 from framework.data import (
     Box,
     Camera,
+    DeferredTruth,
     Detections,
     Frame,
     FrameTruth,
@@ -173,3 +177,76 @@ def test_a_pose_is_rigid_within_the_digits_that_files_carry() -> None:
     sheared[3, 0] = 0.1
     with pytest.raises(DataError, match="not a rigid transform"):
         Pose(sheared)
+
+
+# Truth that is rendered when it is asked for
+
+
+def deferred(render: Callable[[], np.ndarray], shape: tuple[int, int] = (3, 4)) -> DeferredTruth:
+    return DeferredTruth(render, shape, {1: "chair"}, origin="somewhere")
+
+
+def test_truth_is_rendered_when_it_is_asked_for_and_not_before() -> None:
+    calls: list[int] = []
+
+    def render() -> np.ndarray:
+        calls.append(1)
+        return np.ones((3, 4), np.int32)
+
+    seen = frame(truth=deferred(render))
+    again = replace(seen, index=8)
+    assert seen.truth is not None
+    assert (seen.truth.shape, seen.truth.class_names) == ((3, 4), {1: "chair"})
+    assert "chair" in repr(seen)
+    assert calls == []
+    assert again.truth is not None
+    for truth in (seen.truth, again.truth, seen.truth):
+        np.testing.assert_array_equal(truth.instance_ids, np.ones((3, 4), np.int32))
+    assert calls == [1]
+
+
+def test_truth_that_many_threads_ask_for_is_rendered_once() -> None:
+    calls: list[int] = []
+    entered, gate = threading.Event(), threading.Event()
+
+    def render() -> np.ndarray:
+        calls.append(1)
+        entered.set()
+        assert gate.wait(10)
+        return np.full((3, 4), len(calls), np.int32)
+
+    truth = deferred(render)
+    with ThreadPoolExecutor(4) as threads:
+        asked = [threads.submit(lambda: truth.instance_ids) for _ in range(4)]
+        assert entered.wait(10)
+        gate.set()
+        found = [one.result(10) for one in asked]
+    assert calls == [1]
+    assert all(ids is found[0] for ids in found)
+
+
+def test_what_rendering_raises_is_raised_where_truth_is_asked_for() -> None:
+    outcomes: list[DataError | np.ndarray] = [DataError("the mesh is gone"), np.ones((3, 4), np.int32)]
+
+    def render() -> np.ndarray:
+        outcome = outcomes.pop(0)
+        if isinstance(outcome, DataError):
+            raise outcome
+        return outcome
+
+    seen = frame(truth=deferred(render))
+    assert seen.truth is not None
+    with pytest.raises(DataError, match="the mesh is gone"):
+        _ = seen.truth.instance_ids
+    assert seen.truth.instance_ids.all()
+
+
+@pytest.mark.parametrize("wrong", [np.ones((4, 3), np.int32), np.ones((3, 4), np.int64)], ids=["shape", "dtype"])
+def test_what_is_rendered_is_checked(wrong: np.ndarray) -> None:
+    with pytest.raises(DataError, match=r"DeferredTruth\.instance_ids must"):
+        _ = deferred(lambda: wrong).instance_ids
+
+
+def test_deferred_truth_of_another_shape_is_refused_before_it_is_rendered() -> None:
+    with pytest.raises(DataError, match=r"frame 7: truth.instance_ids must have shape \(3, 4\), found \(2, 2\)"):
+        frame(truth=deferred(lambda: pytest.fail("rendered"), (2, 2)))

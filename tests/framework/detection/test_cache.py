@@ -17,6 +17,8 @@ from omegaconf import DictConfig
 
 from framework.command_line import CONF
 from framework.data import Detections, Frame, FrameTruth
+from framework.datasets.labeled_mesh import LabeledMesh
+from framework.datasets.rasterizer import Rasterizer
 from framework.detection import cache
 from framework.detection.cache import CachedDetector, CacheMode, cache_metrics, frame_hash, pack, unpack, with_cache
 from framework.errors import ConfigError, DataError, FrameError
@@ -155,6 +157,46 @@ def test_what_a_detector_reads_of_a_frame_counts(room: CornerRoom) -> None:
     assert len({frame_hash(other, everything) for other in (frame, *changed.values())}) == len(changed) + 1
     for name, other in changed.items():
         assert (frame_hash(other, ("color",)) == frame_hash(frame, ("color",))) == (name != "color")
+
+
+def mesh(**changes: Any) -> LabeledMesh:
+    vertices = np.array([[-1, -1, 2], [1, -1, 2], [0, 1, 2]], np.float32)
+    parts = {
+        "vertices": vertices,
+        "triangles": np.array([[0, 1, 2]], np.int32),
+        "instance_ids": np.full(3, 5, np.int32),
+        "class_names": {5: "chair"},
+    }
+    return LabeledMesh(**(parts | changes))
+
+
+def test_truth_of_a_mesh_counts_by_where_it_is_from_and_a_hit_spares_its_rendering(
+    room: CornerRoom, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame, T = room[0], np.eye(4)
+    aside = T.copy()
+    aside[0, 3] = 1e-12
+    moved = mesh().vertices + np.float32(1e-6)
+    truths = [
+        mesh().seen_by(CAMERA, T),
+        mesh(vertices=moved).seen_by(CAMERA, T),
+        mesh(triangles=np.array([[1, 2, 0]], np.int32)).seen_by(CAMERA, T),
+        mesh(instance_ids=np.array([5, 5, 0], np.int32)).seen_by(CAMERA, T),
+        mesh(class_names={5: "couch"}).seen_by(CAMERA, T),
+        mesh().seen_by(replace(CAMERA, fx=50.0), T),
+        mesh().seen_by(CAMERA, aside),
+    ]
+    assert len({frame_hash(replace(frame, truth=truth), ("truth",)) for truth in truths}) == len(truths)
+
+    detector = SimulatedDetector(min_pixels=1)
+    labeled = replace(frame, truth=truths[0])
+    expected = CachedDetector(detector, tmp_path).detect(labeled)
+    assert_same(expected, detector.detect(replace(frame, truth=FrameTruth(truths[0].instance_ids, {5: "chair"}))))
+    monkeypatch.setattr(Rasterizer, "draw", lambda *_: pytest.fail("rendered"))
+    cached = CachedDetector(detector, tmp_path)
+    assert_same(expected, cached.detect(replace(frame, truth=mesh().seen_by(CAMERA, T))))
+    assert cached.hits == 1
+    Noise().detect(replace(frame, truth=mesh().seen_by(CAMERA, T)))
 
 
 def test_reading_a_field_that_there_is_not_is_told(tmp_path: Path) -> None:

@@ -6,7 +6,8 @@ from framework.data import Camera
 from framework.synthetic.camera_path import look
 from framework.synthetic.lights import globe
 from framework.synthetic.piece import Furniture
-from framework.synthetic.renderer import Renderer, to_srgb
+from framework.synthetic.ray_caster import NO_TRIANGLE, image_rays, pixel_rays
+from framework.synthetic.renderer import EDGE_SAMPLES, EDGE_STEP, WHITE, Renderer, to_srgb
 from framework.synthetic.solids import panel, rounded_box
 from framework.synthetic.surfaces import assemble
 from framework.synthetic.textures import Material, Texture
@@ -73,3 +74,59 @@ def test_tone_curve_rises_from_black_to_white():
     assert grey[0] == 0
     assert grey[-1] == 255
     assert (np.diff(grey) >= 0).all()
+
+
+# The kernels against the same arithmetic on whole images
+
+
+def furnished():
+    """Things before each other, some of them with steps of depth inside one part, and nothing beyond."""
+    floor = panel(3.0, 3.0).turned("x", np.pi / 2).moved(y=1.5, z=-0.5)
+    return Renderer(
+        scene(floor, rounded_box(0.5, 0.6, 0.7, 0.05), rounded_box(0.3, 0.2, 1.5, 0.02).moved(x=0.6, y=0.3)),
+        [globe(np.array([-2.0, 1.0, 3.0]), 0.1, (1, 1, 1))],
+    )
+
+
+def test_rays_are_those_of_the_arithmetic_on_whole_images_to_the_bit():
+    T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
+    x, y = (np.arange(64)[None, :] - CAMERA.cx) / CAMERA.fx, (np.arange(48)[:, None] - CAMERA.cy) / CAMERA.fy
+    expected = np.empty((48, 64, 6), np.float32)
+    expected[..., :3] = T[:3, 3]
+    for c in range(3):
+        expected[..., 3 + c] = T[c, 0] * x + (T[c, 1] * y + T[c, 2])
+    np.testing.assert_array_equal(image_rays(CAMERA, T), expected)
+    v, u = np.nonzero(np.random.default_rng(0).random((48, 64)) < 0.1)
+    np.testing.assert_array_equal(pixel_rays(CAMERA, T, u[:, None], v[:, None])[:, 0], expected[v, u])
+
+
+def test_a_picture_is_that_of_the_arithmetic_on_whole_images_to_the_bit():
+    renderer = furnished()
+    T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
+    rays = image_rays(CAMERA, T)
+    hits = renderer.caster.cast(rays)
+    met = hits.triangle != NO_TRIANGLE
+    depth = np.where(met, hits.distance, np.float32(0))
+    d, n = rays[..., 3:], hits.normal
+    along, square = (a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2] for a, b in ((d, n), (d, d)))
+    part = np.where(met, renderer.surfaces.parts[hits.triangle], -1)
+    edge = np.zeros(depth.shape, np.bool_)
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = (part[a] != part[b]) | (np.abs(depth[a] - depth[b]) > EDGE_STEP * depth[a])
+        edge[a] |= step
+        edge[b] |= step
+    light, _ = renderer._shade(rays, hits, CAMERA)
+    v, u = np.nonzero(edge)
+    assert 50 < len(u) < 0.5 * edge.size
+    offsets = np.array(EDGE_SAMPLES)
+    finer = pixel_rays(CAMERA, T, u[:, None] + offsets[:, 0], v[:, None] + offsets[:, 1])
+    samples, _ = renderer._shade(finer, renderer.caster.cast(finer), CAMERA)
+    light[v, u] = np.minimum(samples, WHITE).mean(axis=1)
+
+    picture = renderer.render(CAMERA, T)
+    np.testing.assert_array_equal(picture.depth, depth)
+    np.testing.assert_array_equal(picture.incidence, np.abs(along) / np.sqrt(square))
+    np.testing.assert_array_equal(picture.instance_ids, np.where(met, renderer.surfaces.instance_ids[hits.triangle], 0))
+    np.testing.assert_array_equal(picture.color, to_srgb(light))
+    for a, b in zip(renderer.depth_and_ids(CAMERA, T), (picture.depth, picture.instance_ids), strict=True):
+        np.testing.assert_array_equal(a, b)

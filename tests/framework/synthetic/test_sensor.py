@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.synthetic.sensor import DepthSensor, axial_sigma, depth_step
+from framework.synthetic.sensor import DepthSensor, axial_sigma, depth_step, noisy_color
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 FRONT = np.ones(CAMERA.shape, np.float32)
@@ -70,3 +70,68 @@ def test_half_the_noise_has_about_half_the_deviation():
     wall = 3.0 + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * 0.05
     half, full = ((measure(wall, noise=n) - wall).std() for n in (0.6, 1.0))
     assert half == pytest.approx(0.6 * full, rel=0.2)
+
+
+# The kernels against the same arithmetic on whole images
+
+
+def jagged(seed):
+    """Depth (H, W) m with steps, slants and holes, and cosines (H, W) from 0 to a little over 1, as rounding has it."""
+    rng = np.random.default_rng(seed)
+    blocks = rng.uniform(0.2, 7, (CAMERA.height // 8, CAMERA.width // 8)).astype(np.float32)
+    depth = np.kron(blocks, np.ones((8, 8), np.float32))
+    depth *= rng.uniform(0.97, 1.03, depth.shape).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.05] = 0
+    cosine = rng.uniform(0, 1.0001, depth.shape).astype(np.float32)
+    cosine[depth == 0] = 0
+    return depth, cosine
+
+
+def slow_measure(depth, incidence, noise, max_range, rng):
+    """The readings, one operation on the whole image after the other."""
+    exact = np.where(depth <= max_range, depth, np.float32(0))
+    disparity = np.where(depth > 0, np.float32(CAMERA.fx * 0.075) / np.maximum(depth, np.float32(0.1)), 0)
+    place = np.arange(CAMERA.width, dtype=np.float32)[None, :] - disparity
+    hidden = place > np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1] + np.float32(1)
+    beside = np.zeros(depth.shape, np.bool_)
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = np.abs(depth[a] - depth[b]) > np.float32(0.05) * np.minimum(depth[a], depth[b])
+        beside[a] |= step
+        beside[b] |= step
+    theta = np.arccos(np.minimum(incidence, np.float32(1)))
+    chance = rng.random(depth.shape, np.float32)
+    start, end = np.deg2rad(80.0), np.deg2rad(88.0)
+    grazing = (theta - np.float32(start)) / np.float32(end - start)
+    lost = chance < min(noise, 1.0) * np.maximum(np.where(beside, np.float32(0.5), np.float32(0)), grazing)
+    offset = np.rint(np.float32(noise * 0.8 * CAMERA.width / 640) * rng.standard_normal((2, *depth.shape), np.float32))
+    v = np.clip(np.arange(CAMERA.height)[:, None] + offset[0].astype(int), 0, CAMERA.height - 1)
+    u = np.clip(np.arange(CAMERA.width)[None, :] + offset[1].astype(int), 0, CAMERA.width - 1)
+    neighbour = depth[v, u]
+    z = np.where((np.abs(neighbour - depth) > np.float32(0.05) * depth) & (neighbour > 0), neighbour, depth)
+    t = np.minimum(theta, np.float32(np.deg2rad(80)))
+    sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(np.maximum(z, 0.1)) * t**2 / (np.pi / 2 - t) ** 2
+    scale = np.float32(8 * 580 * 0.075)
+    variance = (noise * sigma) ** 2 - (z * z / scale) ** 2 / 12
+    noisy = z + np.sqrt(np.maximum(variance, 0)) * rng.standard_normal(depth.shape, np.float32)
+    reading = scale / np.maximum(np.rint(scale / np.maximum(noisy, np.float32(0.1))), 1)
+    assert reading.dtype == np.float32
+    valid = (exact > 0.4) & ~hidden & ~lost & (reading > 0.4) & (reading <= max_range)
+    return np.where(valid, reading, np.float32(0))
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 1.7])
+def test_readings_are_those_of_the_arithmetic_on_whole_images_to_the_bit(noise):
+    for seed in range(3):
+        depth, cosine = jagged(seed)
+        expected = slow_measure(depth, cosine, noise, 6.0, np.random.default_rng([seed]))
+        assert 0.1 < np.mean(expected > 0) < 0.9
+        np.testing.assert_array_equal(measure(depth, cosine, noise, seed, 6.0), expected)
+
+
+def test_the_grain_of_colour_is_rounded_and_clipped():
+    color = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
+    grain = np.random.default_rng(1).standard_normal(color.shape, np.float32)
+    for noise in (1.0, 40.0):  # grey levels beyond both ends
+        expected = np.clip(np.rint(color + np.float32(noise * 1.5) * grain), 0, 255).astype(np.uint8)
+        np.testing.assert_array_equal(noisy_color(color, noise, np.random.default_rng(1)), expected)
+    assert noisy_color(color, 0.0, np.random.default_rng(1)) is color

@@ -14,6 +14,7 @@ from plugins.detectors.simulated import (
     LOOKALIKES,
     SimulatedDetector,
     confusion_kernel,
+    ellipse,
     signed_distance,
     smooth_field,
     touching_pairs,
@@ -235,6 +236,32 @@ def test_false_positives():
     found = [detector.detect(replace(empty, index=k)) for k in range(200)]
     assert np.mean([len(d) for d in found]) == pytest.approx(1.5, abs=0.3)
     assert np.mean(np.concatenate([d.scores for d in found])) == pytest.approx(0.25, abs=0.04)
+
+
+def test_touching_pairs_are_those_of_the_arithmetic_on_whole_images():
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        ids = np.kron(rng.integers(0, 9, (12, 16)), np.ones((10, 10), int)).astype(np.int32)
+        depth = np.kron(rng.uniform(1, 1.5, (12, 16)), np.ones((10, 10))).astype(np.float32)
+        expected = set()
+        for here, there in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+            near = np.abs(depth[here] - depth[there]) < 0.1
+            touch = near & (ids[here] > 0) & (ids[there] > 0) & (ids[here] != ids[there])
+            expected |= {tuple(sorted(pair)) for pair in zip(ids[here][touch], ids[there][touch], strict=True)}
+        seen = replace(frame(), depth=depth, truth=FrameTruth(ids, {}))
+        assert touching_pairs(seen).tolist() == sorted(map(list, expected))
+        assert 3 < len(expected) < 36  # of the 36 pairs that there could be
+
+
+@pytest.mark.parametrize("place", [(80.3, 60.2), (0.0, 0.0), (159.9, 119.9), (3.5, 118.0)])
+def test_false_ellipses_are_those_of_the_whole_image(place):
+    x, y = place
+    v, u = np.ogrid[:120, :160]
+    for seed, (a, b) in enumerate(((12.0, 80.0), (40.5, 13.0), (79.0, 80.0))):
+        wobble = smooth_field(np.random.default_rng(seed), (120, 160), 12.0) * np.float32(0.4)
+        for field in (wobble, wobble + np.float32(3)):  # with the latter nothing is left
+            expected = np.hypot((u - x) / a, (v - y) / b) + field < 1
+            np.testing.assert_array_equal(ellipse(x, y, a, b, field), expected)
 
 
 def test_no_truth_is_an_error_and_no_objects_are_none():
