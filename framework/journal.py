@@ -10,6 +10,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from types import TracebackType
 
+import numpy as np
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
@@ -53,6 +54,7 @@ class RunResult:
     timings: tuple[StageTime, ...]
     seconds: float  # wall clock of the whole loop
     stopped_by: KeyboardInterrupt | MapFullError | None = None  # None = the sequence was mapped to its end
+    intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
 
     @property
     def frames_lost(self) -> int:
@@ -63,6 +65,11 @@ class RunResult:
     def fps(self) -> float:
         """Frames per second of wall clock, reading and detection included."""
         return self.frames / self.seconds
+
+    @property
+    def fps_median(self) -> float:
+        """The same by the median frame, without what only some frames cost: compiling the kernels, filling caches."""
+        return 1 / float(np.median(self.intervals)) if self.intervals else self.fps
 
 
 @dataclass
@@ -76,6 +83,7 @@ class Journal:
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
     stopped_by: KeyboardInterrupt | MapFullError | None = None
+    frames_began: list[float] = field(default_factory=list)  # s, when each frame was taken
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
@@ -109,6 +117,7 @@ class Journal:
         self.frames += 1
         self._bar.update()
         now = time.perf_counter()
+        self.frames_began.append(now)
         if not self._bar.disable and now - self._counted_at > COUNT_INTERVAL_S:
             self._bar.set_postfix(instances=self.scene.instance_count, refresh=False)
             self._counted_at = time.perf_counter()
@@ -142,4 +151,5 @@ class Journal:
             timings=tuple(self.timings),
             seconds=self.seconds,
             stopped_by=self.stopped_by,
+            intervals=tuple(np.diff(self.frames_began).tolist()),
         )

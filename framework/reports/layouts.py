@@ -28,6 +28,7 @@ HEADS = {
     },
     "instances.to_map.ap50_agnostic": "AP50 agnostic, to map",
     "fps": "Hz",
+    "fps_median": "Hz (median)",
     "frames_lost": "frames lost",
     "trajectory.ate_rmse_m": "ATE (m)",
     "trajectory.rpe_rmse_m": "RPE (m)",

@@ -25,6 +25,7 @@ def run_metrics(result: RunResult) -> Metrics:
         "frames_lost": result.frames_lost,
         "frames_skipped": result.frames_skipped,
         "fps": result.fps,
+        "fps_median": result.fps_median,
         "pose_source": pose_source(result),
         "map.voxels": result.scene.voxel_count,
         "map.bytes": result.scene.byte_count,

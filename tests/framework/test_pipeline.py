@@ -39,6 +39,9 @@ def test_maps_every_frame_in_order(room: CornerRoom, ahead: int) -> None:
     np.testing.assert_array_equal(result.tracked[5].pose.T_world_camera, pose_at(5))
     assert set(mapped(result).instances()) == {1, 2}
     assert result.fps == pytest.approx(6 / result.seconds)
+    assert len(result.intervals) == 5
+    assert sum(result.intervals) <= result.seconds
+    assert result.fps_median == pytest.approx(1 / sorted(result.intervals)[2])
     for stage in ("read", "detect", "track", "lift", "refine", "fuse"):
         assert [time.frame for time in result.timings if time.stage == stage] == list(range(6))
     assert all(time.milliseconds >= 0 for time in result.timings)
