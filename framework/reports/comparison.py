@@ -13,6 +13,7 @@ from typing import Any
 from framework.command_line import CONF
 from framework.errors import ConfigError, DataError
 from framework.parameters import checked_block, checked_rows
+from framework.reports.metrics import is_evaluation
 from framework.reports.published import NOTHING_PUBLISHED, Published, read_published
 from framework.reports.records import Incomplete, Record, find_records, read_yaml
 from framework.reports.rows import Row, Run, natural, rows_of
@@ -106,6 +107,12 @@ class Comparison:
         rows = rows_of(records, [*choice.over, choice.apart] if choice.apart else choice.over, overrides)
         superseded = len(records) - sum(len(row.records) for row in rows)
         return cls(directory.resolve().name, choice, rows, overrides, incomplete, superseded, directory)
+
+    @property
+    def judged(self) -> bool:
+        """Whether a figure depends on the true instances, of whose annotation there may be several releases."""
+        told = self.choice.apart or any(record.annotation for record in self.records)
+        return bool(told) and any(map(is_evaluation, self.choice.columns))
 
     @property
     def base_name(self) -> str:

@@ -56,6 +56,7 @@ def row_grid(comparison: Comparison) -> Grid:
             *(comparison.called(row), str(len(row.records))),
             *(column.cell(k, column.means[k].deviation, len(row.records)) for column in columns),
             row.pose_source,
+            *([row.annotation or NOTHING] if comparison.judged else []),
         ]
         for k, row in enumerate(rows)
     ]
@@ -64,8 +65,9 @@ def row_grid(comparison: Comparison) -> Grid:
             published_cell(published, (key,), column.decimals)
             for key, column in zip(comparison.choice.columns, columns, strict=True)
         ]
-        body.append([published_name(published), NOTHING, *cells, published.poses])
-    heads = ["row", "runs", *map(head, comparison.choice.columns), "poses"]
+        annotation = [published.annotation] if comparison.judged else []
+        body.append([published_name(published), NOTHING, *cells, published.poses, *annotation])
+    heads = ["row", "runs", *map(head, comparison.choice.columns), "poses"] + ["annotation"] * comparison.judged
     return Grid(heads, body, groups=frozenset({len(rows)}))
 
 

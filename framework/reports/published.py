@@ -26,6 +26,7 @@ class PublishedRow:
     source: str
     remark: str  # how the numbers were come by, and what they are not
     poses: str
+    annotation: str  # the release
     decimals: int  # of the values, in our unit
     values: Mapping[Key, float | None] | None  # in our unit; None = nobody has looked it up, or none of all
 
@@ -59,6 +60,7 @@ def read_published(section: str) -> Published:
             source=row["source"],
             remark=row.get("remark", ""),
             poses=row.get("poses", NOT_KNOWN),
+            annotation=row.get("annotation", NOT_KNOWN),
             decimals=node["decimals"],
             values=None if row["values"] is None else dict(_leaves(row["values"], node["scale"])),
         )

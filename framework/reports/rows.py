@@ -69,6 +69,11 @@ class Row:
         tracked = {"tracked": f"tracked ({self._told(f'{CHOICE}tracker')})"}
         return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
 
+    @property
+    def annotation(self) -> str:
+        """The release of the true instances; "" = the dataset does not say."""
+        return "/".join(sorted({record.annotation for record in self.records.values()}))
+
     def _told(self, key: str) -> str:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from framework.reports.comparison import Comparison
 from framework.reports.grid import Grid, decimals, figure
 from framework.reports.layouts import NOTHING, head, published_cell, published_name
-from framework.reports.published import NOT_KNOWN
+from framework.reports.published import NOT_KNOWN, PublishedRow
 from framework.reports.rows import Mean, Row
 from framework.reports.sequences import SequenceMean, mean_by_sequence, mean_difference, mean_over_sequences
 
@@ -52,7 +52,7 @@ def across_grid(comparison: Comparison) -> Grid:
     ]
     published = [
         _Line(
-            [published_name(one), one.poses],
+            _published_words(comparison, one),
             [
                 *(published_cell(one, (sequence,), places) for sequence in sequences),
                 NOT_KNOWN if one.values is None else NOTHING,  # a mean that nobody has published
@@ -60,7 +60,7 @@ def across_grid(comparison: Comparison) -> Grid:
         )
         for one in comparison.published.rows
     ]
-    return _grid(["system", "poses", *sequences, "mean"], [*sections, published], places)
+    return _grid(["system", *_apart(comparison), *sequences, "mean"], [*sections, published], places)
 
 
 def by_grid(comparison: Comparison) -> Grid:
@@ -83,7 +83,7 @@ def by_grid(comparison: Comparison) -> Grid:
             )
             for row in (rows if sequence in begun else ())
         ] + [
-            _Line([published_name(one), one.poses], [published_cell(one, (sequence, key), places) for key in keys])
+            _Line(_published_words(comparison, one), [published_cell(one, (sequence, key), places) for key in keys])
             for one in comparison.published.rows
             if one.has(sequence)
         ]
@@ -96,7 +96,7 @@ def by_grid(comparison: Comparison) -> Grid:
         )
         for row in rows
     ] + [
-        _Line([published_name(one), one.poses], [NOT_KNOWN] * len(keys))
+        _Line(_published_words(comparison, one), [NOT_KNOWN] * len(keys))
         for one in comparison.published.rows
         if one.values is None
     ]
@@ -104,7 +104,7 @@ def by_grid(comparison: Comparison) -> Grid:
         [replace(line, words=[title if k == 0 else "", *line.words]) for k, line in enumerate(section)]
         for title, section in sections.items()
     ]
-    return _grid([comparison.noun, "system", "poses", *map(head, keys)], titled, places)
+    return _grid([comparison.noun, "system", *_apart(comparison), *map(head, keys)], titled, places)
 
 
 def difference_across_grid(comparison: Comparison) -> Grid:
@@ -124,7 +124,8 @@ def difference_across_grid(comparison: Comparison) -> Grid:
             cells += [f"{overall} *" if mean.is_not_zero else overall, str(len(less[row.name]))]
             section.append(_Line(_words(comparison, row), cells))
         sections.append(section)
-    return _grid([f"{comparison.base_called} less", "poses", *sequences, "mean", "pairs"], sections, places)
+    heads = [f"{comparison.base_called} less", *_apart(comparison), *sequences, "mean", "pairs"]
+    return _grid(heads, sections, places)
 
 
 def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], places: int) -> Grid:
@@ -160,8 +161,19 @@ def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
     return list(groups.values())
 
 
+def _apart(comparison: Comparison) -> list[str]:
+    """The heads of what may not be averaged."""
+    return ["poses", "annotation"] if comparison.judged else ["poses"]
+
+
 def _words(comparison: Comparison, row: Row) -> list[str]:
-    return [comparison.called(row, without="tracker"), row.poses]
+    return [comparison.called(row, without="tracker"), row.poses, row.annotation or NOTHING][
+        : 1 + len(_apart(comparison))
+    ]
+
+
+def _published_words(comparison: Comparison, one: PublishedRow) -> list[str]:
+    return [published_name(one), one.poses, one.annotation][: 1 + len(_apart(comparison))]
 
 
 def _seeds(comparison: Comparison) -> int:

@@ -78,9 +78,6 @@ def _protocol(comparison: Comparison) -> Iterator[str]:
     kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if key.startswith("instances.")}
     if not kinds:
         return
-    if comparison.choice.apart or any(record.annotation for record in comparison.records):
-        told = counted(record.annotation or "not told by the dataset" for record in comparison.records)
-        yield f"Annotation release: {told}."
     near = f"within {MAX_DISTANCE * 100:.0f} cm"
     if False in kinds:
         yield f"Transfer: each true vertex takes the instance of the map's nearest vertex {near}. AP is in [0, 1]."

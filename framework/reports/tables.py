@@ -66,7 +66,7 @@ def comma_separated_rows(comparison: Comparison) -> str:
     keys = [f"{column}.{name}" for column in comparison.choice.columns for name in told]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["row", "runs", "poses", *keys, "code", "config"])
+    writer.writerow(["row", "runs", "poses", "annotation", *keys, "code", "config"])
     for row in comparison.rows:
         line: list[float] = []
         base = row if comparison.base_name in (row.name, row.system) else comparison.base_of(row)
@@ -77,7 +77,7 @@ def comma_separated_rows(comparison: Comparison) -> str:
         figures = ["" if math.isnan(x) else repr(x) for x in line]
         records = list(row.records.values())
         code = counted(record.commit for record in records)
-        writer.writerow([row.name, len(records), row.pose_source, *figures, code, digest(records)])
+        writer.writerow([row.name, len(records), row.pose_source, row.annotation, *figures, code, digest(records)])
     return text.getvalue()
 
 

@@ -75,16 +75,16 @@ def grids(text: str) -> list[list[str]]:
 GOLDEN = """\
 # table3
 
-| system                    | poses        |               011 |               016 |                mean |
-| ------------------------- | ------------ | ----------------: | ----------------: | ------------------: |
-| ours                      | ground truth | **0.700 ± 0.141** |     0.400 ± 0.141 |   **0.550 ± 0.000** |
-| Rival (re-implementation) | ground truth |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
-| other                     | ground truth |     0.200 ± 0.000 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
+| system                    | poses        | annotation        |               011 |               016 |                mean |
+| ------------------------- | ------------ | ----------------- | ----------------: | ----------------: | ------------------: |
+| ours                      | ground truth | synthetic, seed 0 | **0.700 ± 0.141** |     0.400 ± 0.141 |   **0.550 ± 0.000** |
+| Rival (re-implementation) | ground truth | synthetic, seed 0 |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
+| other                     | ground truth | synthetic, seed 0 |     0.200 ± 0.000 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
 
-| ours less                 | poses        |    011 |    016 |           mean | pairs |
-| ------------------------- | ------------ | -----: | -----: | -------------: | ----: |
-| Rival (re-implementation) | ground truth | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
-| other                     | ground truth | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
+| ours less                 | poses        | annotation        |    011 |    016 |           mean | pairs |
+| ------------------------- | ------------ | ----------------- | -----: | -----: | -------------: | ----: |
+| Rival (re-implementation) | ground truth | synthetic, seed 0 | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
+| other                     | ground truth | synthetic, seed 0 | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
 
 - Mean ± sample standard deviation over seed, where there are several. The mean is over the sequences (dataset.scene), \
 each of which counts as one; its deviation is over the runs that have all of them. In bold: the highest of the same \
@@ -95,7 +95,6 @@ are averaged first; * where the 95% interval of Student's t is without 0.
 - ours against other, ground truth: higher in 2 of 2 sequences, lower in 0.
 - What each row changes: ours: nothing; rival: refiner=geometric; other: refiner=identity.
 - In all: tracker=ground_truth.
-- Annotation release: synthetic, seed 0.
 - Transfer: each true vertex takes the instance of the map's nearest vertex within 5 cm. AP is in [0, 1].
 - Code: 1234567.
 - Machine: 2 cores of Z80.
@@ -115,15 +114,17 @@ def test_published_numbers_stand_below_with_their_source(sweep: Path) -> None:
     experiment(sweep, ACROSS | {"published": "table3"})
     text = write_tables(sweep)
     first, _ = grids(text)
-    assert first[0] == "| system | poses | 011 | 016 | 030 | 061 | 078 | 086 | 096 | 206 | 223 | 255 | mean |"
+    assert (
+        first[0] == "| system | poses | annotation | 011 | 016 | 030 | 061 | 078 | 086 | 096 | 206 | 223 | 255 | mean |"
+    )
     missing = " ".join(["missing |"] * 8)
     assert (
         first[2]
-        == f"| ours | ground truth | **0.700 ± 0.141** | 0.400 ± 0.141 | {missing} **0.550 ± 0.000 (2 of 10)** |"
+        == f"| ours | ground truth | synthetic, seed 0 | **0.700 ± 0.141** | 0.400 ± 0.141 | {missing} **0.550 ± 0.000 (2 of 10)** |"
     )
-    assert f"| the paper (published) | not known | {' '.join(['not known |'] * 11)}" in first
+    assert f"| the paper (published) | not known | {' '.join(['not known |'] * 12)}" in first
     assert first[-1] == (
-        "| Voxblox++ with Detectron2 panoptic (published) | ground truth "
+        "| Voxblox++ with Detectron2 panoptic (published) | ground truth | not known "
         "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"
     )
     assert "- Published, Voxblox++ with Detectron2 panoptic: Han et al., ICRA 2021" in text
@@ -145,7 +146,8 @@ def test_pose_sources_are_compared_apart(sweep: Path) -> None:
         ["| Rival (re-implementation)", "tracked (icp)"],
     ]
     assert (
-        first[-1] == "| Rival (re-implementation) | tracked (icp) | **0.300 (1 of 2)** | missing | **0.300 (1 of 2)** |"
+        first[-1]
+        == "| Rival (re-implementation) | tracked (icp) | synthetic, seed 0 | **0.300 (1 of 2)** | missing | **0.300 (1 of 2)** |"
     )
     assert second[-1] == "| Rival (re-implementation) | tracked (icp) | -0.100 | missing | -0.100 | 1 |"
 
@@ -161,15 +163,15 @@ def test_a_row_that_alone_is_tracked_is_not_compared_with_given_poses(sweep: Pat
 
 
 @pytest.mark.parametrize(
-    ("changed", "usual", "other"),
+    ("changed", "usual", "other", "annotation"),
     [
-        ({"data": "/real"}, "dataset.root=/data", "dataset.root=/data/real"),
-        ({"release": "2017"}, "annotation=synthetic, seed 0", "annotation=2017"),
-        ({"release": None}, "annotation=synthetic, seed 0", "annotation=not told"),
+        ({"data": "/real"}, "dataset.root=/data", "dataset.root=/data/real", "synthetic, seed 0"),
+        ({"release": "2017"}, "annotation=synthetic, seed 0", "annotation=2017", "2017"),
+        ({"release": None}, "annotation=synthetic, seed 0", "annotation=not told", "–"),
     ],
 )
 def test_other_data_and_annotations_are_never_averaged_or_compared(
-    sweep: Path, changed: dict[str, Any], usual: str, other: str
+    sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
 ) -> None:
     """Neither inside of a row nor between rows."""
     for path in sweep.glob("*row=other*/metrics.json"):
@@ -180,7 +182,7 @@ def test_other_data_and_annotations_are_never_averaged_or_compared(
     rival, another = f"| Rival (re-implementation), {usual}", f"| other, {other}"
     assert {line.split(" | ")[0] for line in first[2:]} == {f"| ours, {usual}", rival, f"| ours, {other}", another}
     assert [line.split(" | ")[1:] for line in second[2:] if line.startswith(another)] == [
-        ["ground truth", "missing", "missing", "+0.100", "+0.100", "1 |"]
+        ["ground truth", annotation, "missing", "missing", "+0.100", "+0.100", "1 |"]
     ]
     assert len([line for line in second if line.startswith(rival)]) == 1
 
@@ -200,12 +202,12 @@ def test_the_csv_has_a_line_a_run_with_all_digits(sweep: Path) -> None:
 def test_the_papers_table_2_in_groups(sweep: Path) -> None:
     experiment(sweep, BY)
     first, second = grids(write_tables(sweep))
-    assert first[0] == "| scene | system | poses | sofa | television | AP50 |"
+    assert first[0] == "| scene | system | poses | annotation | sofa | television | AP50 |"
     couch = "**0.700 ± 0.141** | – | **0.700 ± 0.141**"
-    assert first[2] == f"| 011 | ours | ground truth | {couch} |"
-    assert first[5] == "| 016 | ours | ground truth | 0.400 ± 0.141 | – | 0.400 ± 0.141 |"
-    assert first[7] == "| | other | ground truth | 0.100 (1 of 2) | – | 0.100 (1 of 2) |"
-    assert first[8] == "| mean | ours | ground truth | **0.550 ± 0.000** | – | **0.550 ± 0.000** |"
+    assert first[2] == f"| 011 | ours | ground truth | synthetic, seed 0 | {couch} |"
+    assert first[5] == "| 016 | ours | ground truth | synthetic, seed 0 | 0.400 ± 0.141 | – | 0.400 ± 0.141 |"
+    assert first[7] == "| | other | ground truth | synthetic, seed 0 | 0.100 (1 of 2) | – | 0.100 (1 of 2) |"
+    assert first[8] == "| mean | ours | ground truth | synthetic, seed 0 | **0.550 ± 0.000** | – | **0.550 ± 0.000** |"
     assert second[0] == "| less ours | pairs | sofa | television | AP50 |"
     assert second[2] == "| Rival (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
 
@@ -243,7 +245,7 @@ def test_published_numbers_stand_in_their_sequences_group(sweep: Path) -> None:
     experiment(sweep, BY | {"published": "table2"})
     first, _ = grids(write_tables(sweep))
     han = "Voxblox++ with Detectron2 panoptic (published) | ground truth"
-    assert first[5] == f"| | {han} | 0.952 | – | 0.655 |"
+    assert first[5] == f"| | {han} | not known | 0.952 | – | 0.655 |"
     assert f"| 030 | {han} | 0.991 | 0.000 | 0.676 |" in first  # no run of ours, yet
     assert first[-1] == "| | Voxblox++ (published) | not known | not known | not known | not known |"
     assert not [line for line in first if line.startswith("| 206")]
