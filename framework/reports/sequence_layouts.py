@@ -60,7 +60,7 @@ def across_grid(comparison: Comparison) -> Grid:
         )
         for one in comparison.published.rows
     ]
-    return _grid(["system", *_apart(comparison), *sequences, "mean"], [*sections, published], places)
+    return _grid([*_heads(comparison, "system"), *sequences, "mean"], [*sections, published], places)
 
 
 def by_grid(comparison: Comparison) -> Grid:
@@ -104,7 +104,7 @@ def by_grid(comparison: Comparison) -> Grid:
         [replace(line, words=[title if k == 0 else "", *line.words]) for k, line in enumerate(section)]
         for title, section in sections.items()
     ]
-    return _grid([comparison.noun, "system", *_apart(comparison), *map(head, keys)], titled, places)
+    return _grid([comparison.noun, *_heads(comparison, "system"), *map(head, keys)], titled, places)
 
 
 def difference_across_grid(comparison: Comparison) -> Grid:
@@ -124,7 +124,7 @@ def difference_across_grid(comparison: Comparison) -> Grid:
             cells += [f"{overall} *" if mean.is_not_zero else overall, str(len(less[row.name]))]
             section.append(_Line(_words(comparison, row), cells))
         sections.append(section)
-    heads = [f"{comparison.base_called} less", *_apart(comparison), *sequences, "mean", "pairs"]
+    heads = [*_heads(comparison, f"{comparison.base_called} less"), *sequences, "mean", "pairs"]
     return _grid(heads, sections, places)
 
 
@@ -161,19 +161,21 @@ def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
     return list(groups.values())
 
 
-def _apart(comparison: Comparison) -> list[str]:
-    """The heads of what may not be averaged."""
-    return ["poses", "annotation"] if comparison.judged else ["poses"]
+def _told(comparison: Comparison, name: str, poses: str, annotation: str) -> list[str]:
+    """What a line, or the head, begins with: a name and what may not be averaged."""
+    return [name, poses, annotation] if comparison.judged else [name, poses]
 
 
 def _words(comparison: Comparison, row: Row) -> list[str]:
-    return [comparison.called(row, without="tracker"), row.poses, row.annotation or NOTHING][
-        : 1 + len(_apart(comparison))
-    ]
+    return _told(comparison, comparison.called(row, without="tracker"), row.poses, row.annotation or NOTHING)
 
 
 def _published_words(comparison: Comparison, one: PublishedRow) -> list[str]:
-    return [published_name(one), one.poses, one.annotation][: 1 + len(_apart(comparison))]
+    return _told(comparison, published_name(one), one.poses, one.annotation)
+
+
+def _heads(comparison: Comparison, name: str) -> list[str]:
+    return _told(comparison, name, "poses", "annotation")
 
 
 def _seeds(comparison: Comparison) -> int:
