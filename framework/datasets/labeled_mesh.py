@@ -9,11 +9,12 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 
+from framework import rasterizer
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
-from framework.datasets import rasterizer
-from framework.datasets.rasterizer import Rasterizer
 from framework.detection.fingerprint import file_hash
+from framework.rasterizer import NO_TRIANGLE, Rasterizer
 
 
 @dataclass(frozen=True)
@@ -35,11 +36,16 @@ class LabeledMesh:
         They are those of the mesh's vertices nearest to what the pixels meet.
         """
         return DeferredTruth(
-            render=lambda: self._rasterizer.draw(self.instance_ids, camera, T_world_camera),
+            render=lambda: self._drawn(camera, T_world_camera),
             shape=camera.shape,
             class_names=self.class_names,
             origin=f"{self._fingerprint} {camera!r} {T_world_camera.tobytes().hex()}",
         )
+
+    def _drawn(self, camera: Camera, T_world_camera: Float64) -> Int32:
+        sight = self._rasterizer.draw(camera, T_world_camera)
+        labels = _labels(sight.triangle, sight.nearest_corner, self.triangles, self.instance_ids)
+        return np.asarray(labels, np.int32)
 
     @cached_property
     def _rasterizer(self) -> Rasterizer:
@@ -55,3 +61,14 @@ class LabeledMesh:
         for source in (__file__, rasterizer.__file__):
             told.update(file_hash(Path(source)).encode())
         return told.hexdigest()
+
+
+@njit(cache=True, nogil=True)
+def _labels(triangle: Int32, corner: Int32, triangles: Int32, instance_ids: Int32) -> Int32:
+    """The instances (H, W) at the corners (H, W) of the triangles (H, W) that are seen, 0 where none is."""
+    labels = np.zeros(triangle.shape, np.int32)
+    for v in range(triangle.shape[0]):
+        for u in range(triangle.shape[1]):
+            if triangle[v, u] != NO_TRIANGLE:
+                labels[v, u] = instance_ids[triangles[triangle[v, u], corner[v, u]]]
+    return labels

@@ -18,12 +18,12 @@ from omegaconf import DictConfig
 from framework.command_line import CONF
 from framework.data import Detections, Frame, FrameTruth
 from framework.datasets.labeled_mesh import LabeledMesh
-from framework.datasets.rasterizer import Rasterizer
 from framework.detection import cache
 from framework.detection.cache import CachedDetector, CacheMode, cache_metrics, frame_hash, pack, unpack, with_cache
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
+from framework.rasterizer import Rasterizer
 from framework.run import run
 from plugins.detectors.simulated import SimulatedDetector
 from tests import detector_files, registered

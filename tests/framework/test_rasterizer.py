@@ -3,28 +3,28 @@
 from __future__ import annotations
 
 import threading
+from dataclasses import astuple
 
 import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.datasets.rasterizer import CHUNK, Rasterizer
 from framework.geometry import exp_se3
+from framework.rasterizer import CHUNK, NO_TRIANGLE, Rasterizer, Sight
 from framework.synthetic.camera_path import look
-from framework.synthetic.ray_caster import NO_TRIANGLE, RayCaster, pixel_rays
+from framework.synthetic.ray_caster import RayCaster, image_rays, pixel_rays
 
 CAMERA = Camera(96, 64, 80.0, 85.0, 47.3, 31.1)
 ASIDE = 2e-3  # px: rays this far apart that meet vertices alike say that the answer is no matter of rounding
 
 
-def numbered(vertices: np.ndarray) -> np.ndarray:
-    """Each vertex labelled with its index, from 1."""
-    return np.arange(1, len(vertices) + 1, dtype=np.int32)
-
-
 def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
     """(H, W) the index of the nearest vertex, -1 = nothing."""
-    return Rasterizer(vertices, triangles).draw(numbered(vertices), camera, T) - 1
+    sight = Rasterizer(vertices, triangles).draw(camera, T)
+    if not len(triangles):
+        return sight.triangle
+    corner = np.take_along_axis(triangles[sight.triangle], sight.nearest_corner[..., None], axis=-1)[..., 0]
+    return np.where(sight.triangle == NO_TRIANGLE, -1, corner)
 
 
 def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: float, dv: float) -> np.ndarray:
@@ -58,6 +58,28 @@ def test_confetti_is_seen_as_rays_meet_it(size: float, count: int, seed: int) ->
     rng = np.random.default_rng([seed, count])
     vertices, triangles = confetti(rng, size, count)
     assert_sees_what_rays_meet(vertices, triangles, exp_se3(rng.normal(0, 1, 6)))
+
+
+@pytest.mark.parametrize("size", [0.2, 3.0])
+def test_depth_and_weights_are_those_of_rays(size: float) -> None:
+    rng = np.random.default_rng(7)
+    vertices, triangles = confetti(rng, size, 400)
+    T = exp_se3(rng.normal(0, 1, 6))
+    sight = Rasterizer(vertices, triangles).draw(CAMERA, T)
+    hits = RayCaster(vertices, triangles).cast(image_rays(CAMERA, T))
+    same = (sight.triangle == hits.triangle) & (sight.triangle != NO_TRIANGLE)
+    assert (sight.triangle == hits.triangle).mean() > 0.99
+    assert same.sum() > 1000
+    u, v = np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height))
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1)
+    points = T[:3, 3] + sight.depth[..., None] * (rays @ T[:3, :3].T)  # where the corners' weighted mean must be, too
+    weights = np.concatenate([1 - sight.uv.sum(axis=-1, keepdims=True), sight.uv], axis=-1)
+    mean = np.einsum("nk,nkc->nc", weights[same], vertices[triangles[sight.triangle[same]]].astype(float))
+    np.testing.assert_allclose(mean, points[same], atol=1e-5)
+    np.testing.assert_allclose(np.median(np.abs(sight.depth[same] - hits.distance[same])), 0, atol=1e-6)
+    nothing = sight.triangle == NO_TRIANGLE
+    assert (sight.depth[nothing] == 0).all()
+    assert (sight.depth[~nothing] > 0).all()
 
 
 def test_a_closed_surface_has_no_gap() -> None:
@@ -110,11 +132,11 @@ def test_several_threads_draw_at_once() -> None:
     vertices, triangles = confetti(np.random.default_rng(0), 0.1, 3000)
     rasterizer = Rasterizer(vertices, triangles)
     poses = [exp_se3(np.random.default_rng(k).normal(0, 1, 6)) for k in range(8)]
-    alone = [rasterizer.draw(numbered(vertices), CAMERA, T) for T in poses]
-    together: dict[int, np.ndarray] = {}
+    alone = [rasterizer.draw(CAMERA, T) for T in poses]
+    together: dict[int, Sight] = {}
 
     def draw(k: int) -> None:
-        together[k] = rasterizer.draw(numbered(vertices), CAMERA, poses[k])
+        together[k] = rasterizer.draw(CAMERA, poses[k])
 
     threads = [threading.Thread(target=draw, args=(k,)) for k in range(len(poses))]
     for thread in threads:
@@ -122,4 +144,5 @@ def test_several_threads_draw_at_once() -> None:
     for thread in threads:
         thread.join()
     for k, expected in enumerate(alone):
-        np.testing.assert_array_equal(together[k], expected)
+        for a, b in zip(astuple(together[k]), astuple(expected), strict=True):
+            np.testing.assert_array_equal(a, b)

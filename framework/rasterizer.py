@@ -7,16 +7,33 @@ each pixel: nothing has to be clipped, and neighbours that share an edge leave n
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32
 
+NO_TRIANGLE = -1
 CHUNK = 32  # triangles that are looked at together
 SLACK = 0.01  # px by which bounds are wider than what they hold, so that rounding loses no pixel
 CELLS = 1023  # along each axis, of the cube that is ordered
 NEAR = 1e-9  # m, where triangles that reach behind the camera are cut to find their bounds
+
+
+@dataclass(frozen=True)
+class Sight:
+    """What each pixel of a picture shows of a mesh."""
+
+    triangle: Int32  # (H, W), NO_TRIANGLE = nothing is seen
+    depth: Float32  # (H, W) m along z, 0 = nothing
+    uv: Float32  # (H, W, 2) barycentric weights of the triangle's second and third vertex
+
+    @property
+    def nearest_corner(self) -> Int32:
+        """(H, W) which vertex of its triangle is nearest, 0 to 2: the first one with the largest weight."""
+        return np.asarray(_nearest_corner(self.uv), np.int32)
 
 
 class Rasterizer:
@@ -26,28 +43,29 @@ class Rasterizer:
         """vertices (V, 3) m, world; triangles (F, 3), seen from both sides."""
         self._vertices = np.ascontiguousarray(vertices, np.float32)
         # neighbours in space one after the other, so that they are in sight, and in the processor's caches, together
-        self._triangles = triangles.astype(np.int32, copy=False)[np.argsort(_curve(vertices, triangles), kind="stable")]
+        self._order = np.argsort(_curve(self._vertices, triangles), kind="stable").astype(np.int32)
+        self._triangles = triangles.astype(np.int32, copy=False)[self._order]
         self._spheres = _bounding_spheres(self._vertices, self._triangles)
 
-    def draw(self, labels: Int32, camera: Camera, T_world_camera: Float64) -> Int32:
-        """For each pixel (H, W) the label of the vertex nearest to what it sees, 0 where it sees nothing; labels (V,).
-
-        Nearest is the corner with the largest barycentric weight where the pixel's ray first hits. Of surfaces at the
-        same depth it is always the same one that is seen.
-        """
-        image = np.zeros(camera.shape, np.int32)
+    def draw(self, camera: Camera, T_world_camera: Float64) -> Sight:
+        """What the ray of each pixel meets first. Of surfaces at the same depth it is always the same one."""
+        triangle = np.empty(camera.shape, np.int32)
+        depth = np.empty(camera.shape, np.float32)
+        uv = np.empty((*camera.shape, 2), np.float32)
         _draw(
             self._vertices,
             self._triangles,
+            self._order,
             self._spheres,
-            np.ascontiguousarray(labels, np.int32),
             np.ascontiguousarray(T_world_camera, np.float64),
             (camera.fx, camera.fy, camera.cx, camera.cy),
             (np.arange(camera.width) - camera.cx) / camera.fx,
             (np.arange(camera.height) - camera.cy) / camera.fy,
-            image,
+            triangle,
+            depth,
+            uv,
         )
-        return image
+        return Sight(triangle, depth, uv)
 
 
 @njit(cache=True, nogil=True)
@@ -96,51 +114,96 @@ def _bounding_spheres(vertices: Float32, triangles: Int32) -> Float64:
 def _draw(
     vertices: Float32,
     triangles: Int32,
+    order: Int32,
     spheres: Float64,
-    labels: Int32,
     T_world_camera: Float64,
     intrinsics: tuple[float, float, float, float],
     x: Float64,
     y: Float64,
-    image: Int32,
+    triangle: Int32,
+    depth: Float32,
+    uv: Float32,
 ) -> None:
-    """Writes to `image`; x (W,) and y (H,) are the pixels' places on the plane z = 1."""
-    height, width = image.shape
+    """Writes the last three, (H, W) and (H, W, 2); x (W,) and y (H,) are the pixels' places on the plane z = 1."""
+    height, width = triangle.shape
     closeness = np.zeros((height, width))  # 1/m
+    triangle[:] = NO_TRIANGLE  # until the end, in the order of `triangles`
     for chunk in range(len(spheres)):
         center = _in_camera(T_world_camera, spheres[chunk, 0], spheres[chunk, 1], spheres[chunk, 2])
         if _is_out_of_sight(center, spheres[chunk, 3], intrinsics, width, height):
             continue
         for f in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(triangles))):
-            i, j, k = np.uint64(triangles[f, 0]), np.uint64(triangles[f, 1]), np.uint64(triangles[f, 2])
-            a = _in_camera(T_world_camera, vertices[i, 0], vertices[i, 1], vertices[i, 2])
-            b = _in_camera(T_world_camera, vertices[j, 0], vertices[j, 1], vertices[j, 2])
-            c = _in_camera(T_world_camera, vertices[k, 0], vertices[k, 1], vertices[k, 2])
+            a, b, c = _corners(vertices, triangles, f, T_world_camera)
             u0, u1, v0, v1 = _pixels_of(a, b, c, intrinsics, width, height)
             if u1 <= u0 or v1 <= v0:
                 continue
-            # Edge functions: a corner's barycentric weight, but for a factor that all three share, is the product of
-            # the pixel's ray and the cross product of the other two corners. Neighbours compute that of their common
-            # edge alike but for the sign, so that no pixel falls between them.
-            ax, ay, az = _cross(b, c)
-            bx, by, bz = _cross(c, a)
-            cx, cy, cz = _cross(a, b)
-            volume = a[0] * ax + a[1] * ay + a[2] * az
+            ea, eb, ec, volume = _edge_functions(a, b, c)
             if volume == 0:
                 continue  # the camera lies in its plane
-            if volume < 0:  # its other side is seen
-                volume = -volume
-                ax, ay, az, bx, by, bz, cx, cy, cz = -ax, -ay, -az, -bx, -by, -bz, -cx, -cy, -cz
             scale = 1 / volume
             for v in range(np.uint64(v0), np.uint64(v1)):
-                row_a, row_b, row_c = ay * y[v] + az, by * y[v] + bz, cy * y[v] + cz
+                row_a, row_b, row_c = ea[1] * y[v] + ea[2], eb[1] * y[v] + eb[2], ec[1] * y[v] + ec[2]
                 for u in range(np.uint64(u0), np.uint64(u1)):
-                    wa, wb, wc = ax * x[u] + row_a, bx * x[u] + row_b, cx * x[u] + row_c
+                    wa, wb, wc = ea[0] * x[u] + row_a, eb[0] * x[u] + row_b, ec[0] * x[u] + row_c
                     if (wa >= 0) & (wb >= 0) & (wc >= 0):
                         near = (wa + wb + wc) * scale
                         if near > closeness[v, u]:
                             closeness[v, u] = near
-                            image[v, u] = labels[i if wa >= wb and wa >= wc else (j if wb >= wc else k)]
+                            triangle[v, u] = f
+    for v in range(height):
+        drawn = NO_TRIANGLE
+        for u in range(width):
+            f = triangle[v, u]
+            if f == NO_TRIANGLE:
+                depth[v, u], uv[v, u, 0], uv[v, u, 1] = 0, 0, 0
+                continue
+            if f != drawn:
+                drawn = f
+                a, b, c = _corners(vertices, triangles, f, T_world_camera)
+                ea, eb, ec, _ = _edge_functions(a, b, c)
+            wa = ea[0] * x[u] + (ea[1] * y[v] + ea[2])
+            wb = eb[0] * x[u] + (eb[1] * y[v] + eb[2])
+            wc = ec[0] * x[u] + (ec[1] * y[v] + ec[2])
+            share = 1 / (wa + wb + wc)
+            triangle[v, u] = order[f]
+            depth[v, u], uv[v, u, 0], uv[v, u, 1] = 1 / closeness[v, u], wb * share, wc * share
+
+
+@njit(cache=True, nogil=True)
+def _nearest_corner(uv: Float32) -> Int32:
+    corner = np.empty(uv.shape[:2], np.int32)
+    for v in range(uv.shape[0]):
+        for u in range(uv.shape[1]):
+            b, c = uv[v, u, 0], uv[v, u, 1]
+            a = 1 - b - c
+            corner[v, u] = 0 if a >= b and a >= c else (1 if b >= c else 2)
+    return corner
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _corners(vertices, triangles, f, T_world_camera):  # type: ignore[no-untyped-def]
+    """The corners of triangle f in the camera's coordinates."""
+    i, j, k = np.uint64(triangles[f, 0]), np.uint64(triangles[f, 1]), np.uint64(triangles[f, 2])
+    return (
+        _in_camera(T_world_camera, vertices[i, 0], vertices[i, 1], vertices[i, 2]),
+        _in_camera(T_world_camera, vertices[j, 0], vertices[j, 1], vertices[j, 2]),
+        _in_camera(T_world_camera, vertices[k, 0], vertices[k, 1], vertices[k, 2]),
+    )
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _edge_functions(a, b, c):  # type: ignore[no-untyped-def]
+    """The three edge functions of a triangle, and its corners' triple product, which is 0 or positive.
+
+    A corner's barycentric weight, but for a factor that all three share, is the product of the pixel's ray and the
+    cross product of the other two corners. Neighbours compute that of their common edge alike but for the sign, so that
+    no pixel falls between them.
+    """
+    ea, eb, ec = _cross(b, c), _cross(c, a), _cross(a, b)
+    volume = a[0] * ea[0] + a[1] * ea[1] + a[2] * ea[2]
+    if volume < 0:  # its other side is seen
+        return (-ea[0], -ea[1], -ea[2]), (-eb[0], -eb[1], -eb[2]), (-ec[0], -ec[1], -ec[2]), -volume
+    return ea, eb, ec, volume
 
 
 @njit(cache=True, nogil=True, inline="always")
