@@ -14,7 +14,7 @@ from framework.errors import ConfigError
 from framework.evaluation.scene_truth import LabeledDepth, fuse_scene_truth
 from framework.interfaces import RGBDSequence
 from framework.synthetic.camera_path import FRAME_RATE, plan_path
-from framework.synthetic.renderer import Renderer
+from framework.synthetic.renderer import Renderer, ids_met
 from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.sensor import DepthSensor, noisy_color
 
@@ -71,7 +71,7 @@ class Synthetic(RGBDSequence):
         self.path = plan_path(
             self.room.layout,
             self.frames,
-            lambda T_world_camera: self._renderer.depth_and_ids(small, T_world_camera)[1],
+            lambda T_world_camera: ids_met(self.room.surfaces, self._renderer.caster, small, T_world_camera),
             wanted,
             rng,
         )

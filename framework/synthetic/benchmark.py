@@ -37,7 +37,7 @@ from framework.synthetic.groups import (
 )
 from framework.synthetic.piece import Rng
 from framework.synthetic.ray_caster import RayCaster
-from framework.synthetic.renderer import depth_and_ids
+from framework.synthetic.renderer import ids_met
 from framework.synthetic.room import Room, furnish_with
 
 SMALLEST = (4.2, 3.8)  # m, width and depth of the smallest room tried
@@ -168,7 +168,7 @@ def _draw_scene(spec: SceneSpec, frames: int, rng: Rng) -> tuple[Scene, tuple[fl
     wanted = {i: name for i, name in surfaces.class_names.items() if name is not None}
 
     def labels(T_world_camera: Float64) -> Int32:
-        return depth_and_ids(surfaces, caster, SMALL_VIEW, T_world_camera)[1]
+        return ids_met(surfaces, caster, SMALL_VIEW, T_world_camera)
 
     path = plan_path(room.layout, frames, labels, set(wanted), rng)
     views = [labels(path.pose(k)) for k in range(0, frames, -(-frames // JUDGED_VIEWS))]

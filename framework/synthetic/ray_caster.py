@@ -13,8 +13,6 @@ from framework.data import Bool, Camera, Float32, Float64, Int32
 
 Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 
-NO_TRIANGLE = -1
-
 
 @dataclass(frozen=True)
 class Hits:

@@ -30,7 +30,7 @@ from framework.scenenn.intrinsics import write_intrinsics
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import Recording, SceneNNScene, frame_files, trajectory_file
 
-GENERATION = 1  # of the rooms that this code makes: raise it when they change, so that none are mixed
+GENERATION = 2  # of the rooms that this code makes: raise it when they change, so that none are mixed
 FRAMES_AT_ONCE = 8  # few, so that all processes end at about the same time
 
 Piece = Callable[[SceneNNScene], int]  # writes some files, returns how many of them are frames

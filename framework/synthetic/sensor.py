@@ -12,12 +12,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import lru_cache
+from statistics import NormalDist
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
 from framework.data import Bool, Camera, Float32, UInt8
+
+UInt16 = npt.NDArray[np.uint16]
 
 BASELINE = 0.075  # m, between projector and camera
 DISPARITY_STEPS = 8.0  # per px
@@ -28,6 +34,8 @@ EDGE_JUMP = 0.05  # relative step of depth that the sensor's correlation window 
 EDGE_DROP = 0.5  # probability of no reading beside such a step
 GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # from all readings to none
 COLOR_SIGMA = 1.5  # grey levels of 255
+QUANTILE_BITS = 12  # a normal error is one of so many equally likely ones: up to 3.7 standard deviations
+SPARE_BITS = 16 - QUANTILE_BITS
 
 _SCALE = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)  # m, depth times steps of disparity
 _LARGEST_THETA = np.float32(np.deg2rad(80))  # the model of axial noise was fitted up to here and then diverges
@@ -60,17 +68,13 @@ class DepthSensor:
         """The readings (H, W) m for exact `depth` (H, W) m seen under the cosines `incidence`, 0 = no reading."""
         if self.noise == 0:
             return np.where(depth <= self.max_range, depth, np.float32(0))
-        chance = rng.random(depth.shape, np.float32)
-        lateral = rng.standard_normal((2, *depth.shape), np.float32)
-        axial = rng.standard_normal(depth.shape, np.float32)
         theta = np.arccos(np.minimum(incidence, np.float32(1)))
         reading = np.zeros(depth.shape, np.float32)
         _read(
             depth,
             theta,
-            chance,
-            lateral,
-            axial,
+            random_bits((*depth.shape, 4), rng),
+            normal_quantiles(),
             np.float32(self.noise),
             np.float32(self.noise * LATERAL_SIGMA * camera.width / 640),
             np.float32(camera.fx * BASELINE),
@@ -84,10 +88,25 @@ def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
     """`color` with the grain of a camera indoors."""
     if noise == 0:
         return color
-    grain = rng.standard_normal(color.shape, np.float32)
     noisy = np.empty_like(color)
-    _add(color.reshape(-1), grain.reshape(-1), np.float32(noise * COLOR_SIGMA), noisy.reshape(-1))
+    bits = random_bits((color.size,), rng)
+    _add(color.reshape(-1), bits, normal_quantiles(), np.float32(noise * COLOR_SIGMA), noisy.reshape(-1))
     return noisy
+
+
+def random_bits(shape: tuple[int, ...], rng: np.random.Generator) -> UInt16:
+    """16 random bits in each place: several times cheaper than as many random numbers of a distribution."""
+    count = math.prod(shape)
+    words = rng.integers(0, 2**64, -(-count // 4), np.uint64)
+    return words.view(np.uint16)[:count].reshape(shape)
+
+
+@lru_cache
+def normal_quantiles() -> Float32:
+    """(2^QUANTILE_BITS,) equally likely numbers of mean 0 and variance 1 that are distributed normally."""
+    count = 1 << QUANTILE_BITS
+    quantiles = np.array([NormalDist().inv_cdf((k + 0.5) / count) for k in range(count)])
+    return np.asarray(quantiles / quantiles.std(), np.float32)
 
 
 # The kernels compute in float32, in this order: other code made readings that these must equal to the last bit.
@@ -97,9 +116,8 @@ def noisy_color(color: UInt8, noise: float, rng: np.random.Generator) -> UInt8:
 def _read(
     depth: Float32,
     theta: Float32,
-    chance: Float32,
-    lateral: Float32,
-    axial: Float32,
+    random: UInt16,
+    normal: Float32,
     noise: np.float32,
     lateral_sigma: np.float32,
     disparity_scale: np.float32,
@@ -108,8 +126,8 @@ def _read(
 ) -> None:
     """Writes the readings (H, W) m, where there is one.
 
-    depth (H, W) m; theta (H, W) rad, of incidence; chance (H, W) in [0, 1); lateral (2, H, W), along y and x, and axial
-    (H, W): standard normal; lateral_sigma: px; disparity_scale: px m.
+    depth (H, W) m; theta (H, W) rad, of incidence; random (H, W, 4) bits: for losing a reading, for the lateral error
+    along y and x and for the axial one; normal (N,): normal_quantiles; lateral_sigma: px; disparity_scale: px m.
     """
     height, width = depth.shape
     beside_edge = _beside_edge(depth)
@@ -128,13 +146,16 @@ def _read(
                 continue
             lost = np.float32(EDGE_DROP) if beside_edge[v, u] else np.float32(0)
             grazing = (theta[v, u] - np.float32(GRAZING_START)) / np.float32(GRAZING_END - GRAZING_START)
-            if chance[v, u] < most_lost * max(lost, grazing):
+            chance = np.float32(random[v, u, 0]) / np.float32(65536)
+            if chance < most_lost * max(lost, grazing):
                 continue
-            seen = _shifted(depth, v, u, lateral_sigma * lateral[0, v, u], lateral_sigma * lateral[1, v, u])
+            aside_v = lateral_sigma * normal[random[v, u, 1] >> SPARE_BITS]
+            aside_u = lateral_sigma * normal[random[v, u, 2] >> SPARE_BITS]
+            seen = _shifted(depth, v, u, aside_v, aside_u)
             # Gaussian noise which, together with the quantisation that follows, has the measured deviation
             sigma, step = noise * axial_sigma(seen, theta[v, u]), depth_step(seen)
             variance = sigma * sigma - step * step / np.float32(12)
-            seen += np.sqrt(max(variance, np.float32(0))) * axial[v, u]
+            seen += np.sqrt(max(variance, np.float32(0))) * normal[random[v, u, 3] >> SPARE_BITS]
             steps = np.rint(_SCALE / max(seen, np.float32(0.1)))
             quantised = _SCALE / max(steps, np.float32(1))
             if np.float32(MIN_RANGE) < quantised <= max_range:
@@ -171,8 +192,8 @@ def _beside_edge(depth: Float32) -> Bool:
 
 
 @njit(cache=True, nogil=True)
-def _add(color: UInt8, grain: Float32, sigma: np.float32, noisy: UInt8) -> None:
-    """Writes `color` (N,) with `sigma` times `grain` (N,) added, rounded."""
+def _add(color: UInt8, random: UInt16, normal: Float32, sigma: np.float32, noisy: UInt8) -> None:
+    """Writes `color` (N,) with noise of this deviation added, rounded; random (N,) bits, normal: normal_quantiles."""
     for n in range(len(color)):
-        value = np.rint(np.float32(color[n]) + sigma * grain[n])
+        value = np.rint(np.float32(color[n]) + sigma * normal[random[n] >> SPARE_BITS])
         noisy[n] = np.uint8(min(max(value, np.float32(0)), np.float32(255)))

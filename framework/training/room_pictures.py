@@ -15,7 +15,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -102,8 +102,7 @@ def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[
             _, ids = renderer.depth_and_ids(camera, T_world_camera)
             if np.isin(ids, list(names)).sum() >= LEAST:
                 break
-        renderer.surfaces = replace(room.surfaces, material_table=_tinted(room.surfaces.material_table, rng))
-        picture = renderer.render(camera, T_world_camera)
+        picture = renderer.render(camera, T_world_camera, _tinted(room.surfaces.material_table, rng))
         yield noisy_color(picture.color, rng.uniform(0, 2), rng), picture.instance_ids.astype(np.uint16), names
 
 

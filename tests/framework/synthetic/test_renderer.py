@@ -3,14 +3,16 @@
 import numpy as np
 
 from framework.data import Camera
+from framework.rasterizer import NO_TRIANGLE
 from framework.synthetic.camera_path import look
 from framework.synthetic.lights import globe
 from framework.synthetic.piece import Furniture
-from framework.synthetic.ray_caster import NO_TRIANGLE, image_rays, pixel_rays
-from framework.synthetic.renderer import EDGE_SAMPLES, EDGE_STEP, WHITE, Renderer, to_srgb
+from framework.synthetic.ray_caster import image_rays, pixel_rays
+from framework.synthetic.renderer import Renderer, ids_met, to_srgb
+from framework.synthetic.shading import EDGE_SAMPLES, EDGE_STEP, WHITE
 from framework.synthetic.solids import panel, rounded_box
 from framework.synthetic.surfaces import assemble
-from framework.synthetic.textures import Material, Texture
+from framework.synthetic.textures import Material, Texture, surface_color
 
 CAMERA = Camera(64, 48, 50.0, 55.0, 30.7, 22.9)
 GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
@@ -76,7 +78,7 @@ def test_tone_curve_rises_from_black_to_white():
     assert (np.diff(grey) >= 0).all()
 
 
-# The kernels against the same arithmetic on whole images
+# The kernels against the obvious
 
 
 def furnished():
@@ -100,33 +102,72 @@ def test_rays_are_those_of_the_arithmetic_on_whole_images_to_the_bit():
     np.testing.assert_array_equal(pixel_rays(CAMERA, T, u[:, None], v[:, None])[:, 0], expected[v, u])
 
 
-def test_a_picture_is_that_of_the_arithmetic_on_whole_images_to_the_bit():
+def light_along(renderer, rays):
+    """The light (N, 3) that comes back along rays (N, 6), and the cosines (N,): hit by hit, from the definitions."""
+    s, irradiance, hits = renderer.surfaces, renderer._lit.irradiance, renderer.caster.cast(rays)
+    light, cosines = np.zeros((len(rays), 3)), np.zeros(len(rays))
+    for n, f in enumerate(hits.triangle):
+        if f == NO_TRIANGLE:
+            continue
+        corners, (b, c) = s.triangles[f], hits.uv[n].astype(float)
+        weights = np.array([1 - b - c, b, c])
+        p, q, r = s.vertices[corners].astype(float)
+        normal = np.cross(q - p, r - p)
+        ray = rays[n, 3:].astype(float)
+        cosines[n] = abs(normal @ ray) / np.linalg.norm(normal) / np.linalg.norm(ray)
+        material = s.material_table[s.materials[f]]
+        footprint = hits.distance[n] / CAMERA.fx / np.sqrt(max(cosines[n], 0.05))
+        color = surface_color(material, *(weights @ s.texture[corners]), footprint)
+        light[n] = np.array(color) * (weights @ irradiance[corners] + material[11])
+    return light, cosines
+
+
+def test_a_picture_is_that_of_rays_shaded_one_by_one():
     renderer = furnished()
     T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
+    picture = renderer.render(CAMERA, T)
     rays = image_rays(CAMERA, T)
     hits = renderer.caster.cast(rays)
     met = hits.triangle != NO_TRIANGLE
     depth = np.where(met, hits.distance, np.float32(0))
-    d, n = rays[..., 3:], hits.normal
-    along, square = (a[..., 0] * b[..., 0] + a[..., 1] * b[..., 1] + a[..., 2] * b[..., 2] for a, b in ((d, n), (d, d)))
+    np.testing.assert_allclose(picture.depth, depth, atol=2e-6)
+    np.testing.assert_array_equal(picture.instance_ids, np.where(met, renderer.surfaces.instance_ids[hits.triangle], 0))
     part = np.where(met, renderer.surfaces.parts[hits.triangle], -1)
     edge = np.zeros(depth.shape, np.bool_)
     for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
         step = (part[a] != part[b]) | (np.abs(depth[a] - depth[b]) > EDGE_STEP * depth[a])
         edge[a] |= step
         edge[b] |= step
-    light, _ = renderer._shade(rays, hits, CAMERA)
     v, u = np.nonzero(edge)
     assert 50 < len(u) < 0.5 * edge.size
-    offsets = np.array(EDGE_SAMPLES)
-    finer = pixel_rays(CAMERA, T, u[:, None] + offsets[:, 0], v[:, None] + offsets[:, 1])
-    samples, _ = renderer._shade(finer, renderer.caster.cast(finer), CAMERA)
-    light[v, u] = np.minimum(samples, WHITE).mean(axis=1)
-
-    picture = renderer.render(CAMERA, T)
-    np.testing.assert_array_equal(picture.depth, depth)
-    np.testing.assert_array_equal(picture.incidence, np.abs(along) / np.sqrt(square))
-    np.testing.assert_array_equal(picture.instance_ids, np.where(met, renderer.surfaces.instance_ids[hits.triangle], 0))
-    np.testing.assert_array_equal(picture.color, to_srgb(light))
+    light, cosines = light_along(renderer, rays.reshape(-1, 6))
+    light = light.reshape(*CAMERA.shape, 3)
+    np.testing.assert_allclose(picture.incidence.ravel(), cosines, atol=1e-5)
+    smooth = np.zeros((len(u), 3))
+    for du, dv in EDGE_SAMPLES:
+        finer = pixel_rays(CAMERA, T, u[:, None] + du, v[:, None] + dv)[:, 0]
+        sample, _ = light_along(renderer, finer)
+        seen = renderer.caster.cast(finer)
+        same = (seen.triangle != NO_TRIANGLE) & (renderer.surfaces.parts[seen.triangle] == part[v, u])
+        same &= np.abs(seen.distance - depth[v, u]) <= EDGE_STEP * depth[v, u]
+        assert 0.2 < same.mean() < 0.9
+        smooth += np.minimum(np.where(same[:, None], light[v, u], sample), WHITE) / len(EDGE_SAMPLES)
+    light[v, u] = smooth
+    difference = np.abs(picture.color.astype(int) - to_srgb(light.astype(np.float32)))
+    assert difference.max() <= 1  # a grey level, by rounding
+    assert (difference > 0).mean() < 0.02
     for a, b in zip(renderer.depth_and_ids(CAMERA, T), (picture.depth, picture.instance_ids), strict=True):
         np.testing.assert_array_equal(a, b)
+    np.testing.assert_array_equal(ids_met(renderer.surfaces, renderer.caster, CAMERA, T), picture.instance_ids)
+
+
+def test_other_materials_change_the_colours_and_nothing_else():
+    renderer = furnished()
+    T = look(np.array([-3.0, 0.2, 0.3]), 0.1, -0.2, 0.3)
+    table = renderer.surfaces.material_table.copy()
+    table[:, 1:7] *= (0.2, 1, 1, 0.2, 1, 1)  # less red
+    picture, other = renderer.render(CAMERA, T), renderer.render(CAMERA, T, table)
+    np.testing.assert_array_equal(other.depth, picture.depth)
+    np.testing.assert_array_equal(other.color[..., 1:], picture.color[..., 1:])
+    seen = picture.depth > 0
+    assert (other.color[seen][:, 0] < picture.color[seen][:, 0]).all()

@@ -11,12 +11,13 @@ from framework.errors import ConfigError
 from framework.geometry import inverse
 from framework.label_spaces import SCENENN_TO_COCO, SPACES
 from framework.ply import PlyMesh, read_ply
+from framework.rasterizer import NO_TRIANGLE
 from framework.scenenn.annotation import read_annotation
 from framework.scenenn.trajectory_log import read_trajectory_log
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.cluttered_groups import chair_row
 from framework.synthetic.groups import toilet_group
-from framework.synthetic.ray_caster import NO_TRIANGLE, RayCaster, image_rays
+from framework.synthetic.ray_caster import RayCaster, image_rays
 from framework.synthetic.scenenn_scene import (
     _NYU_CLASSES,
     ASUS,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.synthetic.sensor import DepthSensor, axial_sigma, depth_step, noisy_color
+from framework.synthetic.sensor import DepthSensor, axial_sigma, depth_step, noisy_color, normal_quantiles, random_bits
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
 FRONT = np.ones(CAMERA.shape, np.float32)
@@ -72,6 +72,20 @@ def test_half_the_noise_has_about_half_the_deviation():
     assert half == pytest.approx(0.6 * full, rel=0.2)
 
 
+def test_quantiles_are_normal_and_bits_are_even():
+    quantiles = normal_quantiles().astype(float)
+    assert quantiles.mean() == pytest.approx(0, abs=1e-6)
+    assert quantiles.std() == pytest.approx(1, abs=1e-6)
+    assert (quantiles**4).mean() == pytest.approx(3, abs=0.02)
+    for sigmas, share in ((1, 0.6827), (2, 0.9545), (3, 0.9973)):
+        assert (np.abs(quantiles) < sigmas).mean() == pytest.approx(share, abs=5e-4)
+    bits = random_bits((100, 101, 3), np.random.default_rng(0))
+    assert bits.shape == (100, 101, 3)
+    for k in range(16):
+        assert np.mean(bits >> k & 1) == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_array_equal(bits, random_bits((100, 101, 3), np.random.default_rng(0)))
+
+
 # The kernels against the same arithmetic on whole images
 
 
@@ -99,20 +113,22 @@ def slow_measure(depth, incidence, noise, max_range, rng):
         beside[a] |= step
         beside[b] |= step
     theta = np.arccos(np.minimum(incidence, np.float32(1)))
-    chance = rng.random(depth.shape, np.float32)
+    bits = random_bits((*depth.shape, 4), rng)
+    chance = bits[..., 0] / np.float32(65536)
+    lateral_v, lateral_u, axial = (normal_quantiles()[bits[..., k] >> 4] for k in (1, 2, 3))
     start, end = np.deg2rad(80.0), np.deg2rad(88.0)
     grazing = (theta - np.float32(start)) / np.float32(end - start)
     lost = chance < min(noise, 1.0) * np.maximum(np.where(beside, np.float32(0.5), np.float32(0)), grazing)
-    offset = np.rint(np.float32(noise * 0.8 * CAMERA.width / 640) * rng.standard_normal((2, *depth.shape), np.float32))
-    v = np.clip(np.arange(CAMERA.height)[:, None] + offset[0].astype(int), 0, CAMERA.height - 1)
-    u = np.clip(np.arange(CAMERA.width)[None, :] + offset[1].astype(int), 0, CAMERA.width - 1)
+    pixel = np.float32(noise * 0.8 * CAMERA.width / 640)
+    v = np.clip(np.arange(CAMERA.height)[:, None] + np.rint(pixel * lateral_v).astype(int), 0, CAMERA.height - 1)
+    u = np.clip(np.arange(CAMERA.width)[None, :] + np.rint(pixel * lateral_u).astype(int), 0, CAMERA.width - 1)
     neighbour = depth[v, u]
     z = np.where((np.abs(neighbour - depth) > np.float32(0.05) * depth) & (neighbour > 0), neighbour, depth)
     t = np.minimum(theta, np.float32(np.deg2rad(80)))
     sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(np.maximum(z, 0.1)) * t**2 / (np.pi / 2 - t) ** 2
     scale = np.float32(8 * 580 * 0.075)
     variance = (noise * sigma) ** 2 - (z * z / scale) ** 2 / 12
-    noisy = z + np.sqrt(np.maximum(variance, 0)) * rng.standard_normal(depth.shape, np.float32)
+    noisy = z + np.sqrt(np.maximum(variance, 0)) * axial
     reading = scale / np.maximum(np.rint(scale / np.maximum(noisy, np.float32(0.1))), 1)
     assert reading.dtype == np.float32
     valid = (exact > 0.4) & ~hidden & ~lost & (reading > 0.4) & (reading <= max_range)
@@ -130,7 +146,7 @@ def test_readings_are_those_of_the_arithmetic_on_whole_images_to_the_bit(noise):
 
 def test_the_grain_of_colour_is_rounded_and_clipped():
     color = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
-    grain = np.random.default_rng(1).standard_normal(color.shape, np.float32)
+    grain = normal_quantiles()[random_bits(color.shape, np.random.default_rng(1)) >> 4]
     for noise in (1.0, 40.0):  # grey levels beyond both ends
         expected = np.clip(np.rint(color + np.float32(noise * 1.5) * grain), 0, 255).astype(np.uint8)
         np.testing.assert_array_equal(noisy_color(color, noise, np.random.default_rng(1)), expected)
