@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import io
 import json
 import zipfile
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
+from isal import isal_zlib
 
 from framework.atomic_files import written_whole
 from framework.data import Array
@@ -19,19 +19,31 @@ from framework.errors import DataError
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 
+DEFLATE_LEVEL = 1  # of ISA-L: at most 5 % larger than zlib's level 1, in a sixth of its time
+
 
 def write_map(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
-    """Writes an .npz as np.load reads it: the same arrays give the same bytes, and light compression.
+    """Writes an .npz as np.load reads it, lightly compressed: a third of the arrays' size.
 
-    Distances far from the surface are all alike and most labels are 0: level 1 makes a map a fifth of its size, at
-    about the speed of a disk.
+    The same arrays give the same bytes on the same kind of processor.
     """
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
-    with written_whole(path) as temporary, zipfile.ZipFile(temporary, "w") as archive:
+    with (
+        written_whole(path) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
+    ):
         for name, array in {"header": encoded, **arrays}.items():
-            file = io.BytesIO()
-            np.lib.format.write_array(file, np.ascontiguousarray(array), allow_pickle=False)
-            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), file.getbuffer(), zipfile.ZIP_DEFLATED, compresslevel=1)
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                _deflate_fast(member)
+                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def _deflate_fast(member: IO[bytes]) -> None:
+    """Gives a member of a zip file, before it is written, to ISA-L.
+
+    zipfile has no public way to choose who deflates. If it should call this attribute otherwise one day, zlib does it.
+    """
+    member._compressor = isal_zlib.compressobj(DEFLATE_LEVEL, wbits=-isal_zlib.MAX_WBITS)  # type: ignore[attr-defined]
 
 
 def read_map(path: Path, expected_format: object, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:

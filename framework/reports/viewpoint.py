@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32
-from framework.geometry import inverse, project, transform
 from framework.reports.surface import Surface
 
 FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, so that far objects are not much smaller than near ones
@@ -24,13 +24,10 @@ def upward(poses: Float64, surface: Surface) -> Float64:
     """
     up = -poses[:, :3, 1].mean(axis=0)
     up /= np.linalg.norm(up)
-    areas = np.linalg.norm(surface.face_normals, axis=1)
-    normals = surface.face_normals / np.maximum(areas, 1e-12)[:, None]
     cone = LEVEL_CONE_RAD
     for _ in range(5):  # mean shift with a narrowing cone
-        inside = normals @ up > np.cos(cone)
-        mean = surface.face_normals[inside].sum(axis=0)
-        if areas[inside].sum() < 0.02 * areas.sum() or np.linalg.norm(mean) == 0:
+        mean, share = _level(surface.face_normals, up, np.cos(cone))
+        if share < 0.02 or np.linalg.norm(mean) == 0:
             return np.asarray(up)
         up = mean / np.linalg.norm(mean)
         cone = max(cone / 1.5, np.deg2rad(6))
@@ -53,14 +50,15 @@ def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int,
     side = np.cross(forward, up)
 
     chosen = slice(None, None, max(1, len(surface.vertices) // TRIAL_POINTS))
-    points, normals = surface.vertices[chosen], surface.vertex_normals()[chosen]
+    points, normals = surface.vertices[chosen], surface.vertex_normals[chosen]
+    bulk = _without_strays(points)
     best_score, shown = -np.inf, points
     R = np.eye(3)
     for elevation in ELEVATIONS_RAD:
         for azimuth in 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS:
             level = np.cos(azimuth) * forward + np.sin(azimuth) * side
             R_trial = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
-            visible = _visible(points, normals, *fitted(R_trial, points, TRIAL_WIDTH, TRIAL_HEIGHT))
+            visible = _visible(points, normals, *_framed(R_trial, bulk, TRIAL_WIDTH, TRIAL_HEIGHT))
             score = _score(instance_ids[chosen][visible])
             score *= 1 + 0.15 * np.cos(azimuth)  # between equals, the way that the cameras looked
             if score > best_score:
@@ -79,34 +77,76 @@ def looking(forward: Float64, up: Float64) -> Float64:
 
 def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
     """A camera with this rotation, as near as it can be with the points (P, 3) in its picture of width x height px."""
+    return _framed(R_world_camera, _without_strays(points_world), width, height)
+
+
+def _without_strays(points: Float32) -> Float32:
+    """Points (P, 3) less those at the border of a map that lie apart."""
+    low, high = np.percentile(points, [0.3, 99.7], axis=0)
+    kept = points[((points >= low) & (points <= high)).all(axis=1)]
+    return kept if len(kept) else points
+
+
+def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
+    """`fitted`, with all the points in the picture."""
     focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
     camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-    low, high = np.percentile(points_world, [0.3, 99.7], axis=0)  # stray points at the border of a map do not count
-    kept = points_world[((points_world >= low) & (points_world <= high)).all(axis=1)]
-    p = (kept if len(kept) else points_world) @ R_world_camera
+    x, y, z = R_world_camera.T @ points_world.T
     # |x - x0| <= tan_x (z - z0) for all points; the extreme lines of either side meet where the camera must be
     tan_x, tan_y = width / 2 / focal / MARGIN, height / 2 / focal / MARGIN
-    right, left = (p[:, 0] - tan_x * p[:, 2]).max(), (p[:, 0] + tan_x * p[:, 2]).min()
-    below, above = (p[:, 1] - tan_y * p[:, 2]).max(), (p[:, 1] + tan_y * p[:, 2]).min()
-    z = min(-(right - left) / (2 * tan_x), -(below - above) / (2 * tan_y), p[:, 2].min() - 0.1)
+    right, left = (x - tan_x * z).max(), (x + tan_x * z).min()
+    below, above = (y - tan_y * z).max(), (y + tan_y * z).min()
+    nearest = min(-(right - left) / (2 * tan_x), -(below - above) / (2 * tan_y), z.min() - 0.1)
     T_world_camera = np.eye(4)
     T_world_camera[:3, :3] = R_world_camera
-    T_world_camera[:3, 3] = R_world_camera @ [(right + left) / 2, (below + above) / 2, z]
+    T_world_camera[:3, 3] = R_world_camera @ [(right + left) / 2, (below + above) / 2, nearest]
     return camera, T_world_camera
 
 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
     """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
-    front = np.flatnonzero(((points - T_world_camera[:3, 3]) * normals).sum(axis=1) < 0)
-    local = transform(inverse(T_world_camera), points[front])
-    u, v = np.rint(project(camera, local)).astype(int).T
-    inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-    pixel, z, front = (v * camera.width + u)[inside], local[inside, 2], front[inside]
-    nearest_first = np.lexsort((z, pixel))
-    _, first = np.unique(pixel[nearest_first], return_index=True)
-    return np.asarray(front[nearest_first][first], np.int32)
+    nearest = np.full(camera.shape, -1, np.int32)
+    _draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
+    return np.asarray(nearest[nearest >= 0])
 
 
 def _score(instance_ids: Int32) -> float:
     """How much a picture shows, given its pixels' ids. Square roots: ten objects are worth more than a large one."""
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))
+
+
+@njit(cache=True, nogil=True)
+def _level(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
+    """The sum (3,) of the normals (F, 3) within a cone around `up` (3,), and their share of the area."""
+    total, inside, area = np.zeros(3), 0.0, 0.0
+    for f in range(len(normals)):
+        x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
+        size = np.sqrt(x * x + y * y + z * z)
+        area += size
+        if x * up[0] + y * up[1] + z * up[2] > cosine * size:
+            inside += size
+            total[0], total[1], total[2] = total[0] + x, total[1] + y, total[2] + z
+    return total, inside / max(area, 1e-12)
+
+
+@njit(cache=True, nogil=True)
+def _draw_fronts(
+    points: Float32,
+    normals: Float32,
+    T: Float64,
+    intrinsics: tuple[float, float, float, float],
+    nearest: Int32,
+) -> None:
+    """Writes which point (P, 3) is the nearest (H, W) of those that turn their front to the camera, T_world_camera."""
+    fx, fy, cx, cy = intrinsics
+    height, width = nearest.shape
+    depth = np.full(nearest.shape, np.inf)
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - T[0, 3], points[i, 1] - T[1, 3], points[i, 2] - T[2, 3]
+        distance = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
+        if x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2] >= 0 or distance <= 0:
+            continue
+        u = int(np.rint(fx * (T[0, 0] * x + T[1, 0] * y + T[2, 0] * z) / distance + cx))
+        v = int(np.rint(fy * (T[0, 1] * x + T[1, 1] * y + T[2, 1] * z) / distance + cy))
+        if 0 <= u < width and 0 <= v < height and distance < depth[v, u]:
+            depth[v, u], nearest[v, u] = distance, i

@@ -11,9 +11,10 @@ from PIL import Image
 from framework.data import Camera, InstanceMesh
 from framework.geometry import inverse, project, transform
 from framework.reports import overview
+from framework.reports.ambient_occlusion import openness
 from framework.reports.palette import instance_colors
 from framework.reports.surface import FrontSides, Surface
-from framework.reports.viewpoint import best_view, fitted, looking, upward
+from framework.reports.viewpoint import _visible, best_view, fitted, looking, upward
 from tests.boxes_room import Z_UP, furnished, walk
 
 RNG = np.random.default_rng(0)
@@ -47,7 +48,6 @@ def test_a_ray_sees_the_nearest_front_at_its_exact_depth() -> None:
     assert hits.depth[12, 16] == pytest.approx(0.5 - -0.6, abs=1e-5)  # the red box's side
     assert hits.nearest(mesh.instance_ids)[12, 16] == 1
     assert hits.depth[12, 0] == pytest.approx(2.5, abs=1e-4)  # past it, the wall: depth is along z, not the ray
-    np.testing.assert_allclose(hits.interpolated(mesh.vertices), hits.points_world, atol=1e-4)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, eye
     pixels = project(camera, transform(inverse(T), hits.points_world.astype(np.float64)))
@@ -64,18 +64,16 @@ def test_walls_and_ceiling_between_the_eye_and_the_room_are_looked_through() -> 
 
 def test_corners_are_darker_than_open_floor() -> None:
     mesh = furnished()
-    camera, R = Camera(64, 64, 40.0, 40.0, 31.5, 31.5), looking(np.array([0.0, 0.01, -1.0]), np.array([0.0, 0, 1]))
-    sides = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([0.0, 0.0, 4.0]))
-    hits = sides.seen_by(camera, R)
-    normals = np.zeros((64, 64, 3), np.float32)
-    normals[..., 2] = 1
-    openness = sides.openness(hits, normals)
+    camera, R = Camera(128, 128, 80.0, 80.0, 63.5, 63.5), looking(np.array([-1.0, 0, -1.0]), np.array([0.0, 0, 1]))
+    hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([2.5, 0.0, 3.0])).seen_by(camera, R)
+    normals = np.tile(np.float32(R[2]), (128, 128, 1))  # up, in the camera's coordinates
+    light = openness(camera, hits.depth, normals)
     x, y, z = np.moveaxis(hits.points_world, -1, 0)
     floor = hits.seen & (np.abs(z) < 1e-3)
     near_box = floor & (np.abs(x + 0.55) < 0.05) & (np.abs(y) < 0.3)
     free = floor & (np.abs(x) < 0.1) & (y < -0.3) & (y > -0.8)
-    assert openness[free].mean() > 0.98
-    assert openness[near_box].mean() < 0.85
+    assert light[free].mean() > 0.98
+    assert light[near_box].mean() < 0.85
 
 
 def test_fitted_is_as_near_as_it_can_be() -> None:
@@ -87,6 +85,22 @@ def test_fitted_is_as_near_as_it_can_be() -> None:
     assert inside.mean() > 0.98
     spread = np.ptp(pixels[inside], axis=0) / [400, 300]
     assert spread.max() > 0.9
+
+
+def test_small_pictures_show_the_nearest_fronts() -> None:
+    camera, T = Camera(30, 20, 25.0, 25.0, 14.5, 9.5), np.eye(4)
+    T[:3, :3], T[:3, 3] = looking(np.array([1.0, 0.5, -0.2]), np.array([0.0, 0, 1])), [-3, -1.5, 0.5]
+    points, normals = RNG.uniform(-2, 2, (3000, 3)).astype(np.float32), RNG.normal(0, 1, (3000, 3)).astype(np.float32)
+    local = transform(inverse(T), points.astype(np.float64))
+    expected: dict[tuple[int, int], int] = {}
+    for i in np.argsort(-local[:, 2]):  # the farthest first
+        u, v = np.rint(project(camera, local[i]))
+        front = (points[i] - T[:3, 3]) @ normals[i] < 0
+        if front and local[i, 2] > 0 and 0 <= u < camera.width and 0 <= v < camera.height:
+            expected[int(v), int(u)] = int(i)
+    assert len(expected) > 300
+    shown = _visible(points, normals, camera, T)
+    assert shown.tolist() == [expected[pixel] for pixel in sorted(expected)]
 
 
 def test_the_best_view_looks_down_into_the_room_and_sees_the_objects() -> None:
