@@ -19,10 +19,10 @@ def read_color(path: Path) -> UInt8:
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
     """Likewise, of what such a file holds; `name` is for messages."""
-    image = _decode(name, data, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
+    image = _decode(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
         raise FrameError(f"{name}: colour must be 8 bits a channel, found {image.dtype}")
-    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+    return np.asarray(image, np.uint8)
 
 
 def read_uint16(path: Path) -> UInt16:

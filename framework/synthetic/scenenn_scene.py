@@ -30,8 +30,13 @@ ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrins
 NOISE, MAX_RANGE = 1.0, 6.0  # the sensor's noise, 1 = a Kinect v1; its range, m
 TRUTH_VIEWS = 60  # frames whose view makes up the labelled mesh; neighbours show nearly the same
 LARGEST_ID = 934338  # of SceneNN's own labels, which have no order
-PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY)
-"""Noisy pictures hold nothing that a search for repetitions finds: this is as small as the slow ways, in 15 ms."""
+PNG = (
+    *(cv2.IMWRITE_PNG_COMPRESSION, 1),
+    *(cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY),
+    *(cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_SUB),
+)
+"""Noisy pictures hold nothing that a search for repetitions finds, and one filter is as good as a choice among all:
+within 5 % of the size of the slow ways, in 10 ms."""
 
 T_YUP_ZUP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """From the room's axes to SceneNN's. It only swaps and negates, so that nothing is rounded."""
