@@ -30,10 +30,14 @@ class Sight:
     depth: Float32  # (H, W) m along z, 0 = nothing
     uv: Float32  # (H, W, 2) barycentric weights of the triangle's second and third vertex
 
-    @property
-    def nearest_corner(self) -> Int32:
-        """(H, W) which vertex of its triangle is nearest, 0 to 2: the first one with the largest weight."""
-        return np.asarray(_nearest_corner(self.uv), np.int32)
+    def nearest(self, triangles: Int32, labels: Int32) -> Int32:
+        """(H, W) the label of the vertex nearest to what is seen, 0 where nothing is; triangles (F, 3), labels (V,).
+
+        Nearest is the corner with the largest barycentric weight.
+        """
+        image = np.zeros(self.triangle.shape, np.int32)
+        _nearest(self.triangle, self.uv, triangles, labels, image)
+        return image
 
 
 class Rasterizer:
@@ -170,14 +174,14 @@ def _draw(
 
 
 @njit(cache=True, nogil=True)
-def _nearest_corner(uv: Float32) -> Int32:
-    corner = np.empty(uv.shape[:2], np.int32)
-    for v in range(uv.shape[0]):
-        for u in range(uv.shape[1]):
-            b, c = uv[v, u, 0], uv[v, u, 1]
-            a = 1 - b - c
-            corner[v, u] = 0 if a >= b and a >= c else (1 if b >= c else 2)
-    return corner
+def _nearest(triangle: Int32, uv: Float32, triangles: Int32, labels: Int32, image: Int32) -> None:
+    for v in range(triangle.shape[0]):
+        for u in range(triangle.shape[1]):
+            f = triangle[v, u]
+            if f != NO_TRIANGLE:
+                b, c = uv[v, u, 0], uv[v, u, 1]
+                a = 1 - b - c
+                image[v, u] = labels[triangles[f, 0 if a >= b and a >= c else (1 if b >= c else 2)]]
 
 
 @njit(cache=True, nogil=True, inline="always")

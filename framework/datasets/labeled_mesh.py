@@ -9,12 +9,11 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from framework import rasterizer
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
 from framework.detection.fingerprint import file_hash
-from framework.rasterizer import NO_TRIANGLE, Rasterizer
+from framework.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -43,9 +42,7 @@ class LabeledMesh:
         )
 
     def _drawn(self, camera: Camera, T_world_camera: Float64) -> Int32:
-        sight = self._rasterizer.draw(camera, T_world_camera)
-        labels = _labels(sight.triangle, sight.nearest_corner, self.triangles, self.instance_ids)
-        return np.asarray(labels, np.int32)
+        return self._rasterizer.draw(camera, T_world_camera).nearest(self.triangles, self.instance_ids)
 
     @cached_property
     def _rasterizer(self) -> Rasterizer:
@@ -61,14 +58,3 @@ class LabeledMesh:
         for source in (__file__, rasterizer.__file__):
             told.update(file_hash(Path(source)).encode())
         return told.hexdigest()
-
-
-@njit(cache=True, nogil=True)
-def _labels(triangle: Int32, corner: Int32, triangles: Int32, instance_ids: Int32) -> Int32:
-    """The instances (H, W) at the corners (H, W) of the triangles (H, W) that are seen, 0 where none is."""
-    labels = np.zeros(triangle.shape, np.int32)
-    for v in range(triangle.shape[0]):
-        for u in range(triangle.shape[1]):
-            if triangle[v, u] != NO_TRIANGLE:
-                labels[v, u] = instance_ids[triangles[triangle[v, u], corner[v, u]]]
-    return labels

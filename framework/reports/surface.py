@@ -56,9 +56,7 @@ class Hits:
 
     def nearest(self, labels: Int32) -> Int32:
         """(H, W) the label (V,) of the nearest corner, 0 where nothing is seen."""
-        image = np.zeros(self.camera.shape, np.int32)
-        _pick(self.sight.triangle, self.sight.nearest_corner, self.triangles, labels, image)
-        return image
+        return self.sight.nearest(self.triangles, labels)
 
 
 class Surface:
@@ -129,14 +127,6 @@ def _interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32
             wa = np.float32(1) - wb - wc
             for k in range(values.shape[1]):
                 image[v, u, k] = wa * values[a, k] + wb * values[b, k] + wc * values[c, k]
-
-
-@njit(cache=True, nogil=True)
-def _pick(triangle: Int32, corner: Int32, triangles: Int32, labels: Int32, image: Int32) -> None:
-    for v in range(triangle.shape[0]):
-        for u in range(triangle.shape[1]):
-            if triangle[v, u] != NO_TRIANGLE:
-                image[v, u] = labels[triangles[triangle[v, u], corner[v, u]]]
 
 
 @njit(cache=True, nogil=True)

@@ -20,11 +20,8 @@ ASIDE = 2e-3  # px: rays this far apart that meet vertices alike say that the an
 
 def drawn(vertices: np.ndarray, triangles: np.ndarray, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
     """(H, W) the index of the nearest vertex, -1 = nothing."""
-    sight = Rasterizer(vertices, triangles).draw(camera, T)
-    if not len(triangles):
-        return sight.triangle
-    corner = np.take_along_axis(triangles[sight.triangle], sight.nearest_corner[..., None], axis=-1)[..., 0]
-    return np.where(sight.triangle == NO_TRIANGLE, -1, corner)
+    numbered = np.arange(1, len(vertices) + 1, dtype=np.int32)
+    return Rasterizer(vertices, triangles).draw(camera, T).nearest(triangles, numbered) - 1
 
 
 def met_by_rays(caster: RayCaster, triangles: np.ndarray, T: np.ndarray, du: float, dv: float) -> np.ndarray:
