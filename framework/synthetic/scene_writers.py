@@ -28,9 +28,8 @@ from framework.atomic_files import written_whole
 from framework.errors import ConfigError, DataError
 from framework.scenenn.intrinsics import write_intrinsics
 from framework.synthetic.benchmark import SceneSpec
-from framework.synthetic.scenenn_scene import Recording, SceneNNScene, frame_files, trajectory_file
+from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 
-GENERATION = 2  # of the rooms that this code makes: raise it when they change, so that none are mixed
 FRAMES_AT_ONCE = 8  # few, so that all processes end at about the same time
 
 Piece = Callable[[SceneNNScene], int]  # writes some files, returns how many of them are frames

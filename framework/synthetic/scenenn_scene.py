@@ -26,6 +26,7 @@ from framework.synthetic.labeled_mesh import visible_mesh
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.sensor import MIN_RANGE, DepthSensor, noisy_color
 
+GENERATION = 2  # of the rooms that this code makes: raise it when they change, so that none are mixed
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
 NOISE, MAX_RANGE = 1.0, 6.0  # the sensor's noise, 1 = a Kinect v1; its range, m
 TRUTH_VIEWS = 60  # frames whose view makes up the labelled mesh; neighbours show nearly the same
@@ -84,7 +85,7 @@ class Recording:
     @property
     def release(self) -> str:
         """What tables call the annotation."""
-        return f"synthetic, seed {self.seed}, {self.frames} frames"
+        return f"synthetic {GENERATION}, seed {self.seed}, {self.frames} frames"
 
 
 class SceneNNScene:

@@ -12,8 +12,8 @@ import pytest
 from framework.errors import ConfigError, DataError
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.groups import toilet_group
-from framework.synthetic.scene_writers import FRAMES_AT_ONCE, GENERATION, _choose, _Scene, write_scenes
-from framework.synthetic.scenenn_scene import Recording, SceneNNScene, frame_files, trajectory_file
+from framework.synthetic.scene_writers import FRAMES_AT_ONCE, _choose, _Scene, write_scenes
+from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 
 SPEC = SceneSpec("bathroom", (toilet_group,), {"toilet": 1})
 SPECS = {"007": SPEC, "008": SPEC}
@@ -68,7 +68,7 @@ def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Pat
 
 
 def test_what_all_scenes_share(root: Path) -> None:
-    assert (root / "release.txt").read_text() == "synthetic, seed 1, 10 frames\n"
+    assert (root / "release.txt").read_text() == f"synthetic {GENERATION}, seed 1, 10 frames\n"
     assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION
     assert "fx 54.447329\n" in (root / "intrinsic" / "asus.ini").read_text()
     assert not list(root.rglob(".*")), "nothing unfinished is left"

@@ -21,6 +21,7 @@ from framework.synthetic.ray_caster import RayCaster, image_rays
 from framework.synthetic.scenenn_scene import (
     _NYU_CLASSES,
     ASUS,
+    GENERATION,
     T_YUP_ZUP,
     Recording,
     SceneNNScene,
@@ -130,7 +131,7 @@ def test_the_camera_is_scenenns() -> None:
     assert Recording().camera == ASUS
     assert RECORDING.camera.shape == (120, 160)
     assert RECORDING.camera.fx == pytest.approx(544.47329 / 4)
-    assert RECORDING.release == "synthetic, seed 3, 9 frames"
+    assert RECORDING.release == f"synthetic {GENERATION}, seed 3, 9 frames"
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"frames": 0}, {"width": 8}, {"width": 162}])
