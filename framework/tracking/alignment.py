@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from numba import njit, prange
 
@@ -56,6 +57,22 @@ def model_view(view: SurfaceView) -> ModelView:
     _turn_normals(view.normals_world, np.ascontiguousarray(view.T_world_camera[:3, :3].T, np.float32), normals)
     camera = view.camera
     return ModelView(view.depth, normals, *(np.float32(k) for k in (camera.fx, camera.fy, camera.cx, camera.cy)))
+
+
+def smoothed(model: ModelView, level: int) -> ModelView:
+    """The model for `level` halvings of its resolution: its normals are the means of squares about as large.
+
+    A young map is noisy, and a normal's noise looks like a surface that resists motions along the real one.
+    """
+    if level == 0:
+        return model
+    size = 2 ** (level + 1) - 1
+    x, y, z = (cv2.blur(plane, (size, size)) for plane in model.normals)
+    length = np.maximum(cv2.magnitude(cv2.magnitude(x, y), z), np.float32(1e-6))
+    normals = np.empty_like(model.normals)
+    for plane, mean in zip(normals, (x, y, z), strict=True):
+        np.divide(mean, length, out=plane)
+    return model._replace(normals=normals)
 
 
 @njit(cache=True, nogil=True, parallel=True)

@@ -11,6 +11,7 @@ from numba import njit, prange
 from framework.data import Camera, Float32, SurfaceView, UInt8
 
 DEPTH_GAP = 0.05  # of the depth: readings farther apart than this do not belong to one surface and are not averaged
+MAPPED = np.float32(2.0)  # of the four pixels below one, so that it has the intensity of those
 
 
 @dataclass(frozen=True)
@@ -128,11 +129,15 @@ def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
 
 @njit(cache=True, nogil=True, parallel=True)
 def _halve_mapped(intensity, half):
+    """The mean of those of four that are mapped: a young map is full of holes of one pixel."""
+    zero, one = np.float32(0.0), np.float32(1.0)
     for v in prange(half.shape[0]):
         for u in range(half.shape[1]):
-            a, b = intensity[2 * v, 2 * u], intensity[2 * v, 2 * u + 1]
-            c, d = intensity[2 * v + 1, 2 * u], intensity[2 * v + 1, 2 * u + 1]
-            if min(min(a, b), min(c, d)) >= np.float32(0.0):
-                half[v, u] = (a + b + c + d) * np.float32(0.25)
-            else:
-                half[v, u] = np.float32(-1.0)
+            total, count = zero, zero
+            for b in range(2):
+                for a in range(2):
+                    i = intensity[2 * v + b, 2 * u + a]
+                    if i >= zero:
+                        total += i
+                        count += one
+            half[v, u] = total / count if count >= MAPPED else -one

@@ -13,7 +13,7 @@ from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
-from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view
+from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
 
@@ -192,9 +192,9 @@ class VoxelHashingIcp(PoseTracker):
         T_view_camera = np.eye(4)
         brightness = 0.0
         for level in reversed(range(LEVELS)):
-            weights = self._weights_at(level)
+            weights, model_here = self._weights_at(level), smoothed(model, level)
             for _ in range(iterations[level]):
-                equations = linearize(levels[level], model, intensities[level], T_view_camera, weights, brightness)
+                equations = linearize(levels[level], model_here, intensities[level], T_view_camera, weights, brightness)
                 brightness = equations.brightness
                 xi = _solved(equations)
                 T_view_camera = exp_se3(xi) @ T_view_camera
