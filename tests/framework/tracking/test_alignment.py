@@ -1,6 +1,7 @@
 """One step of the alignment, term by term and level by level, between two exact views of a scene."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
 from framework.mapping.sensor import depth_noise
-from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize
+from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize, smoothed
 from framework.tracking.pyramid import build_pyramid, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
 from tests.analytic_scene import CAMERA, Scene, pose
@@ -20,9 +21,18 @@ T_VIEW = pose(0.02, -0.03, 0.01, (0.01, 0.02, -0.01))
 
 
 def step(
-    scene: Scene, frame: Frame, level: int, T_view_camera: np.ndarray, weights: Weights, brightness: float = 0.0
+    scene: Scene,
+    frame: Frame,
+    level: int,
+    T_view_camera: np.ndarray,
+    weights: Weights,
+    brightness: float = 0.0,
+    seen: Callable[[ModelView], ModelView] = lambda model: model,
 ) -> tuple[np.ndarray, NormalEquations]:
-    """The Gauss-Newton step (6,) from T_view_camera at a level, and its equations; the model is seen from T_VIEW."""
+    """The Gauss-Newton step (6,) from T_view_camera at a level, and its equations.
+
+    The model is seen from T_VIEW, as `seen` has it.
+    """
     view_frame = scene.frame(T_VIEW)
     depth = view_frame.depth
     gap = inverse(T_VIEW)[:3, :3]
@@ -33,6 +43,7 @@ def step(
     depth = np.where(surface <= len(scene.planes), depth, 0).astype(np.float32)
     f, c = (np.float32(CAMERA.fx), np.float32(CAMERA.fy)), (np.float32(CAMERA.cx), np.float32(CAMERA.cy))
     model = ModelView(depth, np.ascontiguousarray(normals.transpose(2, 0, 1)), *f, *c)
+    model = seen(model)
     view = dataclasses.make_dataclass("Seen", ["color", "depth"])(view_frame.color, depth)
     intensity = model_intensities(view, 3)[level]
     pyramid = build_pyramid(CAMERA, frame.depth, frame.color, 1.0, 3)
@@ -97,6 +108,46 @@ def test_points_whose_normals_differ_do_not_match() -> None:
     assert equations.matched == 0
     _, open_gate = step(WALL, turned.frame(T_VIEW), 0, np.eye(4), DEPTH._replace(min_normal_dot=np.float32(0.3)))
     assert open_gate.matched > 100
+
+
+def with_noisy_normals(model: ModelView) -> ModelView:
+    """As a map of one frame has them, a few metres away."""
+    noisy = model.normals + np.random.default_rng(0).normal(0, 0.4, model.normals.shape).astype(np.float32)
+    noisy /= np.linalg.norm(noisy, axis=0)
+    return model._replace(normals=np.where(model.depth > 0, noisy, 0).astype(np.float32))
+
+
+@pytest.mark.parametrize("level", [1, 2])
+def test_noisy_normals_do_not_resist_a_motion_along_a_wall(level: int) -> None:
+    """A wall says nothing about motions along it, a slanted one at the border of the picture says it all."""
+    room = Scene(planes=[(np.array([0, 0, -1.0]), -2.0), (np.array([-0.8, 0, -0.6]), -1.95)])
+    T = T_VIEW @ exp_se3(np.array([0.02, 0, 0, 0, 0, 0]))
+    weights = DEPTH._replace(max_distance=np.float32(0.3), geometric_scale=np.float32(16))
+
+    def share_found(seen: Callable[[ModelView], ModelView]) -> float:
+        xi, _ = step(room, room.frame(T), level, np.eye(4), weights, seen=seen)
+        return float(xi[0] / 0.02)
+
+    assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
+    assert share_found(with_noisy_normals) < 0.8, "this case does not show what it is for"
+    assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
+
+
+def test_smoothed_normals_are_means_of_squares_without_what_is_not_mapped() -> None:
+    rng = np.random.default_rng(1)
+    normals = rng.normal(0, 1, (3, 12, 17)).astype(np.float32)
+    normals /= np.linalg.norm(normals, axis=0)
+    hole = rng.random((12, 17)) < 0.3
+    normals[:, hole] = 0
+    model = ModelView((~hole).astype(np.float32), normals, *map(np.float32, (9, 9, 8, 6)))
+    assert smoothed(model, 0) is model
+    for level, reach in ((1, 1), (2, 3)):
+        found = smoothed(model, level)
+        np.testing.assert_array_equal(found.depth, model.depth)
+        for v in range(reach, 12 - reach):
+            for u in range(reach, 17 - reach):
+                total = normals[:, v - reach : v + reach + 1, u - reach : u + reach + 1].sum(axis=(1, 2))
+                np.testing.assert_allclose(found.normals[:, v, u], total / np.linalg.norm(total), atol=1e-4)
 
 
 def test_depth_noise_is_nguyens() -> None:
