@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 from numba import njit, prange
 
@@ -66,13 +65,32 @@ def smoothed(model: ModelView, level: int) -> ModelView:
     """
     if level == 0:
         return model
-    size = 2 ** (level + 1) - 1
-    x, y, z = (cv2.blur(plane, (size, size)) for plane in model.normals)
-    length = np.maximum(cv2.magnitude(cv2.magnitude(x, y), z), np.float32(1e-6))
-    normals = np.empty_like(model.normals)
-    for plane, mean in zip(normals, (x, y, z), strict=True):
-        np.divide(mean, length, out=plane)
+    across, normals = np.empty_like(model.normals), np.empty_like(model.normals)
+    _smooth(model.normals, 2**level - 1, across, normals)
     return model._replace(normals=normals)
+
+
+# Not cv2.blur: how its running sums are split, and so rounded, depends on what other threads do in OpenCV meanwhile.
+@njit(cache=True, nogil=True, parallel=True)
+def _smooth(normals, reach, across, smooth):
+    """Fills smooth (3, H, W) with the means of normals over squares of 2 reach + 1, of length 1, 0 where all are 0."""
+    _, height, width = normals.shape
+    for v in prange(height):
+        for i in range(3):
+            across[i, v] = np.float32(0.0)
+            for d in range(-reach, reach + 1):
+                for u in range(max(-d, 0), min(width - d, width)):
+                    across[i, v, u] += normals[i, v, u + d]
+    for v in prange(height):
+        smooth[:, v] = np.float32(0.0)
+        for w in range(max(v - reach, 0), min(v + reach + 1, height)):
+            for i in range(3):
+                for u in range(width):
+                    smooth[i, v, u] += across[i, w, u]
+        for u in range(width):
+            x, y, z = smooth[0, v, u], smooth[1, v, u], smooth[2, v, u]
+            scale = np.float32(1.0) / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))
+            smooth[0, v, u], smooth[1, v, u], smooth[2, v, u] = x * scale, y * scale, z * scale
 
 
 @njit(cache=True, nogil=True, parallel=True)
