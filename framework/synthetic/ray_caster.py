@@ -21,7 +21,6 @@ class Hits:
     distance: Float32  # in lengths of the ray's direction, inf = nothing was met
     triangle: Int32  # NO_TRIANGLE = nothing was met
     uv: Float32  # (..., 2) barycentric weights of the triangle's second and third vertex
-    normal: Float32  # (..., 3) of the triangle, towards no particular side
 
 
 class RayCaster:
@@ -40,9 +39,7 @@ class RayCaster:
         """The first hits of rays (..., 6), origin and direction."""
         answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), self._threads)
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
-        return Hits(
-            answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy(), answer["primitive_normals"].numpy()
-        )
+        return Hits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
         """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""

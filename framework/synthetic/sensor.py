@@ -109,7 +109,7 @@ def normal_quantiles() -> Float32:
     return np.asarray(quantiles / quantiles.std(), np.float32)
 
 
-# The kernels compute in float32, in this order: other code made readings that these must equal to the last bit.
+# The kernels compute in float32, in this order: their tests compare them to the last bit with whole images.
 
 
 @njit(cache=True, nogil=True)
