@@ -17,8 +17,8 @@ from framework.reports.metrics import is_evaluation
 from framework.reports.published import NOTHING_PUBLISHED, Published, read_published
 from framework.reports.records import Incomplete, Record, find_records, read_yaml
 from framework.reports.rows import Row, Run, natural, rows_of
+from framework.reports.sweep_file import SWEEP, asked_runs
 
-SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
 DEFAULT_CHOICE = CONF / "parts" / "experiment.yaml"
 
 
@@ -85,6 +85,7 @@ class Comparison:
     choice: TableChoice
     rows: list[Row]  # in their order, each with a run or more
     overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
+    asked: list[Run]  # what the sweep was last asked for, of every row; some may not have begun
     incomplete: list[Incomplete]
     superseded: int  # records of runs that have a later one
     root: Path  # what the names of runs are relative to
@@ -104,9 +105,11 @@ class Comparison:
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
             raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
-        rows = rows_of(records, [*choice.over, choice.apart] if choice.apart else choice.over, overrides)
+        keys = [*choice.over, choice.apart] if choice.apart else choice.over
+        rows = rows_of(records, keys, overrides)
+        asked = asked_runs(sweep, keys)
         superseded = len(records) - sum(len(row.records) for row in rows)
-        return cls(directory.resolve().name, choice, rows, overrides, incomplete, superseded, directory)
+        return cls(directory.resolve().name, choice, rows, overrides, asked, incomplete, superseded, directory)
 
     @property
     def judged(self) -> bool:
@@ -154,7 +157,7 @@ class Comparison:
     @cached_property
     def sequences(self) -> list[str]:
         """The values that are shown one by one: those of published tables first, and those of the runs."""
-        found = {run[-1] for row in self.rows for run in row.records} if self.choice.apart else set()
+        found = {run[-1] for run in self._runs} if self.choice.apart else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
@@ -165,11 +168,16 @@ class Comparison:
         return ", ".join([named, *variant] if named else variant) or row.name
 
     def missing(self) -> Iterator[tuple[Row, list[Run]]]:
-        """The runs that a row should have, as other rows have runs with their seeds and of their sequences."""
-        runs = [run for row in self.rows for run in row.records]
+        """The runs that a row should have: they were asked for, or other rows have their seeds and sequences."""
+        runs = self._runs
         if self.choice.apart:
             seeds, sequences = (dict.fromkeys(run[:-1] for run in runs), dict.fromkeys(run[-1] for run in runs))
             runs = [(*seed, sequence) for seed in seeds for sequence in sequences]
         for row in self.rows:
             if missing := sorted(set(runs) - set(row.records), key=natural):
                 yield row, missing
+
+    @property
+    def _runs(self) -> list[Run]:
+        """All that a row has or that were asked for."""
+        return [*(run for row in self.rows for run in row.records), *self.asked]

@@ -13,7 +13,6 @@ from tqdm import tqdm
 from framework.data import SceneTruth
 from framework.errors import DataError, InstanceMapError
 from framework.parameters import checked_rows
-from framework.reports.comparison import SWEEP
 from framework.reports.figure_choice import FigureChoice
 from framework.reports.figure_page import Page
 from framework.reports.map_figure import CaptionedLine, map_figure, panel_size
@@ -23,6 +22,7 @@ from framework.reports.reevaluation import Truth
 from framework.reports.rows import Row, Run, natural, rows_of
 from framework.reports.stage_times import WINDOW, MeanTimes, stage_times_figure
 from framework.reports.stored_map import StoredMap
+from framework.reports.sweep_file import SWEEP
 from framework.reports.table_notes import counted, machine
 from framework.reports.timings_file import StageTimes, read_timings
 

@@ -107,15 +107,20 @@ def _missing(comparison: Comparison) -> Iterator[str]:
         yield f"Without a complete run of any row: {comparison.choice.apart}={','.join(absent)}."
     keys = [*comparison.choice.over, *filter(None, [comparison.choice.apart])]
     for row, missing in comparison.missing():
-        yield f"Missing in {row.name}: {'; '.join(_run_told(keys, run) for run in missing)}."
+        yield f"Missing in {row.name}: {_runs_told(keys, missing)}."
     if comparison.superseded:
         yield f"Left out, older records of the same runs: {comparison.superseded}."
     for one in comparison.incomplete:
         yield f"Not complete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
 
 
-def _run_told(keys: Sequence[str], run: Run) -> str:
-    return " ".join(f"{key}={value}" for key, value in zip(keys, run, strict=True))
+def _runs_told(keys: Sequence[str], runs: Sequence[Run]) -> str:
+    """As overrides that run them: seed=0 dataset.scene=011,030; seed=1 dataset.scene=011."""
+    last: dict[Run, list[str]] = {}
+    for run in runs:
+        last.setdefault(run[:-1], []).append(run[-1])
+    told = [zip(keys, (*first, ",".join(values)), strict=True) for first, values in last.items()]
+    return "; ".join(" ".join(f"{key}={value}" for key, value in pairs) for pairs in told)
 
 
 def _same(records: Sequence[Record]) -> str:

@@ -101,11 +101,20 @@ def test_what_is_missing_is_said(sweep: Path) -> None:
     lines = [" ".join(line.split()) for line in text.splitlines()]
     assert "| identity | 3 | 0.300 ± 0.141 (2 of 3) | 0.3 ± 0.6 | ground_truth/tracked |" in lines
     assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, and has no error
-    assert "- Missing in chain: seed=1; seed=7." in lines
+    assert "- Missing in chain: seed=1,7." in lines
     assert "- Missing in identity: seed=2." in lines
     assert "- Not complete: row=chain,seed=1: failed: the map is full." in lines
     assert sum(line.startswith("- Not complete: row=identity,seed=2: ") for line in lines) == 1
     assert "- Code: 1234567 (4 runs), 89abcde (1 run)." in lines
+
+
+def test_seeds_that_were_asked_for_and_have_not_begun_are_said(sweep: Path) -> None:
+    asked = {"sweeper": {"params": {"row": "${all_of:${rows}}", "seed": 0}}, "overrides": {"task": ["seed=range(0,5)"]}}
+    config = {"table": TABLE, "rows": ROWS, "hydra": asked}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    lines = write_tables(sweep).splitlines()
+    assert "- Missing in identity: seed=3,4." in lines
+    assert "- Missing in chain: seed=3,4." in lines
 
 
 def test_no_differences_without_the_base(sweep: Path) -> None:

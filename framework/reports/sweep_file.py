@@ -1,0 +1,57 @@
+"""Hydra's record of a sweep: which runs it was last asked for."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override
+from hydra.errors import HydraException
+
+SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
+
+
+def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
+    """The values of `keys` in each job that the sweep was asked for, without a job begun yet; `sweep` is its config.
+
+    Empty where the config does not say so in plain words, such as a value for each of them.
+    """
+    asked = {override.key_or_group: override for override in _overrides(sweep)}
+    if not all(key in asked for key in keys):
+        return []
+    try:
+        values = [_values(asked[key]) for key in keys]
+    except HydraException:  # glob(*), which means nothing without the config groups
+        return []
+    plain = not any("${" in value for column in values for value in column)
+    return list(itertools.product(*values)) if plain else []
+
+
+def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
+    """Those of the experiment's config first: the ones of the command line win."""
+    texts = [f"{key}={value}" for key, value in _below(sweep, "sweeper", "params", dict).items()]
+    found = []
+    for text in [*texts, *_below(sweep, "overrides", "task", list)]:
+        try:
+            found.append(OverridesParser.create().parse_override(str(text)))
+        except HydraException:  # ${all_of:${rows}}, which is no text of the command line
+            continue
+    return found
+
+
+def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:
+    """`hydra.PART.NAME`, which a file that others have written may hold in another form."""
+    node: Any = sweep
+    for key in ("hydra", part, name):
+        node = node.get(key) if isinstance(node, Mapping) else None
+    return node if isinstance(node, kind) else kind()
+
+
+def _values(override: Override) -> list[str]:
+    """What the key becomes, as `str` writes it."""
+    if not override.is_sweep_override():
+        return [str(override.value())]
+    parser = OverridesParser.create()
+    return [str(parser.parse_override(f"x={text}").value()) for text in override.sweep_string_iterator()]
