@@ -68,13 +68,23 @@ def quiet_when_cut_off() -> None:
 
 
 def print_for_directories(command: str, description: str, place: str, write: Callable[[Path], str]) -> None:
-    """The command `command DIR...`: prints what `write` returns for each directory, which is a `place`."""
+    """The command `command DIR...`: prints what `write` returns for each directory, which is a `place`.
+
+    One that is refused does not stop the others.
+    """
     parser = argparse.ArgumentParser(prog=command, description=description)
     parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help=place)
     asked = parser.parse_args()
+    refused = 0
     with one_line_errors():
         for directory in asked.directory:
-            print(write(directory))
+            try:
+                print(write(directory))
+            except KNOWN_ERRORS as error:
+                print(f"error: {one_line(error)}", file=sys.stderr)
+                refused += 1
+    if refused:
+        sys.exit(EXIT_FAILED)
 
 
 @dataclass

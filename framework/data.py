@@ -317,6 +317,7 @@ class SceneTruth:
     points_world: Float32  # (V, 3) m, on the surface that the camera has seen
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None] = field(default_factory=dict)  # as in FrameTruth; None = not evaluated
+    classes: tuple[str, ...] | None = None  # all that were looked for; None = whatever a detector may know
 
     def __post_init__(self) -> None:
         v = len(self.points_world)

@@ -33,15 +33,20 @@ def main() -> None:
         default=Transfer.TO_TRUTH.value,
         help="whose figures to print; both transfers are evaluated",
     )
+    parser.add_argument(
+        "--other-truth",
+        action="store_true",
+        help="also where the true instances are no longer those that the run was compared with",
+    )
     parser.add_argument("--dry-run", action="store_true", help="print only, write nothing")
     asked = parser.parse_intermixed_args()
     with one_line_errors():
-        refused = evaluate_runs(asked.run, Transfer(asked.transfer), write=not asked.dry_run)
+        refused = evaluate_runs(asked.run, Transfer(asked.transfer), not asked.dry_run, asked.other_truth)
     if refused:
         sys.exit(EXIT_FAILED)
 
 
-def evaluate_runs(roots: Sequence[Path], transfer: Transfer, write: bool) -> int:
+def evaluate_runs(roots: Sequence[Path], transfer: Transfer, write: bool, other_truth: bool = False) -> int:
     """Evaluates all runs at and below `roots`, one line each, and returns how many were refused."""
     records, refused = _find(roots)
     for reason in refused:
@@ -59,7 +64,7 @@ def evaluate_runs(roots: Sequence[Path], transfer: Transfer, write: bool) -> int
                 continue
             for record in same_truth:
                 try:
-                    found = Reevaluation.of(record, truth)
+                    found = Reevaluation.of(record, truth, other_truth)
                     if write:
                         found.write()
                     tqdm.write(f"{record.directory}: {told(found, transfer)}")

@@ -38,6 +38,7 @@ class TrackedFrame:
     """Where the camera was believed to be, and where it was."""
 
     index: int  # Frame.index
+    position: int  # among the frames taken from the sequence, skipped ones included
     timestamp: float  # s
     pose: Pose
     T_world_camera_truth: Float64 | None  # (4, 4)
@@ -132,7 +133,7 @@ class Journal:
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
         """Keeps the pose; says when tracking gets lost and when it is found again."""
-        self.tracked.append(TrackedFrame(frame.index, frame.timestamp, pose, frame.T_world_camera))
+        self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
             if not self._lost_for:
                 log.warning("frame %d: lost: %s", frame.index, pose.reason or "the tracker gave no reason")

@@ -24,10 +24,11 @@ class LabeledMesh:
     triangles: Int32  # (F, 3)
     instance_ids: Int32  # (V,), 0 = no instance
     class_names: Mapping[int, str | None]  # as in FrameTruth
+    classes: tuple[str, ...] | None = None  # as in SceneTruth
 
     def scene_truth(self) -> SceneTruth:
         """The vertices as points: all of them, whatever frames of the video are chosen."""
-        return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names))
+        return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names), self.classes)
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
         """The instances that `camera` would see, rendered when they are asked for.

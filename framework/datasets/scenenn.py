@@ -117,7 +117,8 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
     Labels that have no name, or that the annotation does not have, are instances of unknown class: what is found there
     is neither right nor wrong. Labels of other classes (wall, cabinet, ...) are known to be none of the nine: instance
-    0, as is label 0. Raises DataError, naming the file, when one cannot be read or the mesh has no labels.
+    0, as is label 0. Of other classes nobody says what is there. Raises DataError, naming the file, when one cannot be
+    read or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
@@ -133,7 +134,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
         if label and not _is_of_another_class(names.get(label)):
             ids[k] = label
             class_names[label] = SCENENN_TO_COCO.get(_nyu_class(names.get(label)))
-    return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names)
+    return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names, tuple(SCENENN_TO_COCO.values()))
 
 
 def _nyu_class(label: Annotated | None) -> str:

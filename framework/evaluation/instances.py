@@ -8,10 +8,11 @@ higher recall, as in Pascal VOC from 2010 on), averaged over the classes that ha
 **What is evaluated.** A true instance counts when its class is known and it has at least `min_points` points. The other
 true instances (class None, or too few points) are *ignored* ones: something is there, but nobody can say whether a
 detection of it is right. A prediction that finds no evaluated true instance is therefore left out, neither right nor
-wrong, when either
+wrong, when
 
 1. its best overlap among the ignored instances reaches the IoU threshold, or
-2. more than half of its points lie on ignored instances: most of its evidence is where the truth is not known.
+2. more than half of its points lie on ignored instances: most of its evidence is where the truth is not known, or
+3. its class is none of those that were looked for (`SceneTruth.classes`): a keyboard may well be there.
 
 Every other prediction without a match is wrong; among them those on points of instance 0 (known to be no instance) and
 those that no true point is near.
@@ -206,7 +207,7 @@ class _Overlaps:
     """K predictions, best first, against T true instances."""
 
     iou: Float64  # (K, T)
-    mostly_ignored: Bool  # (K,) more than half of the points on ignored instances
+    untold: Bool  # (K,) more than half of the points on ignored instances, or of a class that nobody looked for
     predicted_ids: Int64  # (K,)
     predicted_classes: npt.NDArray[np.object_]  # (K,)
     truth_ids: Int64  # (T,)
@@ -230,12 +231,15 @@ class _Overlaps:
         intersection = points[1:, 1:]
         union = points[1:].sum(axis=1)[:, None] + points[:, 1:].sum(axis=0)[None, :] - intersection
         classes = np.array([truth.class_names.get(int(k)) for k in truth_ids], object)
+        predicted_classes = np.array([predictions.class_names[k] for k in ranks], object)
         evaluated = (truth_sizes >= min_points) & np.array([name is not None for name in classes], np.bool_)
+        mostly_ignored = 2 * intersection[:, ~evaluated].sum(axis=1) > points[1:].sum(axis=1)
+        looked_for = truth.classes is None or np.isin(predicted_classes, truth.classes)
         return cls(
             iou=intersection / np.maximum(union, 1),
-            mostly_ignored=2 * intersection[:, ~evaluated].sum(axis=1) > points[1:].sum(axis=1),
+            untold=mostly_ignored | np.logical_not(looked_for),
             predicted_ids=ids,
-            predicted_classes=np.array([predictions.class_names[k] for k in ranks], object),
+            predicted_classes=predicted_classes,
             truth_ids=truth_ids.astype(np.int64),
             truth_classes=classes,
             evaluated=evaluated,
@@ -244,7 +248,7 @@ class _Overlaps:
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
         """Matches the chosen predictions (K,) in order of confidence with true instances that are `allowed` (K, T)."""
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
-        unknown = self.mostly_ignored | (ignored_iou >= threshold)
+        unknown = self.untold | (ignored_iou >= threshold)
         free = np.ones(len(self.truth_ids), np.bool_)
         hits: list[bool] = []  # of the predictions that count, best first
         ignored, matched_iou = 0, 0.0

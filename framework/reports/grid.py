@@ -32,7 +32,7 @@ def figure(value: float, spread: float, places: int, signed: bool = False) -> st
 
 def markdown_grid(grid: Grid) -> str:
     """Padded, so that it reads as a table in a terminal, too."""
-    cells = [[cell.replace("|", "\\|") for cell in line] for line in (grid.heads, *grid.body)]
+    cells = [[" ".join(cell.replace("|", "\\|").split()) for cell in line] for line in (grid.heads, *grid.body)]
     for line, column in grid.bold:
         cells[line + 1][column] = f"**{cells[line + 1][column]}**"
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
@@ -65,14 +65,16 @@ _LATEX = str.maketrans(
     {
         **{mark: f"\\{mark}" for mark in "&%$#_{}"},
         **{"\\": "\\textbackslash{}", "~": "\\textasciitilde{}", "^": "\\textasciicircum{}"},
-        **{"±": "$\\pm$", "–": "--"},
+        **{"±": "$\\pm$", "–": "--", "|": "\\textbar{}", "<": "\\textless{}", ">": "\\textgreater{}"},
     }
 )
 
 
 def _escaped(cell: str) -> str:
-    return cell.translate(_LATEX)
+    return " ".join(cell.split()).translate(_LATEX)
 
 
 def _latex_line(cells: Iterable[str]) -> str:
-    return " & ".join(cells) + " \\\\"
+    line = " & ".join(cells) + " \\\\"
+    # else the line above would take the mark for its argument
+    return f"{{}}{line}" if line.startswith(("*", "[")) else line

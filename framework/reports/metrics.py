@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Mapping
 
 import numpy as np
 
-from framework.data import Instance, InstanceMesh, SceneTruth
+from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.evaluation import instances, trajectory
 from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.interfaces import RGBDSequence
@@ -15,6 +16,7 @@ from framework.journal import RunResult
 Metrics = dict[str, float | int | str | bool | None]
 
 MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, told for both transfers
+TRUTH = "truth_sha256"  # the key that says which true instances the run was compared with
 STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
 
 
@@ -49,11 +51,11 @@ def pose_source(result: RunResult) -> str:
 
 def trajectory_metrics(result: RunResult) -> Metrics:
     """The error of the poses that were not lost; nothing where no true pose is known."""
-    error = trajectory.evaluate(
-        reference=[frame.T_world_camera_truth for frame in result.tracked],
-        estimated=[frame.pose for frame in result.tracked],
-    )
-    return dict(error.metrics())
+    reference: list[Float64 | None] = [None] * result.frames  # a step over a skipped frame is no step of one frame
+    estimated = [Pose(np.eye(4), lost=True)] * result.frames
+    for frame in result.tracked:
+        reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
+    return dict(trajectory.evaluate(reference, estimated).metrics())
 
 
 def instance_metrics(
@@ -70,17 +72,25 @@ def instance_metrics(
 def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:
     """The figures of `InstanceEvaluation.metrics`, and the main ones of the other transfer as `instances.to_map.`...
 
-    `annotation_release` names the release of the truth, None = there is but one.
+    `annotation_release` names the release of the truth, None = there is but one; `truth_sha256` tells it from others.
     """
     figures = instances.evaluate(predictions, truth).metrics()
     to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
     told = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
-    return {**figures, **told, "annotation_release": annotation or None}
+    return {**figures, **told, "annotation_release": annotation or None, TRUTH: _sha256(truth)}
+
+
+def _sha256(truth: SceneTruth) -> str:
+    """Of all that predictions are compared with."""
+    told = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
+    for array in (truth.points_world, truth.instance_ids):
+        told.update(np.ascontiguousarray(array).data)
+    return told.hexdigest()
 
 
 def is_evaluation(key: str) -> bool:
     """Whether a key of metrics.json is one that `evaluation_metrics` writes."""
-    return key == "annotation_release" or (key.startswith("instances.") and key != "instances.count")
+    return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
 
 
 def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:

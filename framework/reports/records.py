@@ -22,6 +22,7 @@ CONFIG = "config.yaml"
 METRICS = "metrics.json"  # there exactly when the run completed
 PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
 LOG = "instancemap.log"
+EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
 
@@ -40,6 +41,14 @@ class Record:
     @property
     def commit(self) -> str:
         return commit_of(self.metrics)
+
+    @property
+    def code(self) -> str:
+        """What ran, and what evaluated it where that is other code."""
+        prefix = len(EVALUATION)
+        anew = commit_of({key[prefix:]: told for key, told in self.metrics.items() if key.startswith(EVALUATION)})
+        told = f"{EVALUATION}git_commit" in self.metrics and anew != self.commit
+        return f"{self.commit}, evaluated by {anew}" if told else self.commit
 
     @property
     def annotation(self) -> str:

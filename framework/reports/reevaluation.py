@@ -19,11 +19,9 @@ from framework.interfaces import RGBDSequence
 from framework.reports.instances_file import read_instances
 from framework.reports.json_file import write_json
 from framework.reports.mesh_file import read_mesh
-from framework.reports.metrics import evaluation_metrics, is_evaluation
+from framework.reports.metrics import TRUTH, evaluation_metrics, is_evaluation
 from framework.reports.provenance import code_version
-from framework.reports.records import METRICS, Record
-
-CODE = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
+from framework.reports.records import EVALUATION, METRICS, Record
 
 
 @dataclass(frozen=True)
@@ -49,23 +47,30 @@ class Reevaluation:
     metrics: Mapping[str, Any]  # the whole new metrics.json
 
     @classmethod
-    def of(cls, record: Record, truth: Truth) -> Reevaluation:
+    def of(cls, record: Record, truth: Truth, other_truth: bool = False) -> Reevaluation:
         """Keeps all that is not the evaluation of the instances: speed, counts, and the errors of the trajectory.
 
         Those need the true pose of every frame, so every frame read again. Raises DataError when the files do not
-        belong together, or when there is no truth any more for figures that are stored.
+        belong together, when there is no truth any more for figures that are stored, or when it is not the one that
+        the run was compared with, unless `other_truth` allows that.
         """
         if truth.scene is None:
             if any(map(is_evaluation, record.metrics)):
                 raise DataError(f"{record.directory}: its figures are of true instances that the dataset has no longer")
             return cls(record, record.metrics)
         found = evaluation_metrics(read_predictions(record), truth.scene, truth.annotation)
+        if not other_truth and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
+            raise DataError(
+                f"{record.directory}: the true instances of {record.config['dataset']['_target_']} are not those that "
+                "the run was compared with: its dataset has changed, or a relative dataset.root means another folder "
+                "here; --other-truth compares with them all the same"
+            )
         metrics: dict[str, Any] = {}
         for key, value in record.metrics.items():
-            if not is_evaluation(key) and not key.startswith(CODE):
+            if not is_evaluation(key) and not key.startswith(EVALUATION):
                 metrics[key] = value
             if key == "instances.count":
-                metrics |= found | {CODE + name: told for name, told in code_version().items()}
+                metrics |= found | {EVALUATION + name: told for name, told in code_version().items()}
         return cls(record, metrics)
 
     @property

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeGuard
 
@@ -42,8 +42,11 @@ class Mean:
 
     @property
     def is_not_zero(self) -> bool:
-        """Whether 0 lies outside of the mean's interval of confidence, by Student's t."""
-        if self.count < 2:
+        """Whether 0 lies outside of the mean's interval of confidence, by Student's t.
+
+        Values that are all the same have no interval: they are counts, and say nothing about the next one.
+        """
+        if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
             return False
         from scipy.stats import t
 
@@ -102,13 +105,13 @@ def rows_of(
     A row is what an experiment calls `row`, else what was chosen: the stages' options and the parameters in which the
     records differ, other than the keys `over` and what follows them, as dataset.seed follows seed. A row of an
     experiment is split by what differs inside of it, by what differs between rows although no row's overrides change
-    it (one row tracked, another with given poses), and always by where the data are and which annotation they have.
-    Of two records of the same run, the later one counts.
+    it (one row tracked, another with given poses; one with more frames), and always by where the data are and which
+    annotation they have. Of two records of the same run, the later one counts.
     """
     overrides = overrides or {}
     told = [_Told.of(record, over) for record in sorted(records, key=lambda record: record.written)]
     own = _following(told, over)
-    changed = {_stage(override) for changes in overrides.values() for override in changes}
+    changed = {_changed(override) for changes in overrides.values() for override in changes}
     stages = _differing(
         [(one.row, one.choices) for one in told]
         + [("", {key: value for key, value in one.choices.items() if key not in changed}) for one in told]
@@ -116,6 +119,13 @@ def rows_of(
     parameters = _differing(
         [((one.row, *map(one.choices.get, stages)), one.parameters) for one in told]
         + [("", {DATA: one.parameters[DATA]}) for one in told if DATA in one.parameters]
+        + [
+            ((stage, one.choices.get(stage)), {key: value})
+            for one in told
+            for key, value in one.parameters.items()
+            for stage in (key.partition(".")[0],)
+            if (not one.row or one.row in overrides) and not _is_below(key, changed)
+        ]
     )
     rows: dict[tuple[str, tuple[str, ...]], dict[Run, Record]] = {}
     for one in told:
@@ -133,9 +143,16 @@ def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -
     return Row(name, dict(sorted(records.items(), key=lambda item: natural(item[0]))), system, variant)
 
 
-def _stage(override: str) -> str:
-    """What an override changes: "refiner" for refiner=chain, refiner.links.x=null and refiner@refiner.links.x=y."""
-    return override.lstrip("+~").partition("=")[0].partition("@")[0].partition(".")[0]
+def _changed(override: str) -> str:
+    """The key that an override changes: refiner for refiner=chain, refiner.links.x for refiner@refiner.links.x=y."""
+    group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
+    return package or group.replace("/", ".")
+
+
+def _is_below(key: str, others: Collection[str]) -> bool:
+    """Whether a dotted key is one of `others` or below one."""
+    parts = key.split(".")
+    return any(".".join(parts[:k]) in others for k in range(1, len(parts) + 1))
 
 
 @dataclass(frozen=True)
@@ -154,7 +171,8 @@ class _Told:
         choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
         choices["annotation"] = record.annotation or "not told"
         run = tuple(str(parameters.get(key)) for key in over)
-        return cls(record, str(record.config.get("row") or ""), run, choices, parameters)
+        row = record.config.get("row")
+        return cls(record, "" if row is None else str(row), run, choices, parameters)
 
 
 def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -163,6 +181,14 @@ def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, An
             yield from _leaves(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}", value
+
+
+def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
+    """The keys that had the value of one of `over` in every record, although none of its name: maybe by chance."""
+    told = [_Told.of(record, over) for record in records]
+    names = {key.rpartition(".")[2] for key in over}
+    differing = set(_differing([("", one.parameters) for one in told]))
+    return sorted(key for key in differing & _following(told, over) if key.rpartition(".")[2] not in names)
 
 
 def _following(told: Sequence[_Told], over: Sequence[str]) -> set[str]:

@@ -56,13 +56,19 @@ class RunRecord:
     def write(self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None) -> Metrics:
         """Writes everything that the run found, and says the main figures in the log.
 
-        `counts` are further figures for metrics.json, by key.
+        `counts` are further figures for metrics.json, by key. What was mapped is written before it is judged: where the
+        truth turns out to be unusable, it stays.
         """
         scene, classes = result.scene, result.scene.classes
         mesh, instances = scene.mesh(), scene.instances()
         names = {key: class_name(instance, classes) for key, instance in instances.items()}
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
+        write_mesh(self.directory / "mesh.ply", mesh)
+        write_instances(self.directory / "instances.json", mesh, instances, classes)
+        write_tum(self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
+        write_timings(self.directory / "timings.csv", result)
+        scene.save(self.directory / "map.npz")
         metrics: Metrics = {
             "sequence": sequence.name,
             **{f"choice.{group}": self.choices.get(group) for group in STAGES},
@@ -77,12 +83,6 @@ class RunRecord:
             **environment(),
         }
         title = headline(metrics)
-
-        write_mesh(self.directory / "mesh.ply", mesh)
-        write_instances(self.directory / "instances.json", mesh, instances, classes)
-        write_tum(self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
-        write_timings(self.directory / "timings.csv", result)
-        scene.save(self.directory / "map.npz")
         labels = {key: (name or "object", instances[key].confidence) for key, name in names.items()}
         write_overview(self.directory / "overview.png", mesh, labels, poses, title)
         if result.stopped_by is None:

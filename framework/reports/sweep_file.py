@@ -11,6 +11,7 @@ from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
 
 SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
+MOST_VALUES = 1000  # of a key; a range may claim any number
 
 
 def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
@@ -54,4 +55,5 @@ def _values(override: Override) -> list[str]:
     if not override.is_sweep_override():
         return [str(override.value())]
     parser = OverridesParser.create()
-    return [str(parser.parse_override(f"x={text}").value()) for text in override.sweep_string_iterator()]
+    texts = itertools.islice(override.sweep_string_iterator(), MOST_VALUES)
+    return [str(parser.parse_override(f"x={text}").value()) for text in texts]

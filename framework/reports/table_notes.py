@@ -10,11 +10,17 @@ from framework.build import STAGES
 from framework.evaluation.instances import MAX_DISTANCE
 from framework.reports.comparison import Comparison
 from framework.reports.records import Record
-from framework.reports.rows import CHOICE, CONFIDENCE, Run
+from framework.reports.rows import CHOICE, CONFIDENCE, Run, following
 from framework.reports.sequences import mean_by_sequence
 
 
 def notes(comparison: Comparison) -> Iterator[str]:
+    """Each of them one line."""
+    for note in _notes(comparison):
+        yield " ".join(note.split())
+
+
+def _notes(comparison: Comparison) -> Iterator[str]:
     yield from _averaging(comparison)
     yield from _winners(comparison)
     if comparison.overrides:
@@ -24,7 +30,7 @@ def notes(comparison: Comparison) -> Iterator[str]:
         yield f"In all: {fixed}."
     yield from _protocol(comparison)
     yield from _published(comparison)
-    yield f"Code: {counted(record.commit for record in comparison.records)}."
+    yield f"Code: {counted(record.code for record in comparison.records)}."
     yield f"Machine: {counted(machine(record) for record in comparison.records)}."
     yield f"Config: config.yaml beside each run; SHA-256 of all their hashes: {digest(comparison.records)}."
     yield from _missing(comparison)
@@ -33,6 +39,8 @@ def notes(comparison: Comparison) -> Iterator[str]:
 def _averaging(comparison: Comparison) -> Iterator[str]:
     """How figures come about, and how rows are compared."""
     choice, over = comparison.choice, ", ".join(comparison.choice.over)
+    if others := following(comparison.records, choice.over):
+        yield f"Averaged over with {over}, whose value they have in every run: {', '.join(others)}."
     if choice.apart:
         yield (
             f"Mean ± sample standard deviation over {over}, where there are several. The mean is over the sequences "

@@ -76,7 +76,7 @@ def comma_separated_rows(comparison: Comparison) -> str:
             line += [mean.value, mean.deviation, mean.count, difference.value, difference.error, len(less)]
         figures = ["" if math.isnan(x) else repr(x) for x in line]
         records = list(row.records.values())
-        code = counted(record.commit for record in records)
+        code = counted(record.code for record in records)
         writer.writerow([row.name, len(records), row.pose_source, row.annotation, *figures, code, digest(records)])
     return text.getvalue()
 
@@ -93,7 +93,7 @@ def comma_separated_runs(comparison: Comparison) -> str:
         told_of = {
             run: [
                 *(record.metrics.get(key) for key in ("pose_source", "choice.tracker", "annotation_release")),
-                *(record.commit, record.metrics["config_hash"]),
+                *(record.code, record.metrics["config_hash"]),
             ]
             for run, record in row.records.items()
         }

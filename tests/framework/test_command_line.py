@@ -6,10 +6,12 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from framework.command_line import directory_name
+from framework.command_line import directory_name, print_for_directories
+from framework.errors import DataError
 
 
 def test_overrides_become_one_directory() -> None:
@@ -21,6 +23,21 @@ def test_long_overrides_stay_distinct_and_short() -> None:
     names = [directory_name("dataset.root=" + 300 * "x" + f",seed={seed}") for seed in range(2)]
     assert names[0] != names[1]
     assert all(len(name) <= 200 for name in names)
+
+
+def test_a_directory_that_is_refused_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write(directory: Path) -> str:
+        if directory.name == "empty":
+            raise DataError("there is nothing")
+        return directory.name
+
+    monkeypatch.setattr(sys, "argv", ["command", *(str(tmp_path / name) for name in ("a", "empty", "b"))])
+    with pytest.raises(SystemExit) as ended:
+        print_for_directories("command", "", "", write)
+    assert ended.value.code == 1
+    assert capsys.readouterr() == ("a\nb\n", "error: there is nothing\n")
 
 
 @pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])

@@ -120,6 +120,25 @@ def test_last_digits_are_told(stored: Path, command) -> None:
     assert line.endswith(f"-> {true['instances.mean_iou']!r}")
 
 
+def test_another_truth_is_refused_unless_it_is_asked_for(stored: Path, command) -> None:
+    """A relative dataset.root means another folder elsewhere, and its truth says nothing about this run."""
+    true = metrics_of(stored)
+    write_metrics(stored, true | {"truth_sha256": "0" * 64})
+    status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert "the true instances of tests.corner_room.CornerRoom are not those that the run was compared with" in err
+    assert metrics_of(stored)["truth_sha256"] == "0" * 64
+    assert command(stored, "--other-truth")[:2] == (0, f"{stored}: 1 other\n")
+    assert metrics_of(stored) == true | CODE
+
+
+def test_a_record_from_before_truths_had_a_hash_is_evaluated(stored: Path, command) -> None:
+    true = metrics_of(stored)
+    write_metrics(stored, {key: value for key, value in true.items() if key != "truth_sha256"})
+    assert command(stored)[:2] == (0, f"{stored}: 1 new\n")
+    assert metrics_of(stored) == true | CODE
+
+
 def test_a_dry_run_writes_nothing(stored: Path, command) -> None:
     write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.125})
     before = {path.name: path.read_bytes() for path in stored.iterdir()}

@@ -92,6 +92,13 @@ def test_labels_become_instances_of_the_nine_classes(root: Path) -> None:
     np.testing.assert_array_equal(truth.instance_ids, expected)
 
 
+def test_only_the_nine_classes_were_looked_for(root: Path) -> None:
+    truth = SceneNN(root, "016").scene_truth()
+    assert truth is not None
+    assert len(truth.classes or ()) == 9
+    assert "toilet" in (truth.classes or ())
+
+
 def test_a_label_without_a_text_or_of_an_unknown_class_is_not_evaluated(root: Path) -> None:
     changed = [
         Annotated(CHAIR, "", "chair", (0, 0, 0), None, None),

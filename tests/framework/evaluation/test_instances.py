@@ -139,6 +139,19 @@ def test_a_prediction_mostly_on_unknown_instances_is_ignored():
     assert (score.ignored, score.false_positives) == (0, 1), "exactly half of it is unknown: wrong"
 
 
+def test_what_nobody_looked_for_is_neither_right_nor_wrong():
+    """A right chair, and a right keyboard where only chairs and beds are labelled; a wrong bed stays wrong."""
+    truth = replace(scene([(1, 100), (0, 300)], {1: "chair"}), classes=("chair", "bed"))
+    found = [(1, 100), (2, 100), (0, 100), (3, 100)]
+    claims = {1: ("chair", 0.8), 2: ("keyboard", 0.9), 3: ("bed", 0.7)}
+    result = evaluate(prediction(truth, found, claims), truth)
+    assert (result.overall.true_positives, result.overall.false_positives, result.overall.ignored) == (1, 1, 1)
+    assert result.metrics()["instances.ap50_agnostic"] == 1.0
+    assert evaluate(prediction(truth, found, claims), replace(truth, classes=None)).overall.false_positives == 2
+    called_otherwise = evaluate(prediction(truth, [(1, 100)], {1: ("bench", 0.8)}), truth)
+    assert called_otherwise.metrics()["instances.ap50_agnostic"] == 1.0, "the object is found, by whatever name"
+
+
 def test_an_evaluated_match_is_never_ignored():
     """At IoU 0.25 the prediction finds its truth although more of it lies on an unknown instance."""
     truth = scene([(1, 100), (2, 150)], {1: "chair", 2: None})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import pytest
+
 from framework.reports.grid import Grid, decimals, figure, latex_grid, markdown_grid
 
 GRID = Grid(
@@ -24,13 +26,25 @@ def test_markdown_is_padded_and_words_stand_left() -> None:
     ]
 
 
+@pytest.mark.parametrize("name", ["*star", "[optional]"])
+def test_latex_takes_no_cell_for_an_argument(name: str) -> None:
+    """A star or a bracket behind the \\\\ or the rule of the line above is an argument of that."""
+    assert f"{{}}{name} & 1 \\\\" in latex_grid(Grid(["row", "x"], [[name, "1"]]))
+
+
+def test_a_line_break_ends_no_line_of_a_table() -> None:
+    grid = Grid(["row", "x"], [["a\nb", "1"]])
+    assert "a b & 1 \\\\" in latex_grid(grid)
+    assert "| a b | 1 |" in markdown_grid(grid)
+
+
 def test_latex_escapes_and_has_a_rule_between_groups() -> None:
     assert latex_grid(GRID) == [
         "\\begin{tabular}{llr}",
         "\\toprule",
         "scene & a\\_b & x \\\\",
         "\\midrule",
-        "011 & y|z & \\textbf{0.5 $\\pm$ 0.1} \\\\",
+        "011 & y\\textbar{}z & \\textbf{0.5 $\\pm$ 0.1} \\\\",
         "\\midrule",
         " & 50\\% & -- \\\\",
         "\\bottomrule",

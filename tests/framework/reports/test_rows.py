@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from framework.reports.records import Record
-from framework.reports.rows import Mean, Row, rows_of
+from framework.reports.rows import Mean, Row, following, rows_of
 
 AP = "instances.ap50"
 
@@ -73,6 +73,12 @@ def test_the_star_is_the_paired_t_test() -> None:
     assert 5 < sum(stars) < 35
 
 
+def test_equal_differences_are_no_evidence() -> None:
+    """Two instances more in each of two rooms: a count, without a spread by which the next room could be told."""
+    assert not Mean.of([2.0, 2.0]).is_not_zero
+    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "they differ in the last digit only"
+
+
 def test_rows_are_the_experiments_and_runs_are_seeds_in_order() -> None:
     records = [record({"row": name, "seed": seed}) for name in ("b", "a") for seed in (10, 9, 1)]
     runs = [("1",), ("9",), ("10",)]
@@ -125,6 +131,42 @@ def test_rows_that_differ_in_what_no_row_changes_are_told_apart() -> None:
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, tracker=icp", "b, tracker=given"]
     changes["b"].append("tracker=given")
     assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
+
+
+def test_rows_with_other_parameters_are_told_apart_though_each_has_but_one() -> None:
+    """They differ in what no row's overrides say: that is no difference between the rows, and is in their names."""
+    frames = {"a": 8, "b": 16}
+    records = [
+        record({"row": row, "seed": 0, "dataset": {"frames": count}, "fuser": {"voxel": count, "inner": {"x": count}}})
+        for row, count in frames.items()
+    ]
+    changes = {"a": [], "b": ["fuser.voxel=16", "part@fuser.inner=y"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.frames=8", "b, dataset.frames=16"]
+    changes["b"].append("dataset=other")
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
+    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "nobody knows what they change"
+
+
+def test_without_an_experiment_other_scenes_are_told_apart() -> None:
+    records = [
+        record({"seed": 0, "dataset": {"scene": scene}}, refiner=name)
+        for name, scene in (("chain", "011"), ("identity", "016"))
+    ]
+    assert list(names(records)) == ["refiner=chain, dataset.scene=011", "refiner=identity, dataset.scene=016"]
+
+
+def test_a_row_may_be_called_by_a_number() -> None:
+    records = [record({"row": row, "seed": 0}) for row in (0, 20)]
+    assert list(names(records, "0", "20")) == ["0", "20"]
+
+
+def test_what_may_follow_the_seed_by_chance_is_told() -> None:
+    records = [
+        record({"seed": seed, "dataset": {"seed": seed, "stride": seed, "start": 1}, "fuser": {"voxel": 1}})
+        for seed in (1, 2)
+    ]
+    assert following(records, ["seed"]) == ["dataset.stride"]
+    assert following(records[:1], ["seed"]) == []
 
 
 def test_rows_of_other_data_are_told_apart_though_each_has_but_one() -> None:

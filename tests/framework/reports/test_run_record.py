@@ -14,16 +14,16 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from framework.data import Frame, InstanceMesh, Pose
+from framework.data import Frame, InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError, MapFullError
 from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
 from framework.interfaces import SceneMap
-from framework.journal import RunResult
+from framework.journal import RunResult, TrackedFrame
 from framework.pipeline import Pipeline
 from framework.reports import provenance, run_record
 from framework.reports.instances_file import write_instances
 from framework.reports.mesh_file import write_mesh
-from framework.reports.metrics import instance_metrics, pose_source, run_metrics
+from framework.reports.metrics import instance_metrics, pose_source, run_metrics, trajectory_metrics
 from framework.reports.run_record import RunRecord, headline
 from framework.trajectory_file import read_tum
 from tests.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
@@ -93,6 +93,7 @@ def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, 
     assert to_map["instances.mean_iou"] != to_truth["instances.mean_iou"]
     assert metrics.pop("annotation_release") == release
     assert metrics.pop("instances.count") == 2
+    assert len(str(metrics.pop("truth_sha256"))) == 64
     for name in ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou"):
         assert metrics.pop(f"instances.to_map.{name}") == to_map[f"instances.{name}"]
     assert metrics == to_truth
@@ -100,7 +101,7 @@ def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, 
 
 def test_without_ground_truth_there_is_no_evaluation(record: RunRecord, room: CornerRoom) -> None:
     result = mapped(room)
-    untrue = [type(frame)(frame.index, frame.timestamp, frame.pose, None) for frame in result.tracked]
+    untrue = [type(frame)(frame.index, frame.position, frame.timestamp, frame.pose, None) for frame in result.tracked]
     blind = RunResult(result.scene, 6, 0, tuple(untrue), result.timings, result.seconds)
     record.write(CornerRoom(truth=False), blind)
     metrics = metrics_of(record)
@@ -116,6 +117,31 @@ def test_metrics_come_last(record: RunRecord, room: CornerRoom, monkeypatch: pyt
     with pytest.raises(DataError, match="no space"):
         record.write(room, mapped(room))
     assert not (record.directory / "metrics.json").exists()
+
+
+def test_what_was_mapped_stays_where_the_truth_is_unusable(record: RunRecord, room: CornerRoom) -> None:
+    def far_off() -> SceneTruth:
+        raise DataError("ground truth: a point lies far off")
+
+    result = mapped(room)
+    room.scene_truth = far_off  # type: ignore[method-assign]
+    with pytest.raises(DataError, match="far off"):
+        record.write(room, result)
+    left = {path.name for path in record.directory.iterdir()}
+    assert left == {"config.yaml", "mesh.ply", "instances.json", "trajectory.txt", "timings.csv", "map.npz"}
+
+
+def test_a_step_over_a_skipped_frame_is_no_step_of_one_frame(room: CornerRoom) -> None:
+    """1 cm of drift a frame, of which frame 2 was skipped: RPE is 1 cm, and not that of steps of 1, 2 and 1 cm."""
+    true = np.eye(4)
+    tracked = []
+    for position in (0, 1, 3, 4):
+        drifted = np.eye(4)
+        drifted[0, 3] = 0.01 * position
+        tracked.append(TrackedFrame(10 * position, position, 0.1 * position, Pose(drifted), true))
+    result = mapped(room)
+    metrics = trajectory_metrics(RunResult(result.scene, 5, 1, tuple(tracked), (), 1.0))
+    assert metrics["trajectory.rpe_rmse_m"] == pytest.approx(0.01)
 
 
 def test_a_partial_run_is_marked(record: RunRecord, room: CornerRoom) -> None:

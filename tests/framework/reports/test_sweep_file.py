@@ -33,6 +33,10 @@ def test_values_are_those_that_the_config_will_hold(override: str, values: list[
     assert asked_runs(sweep({}, [override]), ["seed"]) == [(value,) for value in values]
 
 
+def test_a_range_cannot_claim_the_memory() -> None:
+    assert len(asked_runs(sweep({}, ["seed=range(0,100000000)"]), ["seed"])) == 1000
+
+
 @pytest.mark.parametrize(
     "config",
     [

@@ -78,7 +78,8 @@ def test_every_figure_by_hand(sweep: Path) -> None:
 def test_seeds_of_a_scene_are_no_independent_evidence(tmp_path: Path) -> None:
     """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, whatever the number of seeds."""
     table = {"over": ["seed", "scene"], "columns": ["instances.ap50"]}
-    (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": {"chain": [], "other": []}}))
+    rows = {"chain": [], "other": ["refiner=other"]}
+    (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": rows}))
     for row, scene, ap in (("chain", "a", 0.5), ("chain", "b", 0.5), ("other", "a", 0.8), ("other", "b", 0.6)):
         for seed in range(3):
             run(tmp_path, row, seed, ap, 1.0, scene=scene)
@@ -115,6 +116,33 @@ def test_seeds_that_were_asked_for_and_have_not_begun_are_said(sweep: Path) -> N
     lines = write_tables(sweep).splitlines()
     assert "- Missing in identity: seed=3,4." in lines
     assert "- Missing in chain: seed=3,4." in lines
+
+
+def test_what_evaluated_anew_is_named_beside_what_ran(sweep: Path) -> None:
+    """A table of two evaluators must say so."""
+    path = sweep / "row=chain,seed=1" / "metrics.json"
+    anew = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
+    path.write_text(json.dumps(json.loads(path.read_text()) | anew))
+    told = "- Code: 1234567 (5 runs), 1234567, evaluated by fedcba9 with changes (1 run)."
+    assert told in write_tables(sweep).splitlines()
+
+
+def test_a_note_is_one_line_whatever_a_run_says(sweep: Path) -> None:
+    (sweep / "row=chain,seed=1" / "metrics.json").unlink()
+    partial = {"partial": "the map\nis\r\nfull"}
+    (sweep / "row=chain,seed=1" / "metrics.partial.json").write_text(json.dumps(partial))
+    assert "- Not complete: row=chain,seed=1: partial: the map is full." in write_tables(sweep).splitlines()
+    assert "% Not complete: row=chain,seed=1: partial: the map is full." in (sweep / "table.tex").read_text()
+
+
+def test_what_has_the_seeds_value_by_chance_is_told(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        config = {"seed": seed, "dataset": {"stride": seed}}
+        directory = run(tmp_path, "x", seed, 0.5, 1.0)
+        (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+        metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
+        (directory / "metrics.json").write_text(json.dumps(metrics))
+    assert "- Averaged over with seed, whose value they have in every run: dataset.stride." in write_tables(tmp_path)
 
 
 def test_no_differences_without_the_base(sweep: Path) -> None:
@@ -214,7 +242,7 @@ def test_latex_and_markdown_escape(sweep: Path) -> None:
     run(sweep, r"50%_{a}|b\c", 0, 0.5, 1.0)
     assert r"50%_{a}\|b\c" in write_tables(sweep)
     latex = (sweep / "table.tex").read_text()
-    assert r"50\%\_\{a\}|b\textbackslash{}c & 1 & 0.500 &" in latex
+    assert r"50\%\_\{a\}\textbar{}b\textbackslash{}c & 1 & 0.500 &" in latex
     assert r"chain & 3 & 0.700 $\pm$ 0.265 & 151.0 $\pm$ 1.0 & ground\_truth \\" in latex
     bodies = [line for line in latex.splitlines() if line.endswith(r"\\")]
     assert {line.count("&") for line in bodies[:4]} == {4}
