@@ -6,18 +6,16 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from framework.errors import DataError
+from framework.whole_files import read_text
 
 SHOWN = 60  # characters of what a file holds that an error repeats
 
 
 def read_lines(path: Path, missing: str = "does not exist") -> list[str]:
     """The lines of a text file. Raises DataError, naming it; `missing` is what is said of one that is not there."""
-    try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError as error:
-        raise DataError(f"{path} {missing}") from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
+    if not path.exists():
+        raise DataError(f"{path} {missing}")
+    return read_text(path).splitlines()
 
 
 def numbers(where: str, words: Sequence[str], count: int, names: str = "") -> list[float]:

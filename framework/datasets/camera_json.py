@@ -10,19 +10,19 @@ from typing import Any
 
 from framework.data import Camera
 from framework.errors import DataError
+from framework.whole_files import MOST_TEXT, read_bytes
 
 
-def read_json_object(path: Path) -> dict[str, Any]:
-    """The JSON object that a file holds. Raises DataError, naming the file, when it holds none."""
+def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
+    """The JSON object that a file of at most so many bytes holds. Raises DataError, naming it, when it holds none."""
+    content = read_bytes(path, most)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+        found = json.loads(content)  # with or without a byte order mark
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
-    return content
+    if not isinstance(found, dict):
+        raise DataError(f"{path} must hold a JSON object, found {type(found).__name__}")
+    return found
 
 
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:

@@ -31,6 +31,7 @@ from framework.scenenn.annotation import Annotated, read_annotation
 from framework.scenenn.intrinsics import read_intrinsics
 from framework.scenenn.timestamps import read_timestamps
 from framework.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
+from framework.whole_files import read_text
 
 DEPTH_SCALE = 1000.0  # units a metre
 MOST_ID = np.iinfo(np.int32).max
@@ -151,7 +152,5 @@ def _is_of_another_class(label: Annotated | None) -> bool:
 
 def _named_release(root: Path) -> str:
     path = root / "release.txt"
-    try:
-        return path.read_text("utf-8").strip().partition("\n")[0] or "not named" if path.exists() else "not named"
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read: {error}") from error
+    text = read_text(path) if path.exists() else ""
+    return text.strip().partition("\n")[0].strip() or "not named"

@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from framework.atomic_files import written_whole
 from framework.data import Box, Float64
 from framework.errors import DataError
+from framework.whole_files import read_bytes
 
 LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 9 s and 0.5 GB
 LARGEST_ID = int(np.iinfo(np.int32).max)  # what a label of the mesh can be
@@ -45,13 +46,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     Raises DataError, naming the line, when the file is not XML, declares a document type (with which entities and
     default attributes come), or has a label with no integer as its id, or with an id that another one has.
     """
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise DataError(f"{path} is no annotation: it has {size} bytes, more than {LARGEST_FILE}")
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+    content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
     parser = DefusedXMLParser(target=labels, forbid_dtd=True)
     labels.expat = parser.parser

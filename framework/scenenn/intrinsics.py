@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from codecs import BOM_UTF8
 from pathlib import Path
 
 from framework.atomic_files import written_whole
 from framework.data import Camera
 from framework.errors import DataError
+from framework.whole_files import read_bytes
 
 KEYS = ("fx", "fy", "cx", "cy")  # px
 SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px, whose middle is the centre where the file has none
@@ -53,13 +55,7 @@ def write_intrinsics(path: Path, camera: Camera) -> None:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
-    if len(content) > LARGEST_FILE:
-        raise DataError(f"{path} is no file of intrinsics: it has more than {LARGEST_FILE} bytes")
+    content = read_bytes(path, LARGEST_FILE).removeprefix(BOM_UTF8)
     return [line.decode("latin-1") for line in content.splitlines()]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,7 @@ from framework.atomic_files import written_whole
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.geometry import nearest_rigid
+from framework.whole_files import MOST_TEXT, read_bytes
 
 LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
 BLOCK = 5  # lines of a frame
@@ -90,10 +92,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 def _read_lines(path: Path) -> list[_Line]:
     """The lines that hold something."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+    content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
     lines = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
     return [line for line in lines if line.words]
 

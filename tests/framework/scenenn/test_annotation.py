@@ -160,7 +160,7 @@ def test_a_file_that_is_too_large_or_not_there(path, monkeypatch):
     path.write_text("<a>" + " " * 93 + "</a>")
     assert read_annotation(path) == ()
     path.write_text("<a>" + " " * 94 + "</a>")
-    with pytest.raises(DataError, match=r"011.xml is no annotation: it has 101 bytes, more than 100"):
+    with pytest.raises(DataError, match=r"011.xml has 101 bytes, more than the 100"):
         read_annotation(path)
 
 
