@@ -84,7 +84,7 @@ class RgbdFolder(Recording):
             recorded = self.contents.frames[index]
             try:
                 if recorded.fault:
-                    raise FrameError(recorded.fault)
+                    raise FrameError(f"frame {index}: {recorded.fault}")
                 depth, truth = self.metric_depth(index), self.truth_in(index)
             except FrameError as error:
                 log.warning("ground truth: left out %s", error)
