@@ -7,6 +7,7 @@ import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
@@ -19,7 +20,8 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import RGBDSequence
 
 FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
-FRAME_RATE = 30.0  # Hz, for the timestamps of recordings without any
+FRAME_RATE = 30.0  # Hz, of recordings without timestamps, or with some that cannot be
+COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # units a metre that stored depth may have; most sensors' have 1000
 NO_READING = 65535  # uint16 that several sensors write instead of 0
 
 log = logging.getLogger(__name__)
@@ -112,7 +114,8 @@ class Recording(RGBDSequence):
             raise DataError(f"dataset.root: the folder {self.folder} does not exist")
         self.name = self.folder.resolve().name
         contents = self.open()
-        self.contents = replace(contents, frames=[_within_reach(recorded) for recorded in contents.frames])
+        frames = [_within_reach(recorded) for recorded in contents.frames]
+        self.contents = replace(contents, frames=_in_order_of_time(self.name, frames))
         self.camera = self.contents.camera
         self.chosen = choose_frames(
             len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
@@ -189,6 +192,15 @@ def _within_reach(recorded: RecordedFrame) -> RecordedFrame:
         return recorded
     told = f"its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
     return RecordedFrame(recorded.images, recorded.timestamp, fault=told)
+
+
+def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
+    """The frames, at 30 Hz where the times of those that can be used do not grow."""
+    times = [recorded.timestamp for recorded in frames if not recorded.fault]
+    if all(a < b for a, b in pairwise(times)):
+        return frames
+    log.warning("%s: the times do not grow from frame to frame; frames are taken to come at %g Hz", name, FRAME_RATE)
+    return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:

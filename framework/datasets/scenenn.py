@@ -13,7 +13,8 @@ The images are those that the official play-back, or `python -m framework.conver
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import logging
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -35,6 +36,8 @@ from framework.whole_files import read_text
 
 DEPTH_SCALE = 1000.0  # units a metre
 MOST_ID = np.iinfo(np.int32).max
+
+log = logging.getLogger(__name__)
 
 
 class Sensor(StrEnum):
@@ -60,7 +63,8 @@ class SceneNN(LabeledRecording):
         images = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
         depths = numbered_images(self.folder / "depth", (".png",))
         poses = _optional_poses(self.folder / "trajectory.log")
-        times = _optional_times(self.folder / "timestamp.txt")
+        numbers = sorted(images.keys() | depths.keys())
+        times = _optional_times(self.folder / "timestamp.txt", numbers)
         self.mesh = mesh_of([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         if self.mesh is None and self.frame_truth:
             raise DataError(f"dataset.frame_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
@@ -76,7 +80,7 @@ class SceneNN(LabeledRecording):
                 poses,
                 times.get(k, (k - 1) / FRAME_RATE),
             )
-            for k in sorted(images.keys() | depths.keys())
+            for k in numbers
         ]
         ini = self.root / "intrinsic" / f"{self.sensor}.ini"
         return Contents(_camera(ini, images.values()), "the first colour image", DEPTH_SCALE, frames)
@@ -109,8 +113,17 @@ def _optional_poses(path: Path) -> TrajectoryLog | None:
     return read_trajectory_log(path) if path.exists() else None
 
 
-def _optional_times(path: Path) -> Mapping[int, float]:
-    return read_timestamps(path) if path.exists() else {}
+def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
+    """The times of all of these images, or of none: two clocks do not mix."""
+    if not path.exists():
+        return {}
+    times = read_timestamps(path)
+    without = [k for k in images if k not in times]
+    if not without:
+        return times
+    told = "%s has no time for %d of %d images, the first being %d: it is ignored, frames are taken to come at %g Hz"
+    log.warning(told, path, len(without), len(images), without[0], FRAME_RATE)
+    return {}
 
 
 def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:

@@ -151,6 +151,18 @@ def test_without_timestamps_frames_come_at_30_hz(root: Path) -> None:
     assert SceneNN(root, "016")[3].timestamp == pytest.approx(0.1)
 
 
+def test_where_times_do_not_grow_frames_come_at_30_hz(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_timestamps(root / "016" / "timestamp.txt", dict.fromkeys(range(1, FRAMES + 1), 0))
+    assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
+    assert caplog.text.count("the times do not grow") == 1
+
+
+def test_timestamps_that_lack_an_image_are_left_out(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_timestamps(root / "016" / "timestamp.txt", {k: 7 + k / 10 for k in (1, 2, 4)})
+    assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
+    assert caplog.text.count("timestamp.txt has no time for 1 of 4 images, the first being 3: it is ignored") == 1
+
+
 @pytest.mark.parametrize("line", ["2 x 5", "2 5", "1 0 0", "2 0 nan"])
 def test_a_bad_line_of_timestamps_is_named(root: Path, line: str) -> None:
     (root / "016" / "timestamp.txt").write_text(f"1 0 0\n{line}\n")
