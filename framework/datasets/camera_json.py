@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.data import Camera
+from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError
 from framework.whole_files import MOST_TEXT, read_bytes
 
@@ -36,8 +37,11 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
         if value != int(value):
             raise DataError(f"{path}: {key} must be a whole number of pixels, found {value}")
     width, height, fx, fy, cx, cy, depth_scale = values
-    if depth_scale <= 0:
-        raise DataError(f"{path}: {keys[-1]} must be positive (depth units per metre), found {depth_scale}")
+    if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
+        raise DataError(
+            f"{path}: {keys[-1]} must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], as metres = value / {keys[-1]} "
+            f"(1000 for millimetres), found {depth_scale:g}"
+        )
     try:
         return Camera(int(width), int(height), fx, fy, cx, cy), depth_scale
     except DataError as error:
