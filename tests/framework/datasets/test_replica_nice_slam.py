@@ -81,6 +81,9 @@ def test_a_pose_that_is_none_is_the_fault_of_its_frame(root: Path) -> None:
     assert "traj.txt, line 2: the pose is not rigid" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
     write_poses(root / "room0", [pose_at(0), np.full((4, 4), np.nan), pose_at(2)])
     assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    text = (root / "room0/traj.txt").read_text()
+    (root / "room0/traj.txt").write_text(text.replace("nan", "-nan(ind)"))
+    assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 
 
 @pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])

@@ -372,6 +372,7 @@ def test_depth_that_is_not_uint16(folder):
     [
         ("0.1 nan 0 0 0 0 0 1", "not finite"),
         ("0.1 0 0 inf 0 0 0 1", "not finite"),
+        ("0.1 -1.#IND -1.#IND -1.#IND 0 0 0 1", "not finite"),
         ("0.1 0 0 0 0 0 0 0.5", "length 0.5, expected 1"),
         ("0.1 0 0 0 0 0 0 0", "length 0, expected 1"),
     ],
