@@ -14,7 +14,7 @@ The images are those that the official play-back, or `python -m framework.conver
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -141,6 +141,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
         raise DataError(f"{mesh}: a label must be in [0, {MOST_ID}], found {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
+    _warn_of_unlisted(mesh, annotation, set(present.tolist()) - names.keys() - {0})
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)
     for k, label in enumerate(present.tolist()):
@@ -148,6 +149,14 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
             ids[k] = label
             class_names[label] = SCENENN_TO_COCO.get(_nyu_class(names.get(label)))
     return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names)
+
+
+def _warn_of_unlisted(mesh: Path, annotation: Path, labels: Collection[int]) -> None:
+    if labels:
+        told = (
+            "%s: %s does not have %d of its labels, like %d: their classes are not known, and they are not evaluated"
+        )
+        log.warning(told, mesh, annotation.name, len(labels), min(labels))
 
 
 def _nyu_class(label: Annotated | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -44,7 +44,7 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     """The labels of an annotation, in the file's order; elements and attributes that are not known are left out.
 
     Raises DataError, naming the line, when the file is not XML, declares a document type (with which entities and
-    default attributes come), or has a label with no integer as its id, or with an id that another one has.
+    default attributes come), has no label, or one with no integer as its id, or two that differ with one id.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -61,7 +61,9 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
         raise DataError(f"{path}, line {error.position[0]}: this is not XML: {ErrorString(error.code)}") from error
     except (ValueError, LookupError) as error:
         raise DataError(f"{path}, line {labels.line}: its encoding is not known, expected UTF-8") from error
-    return tuple(label for label, _ in labels.found.values())
+    if not labels.found:
+        raise DataError(f"{path} holds no <label>: it is no annotation of SceneNN's")
+    return tuple(_annotated(id_, attributes) for id_, (attributes, _) in labels.found.items())
 
 
 def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
@@ -69,6 +71,8 @@ def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
 
     Raises DataError when it would not, or the disk does not take the file.
     """
+    if not objects:
+        raise DataError(f"{path}: an annotation has at least one label")
     lines = ['<?xml version="1.0" encoding="utf-8"?>', "<annotation>"]
     ids = set()
     for label in objects:
@@ -95,33 +99,36 @@ class _Labels:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.expat: Any = None  # it knows the line
-        self.found: dict[int, tuple[Annotated, int]] = {}  # by id: the label and its line
+        self.found: dict[int, tuple[dict[str, str], int]] = {}  # by id: the label's attributes and its line
 
     @property
     def line(self) -> int:
         return int(self.expat.CurrentLineNumber)
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        if tag != "label":
+        if tag.rpartition("}")[2] != "label":  # behind its namespace, if it has one
             return
         id_ = _id(attributes.get("id", ""))
         if id_ is None:
             found = repr(attributes["id"][:40]) if "id" in attributes else "none"
             raise self._fault(f"a label needs an id from 0 to {LARGEST_ID}, found {found}")
-        if id_ in self.found:
-            raise self._fault(f"the label {id_} is there already in line {self.found[id_][1]}")
-        label = Annotated(
-            id=id_,
-            text=attributes.get("text", ""),
-            nyu_class=attributes.get("nyu_class", ""),
-            color=_color(attributes.get("color", "")),
-            aabb=_aabb(attributes.get("aabbox", "")),
-            obb=_obb(attributes.get("obbox", "")),
-        )
-        self.found[id_] = label, self.line
+        before, line = self.found.setdefault(id_, (attributes, self.line))
+        if attributes != before:
+            raise self._fault(f"the label {id_} is there already in line {line}, with other attributes")
 
     def _fault(self, message: str) -> DataError:
         return DataError(f"{self._path}, line {self.line}: {message}")
+
+
+def _annotated(id_: int, attributes: Mapping[str, str]) -> Annotated:
+    return Annotated(
+        id=id_,
+        text=attributes.get("text", ""),
+        nyu_class=attributes.get("nyu_class", ""),
+        color=_color(attributes.get("color", "")),
+        aabb=_aabb(attributes.get("aabbox", "")),
+        obb=_obb(attributes.get("obbox", "")),
+    )
 
 
 def _attributes(label: Annotated) -> dict[str, str]:

@@ -92,6 +92,21 @@ def test_labels_become_instances_of_the_nine_classes(root: Path) -> None:
     np.testing.assert_array_equal(truth.instance_ids, expected)
 
 
+def test_labels_that_the_annotation_does_not_have_are_counted(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    SceneNN(root, "016")
+    assert caplog.text.count("016.ply: 016.xml does not have 1 of its labels, like 55") == 1
+    write_annotation(root / "016" / "016.xml", [*labels(), Annotated(UNLISTED, "x", "chair")])
+    caplog.clear()
+    SceneNN(root, "016")
+    assert not caplog.records
+
+
+def test_an_annotation_without_labels_is_named(root: Path) -> None:
+    (root / "016" / "016.xml").write_text("<annotation/>")
+    with pytest.raises(DataError, match=r"016\.xml holds no <label>"):
+        SceneNN(root, "016")
+
+
 def test_a_label_without_a_text_or_of_an_unknown_class_is_not_evaluated(root: Path) -> None:
     changed = [
         Annotated(CHAIR, "", "chair", (0, 0, 0), None, None),
