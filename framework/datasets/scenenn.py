@@ -153,9 +153,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
 def _warn_of_unlisted(mesh: Path, annotation: Path, labels: Collection[int]) -> None:
     if labels:
-        told = (
-            "%s: %s does not have %d of its labels, like %d: their classes are not known, and they are not evaluated"
-        )
+        told = "%s: %s does not have %d of its labels, like %d: their classes are not known, and they are not evaluated"
         log.warning(told, mesh, annotation.name, len(labels), min(labels))
 
 

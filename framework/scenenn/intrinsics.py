@@ -21,13 +21,14 @@ LARGEST_FILE = 2**20  # bytes; such a file has some hundred
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
-    Comments (# or ;), section headers and other keys are left out. Without cx or cy, it is half of depth_width or
-    depth_height, as ethz-asl/scenenn_to_rosbag takes it. Raises DataError, naming file and line, when a key is
-    missing, there twice, or its value is no finite number, positive for focal lengths and sizes.
+    Keys may be in upper case; comments (# or ;), section headers and other keys are left out. Without cx or cy, it is
+    half of depth_width or depth_height, as ethz-asl/scenenn_to_rosbag takes it. Raises DataError, naming file and line,
+    when a key is missing, there twice, or its value is no finite number, positive for focal lengths and sizes.
     """
     values: dict[str, float] = {}
     for number, line in enumerate(_lines(path), start=1):
         key, *found = re.split(r"\s*[=:]\s*|\s+", re.split("[#;]", line)[0].strip(), maxsplit=1)
+        key = key.lower()
         if key not in POSITIVE and key not in KEYS:
             continue
         value = _number(found[0] if found else "")

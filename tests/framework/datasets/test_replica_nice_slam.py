@@ -104,10 +104,22 @@ def test_without_a_scene_the_camera_is_missing(root: Path) -> None:
         ReplicaNiceSlam(root)
 
 
-def test_fewer_poses_than_frames(root: Path) -> None:
+def test_frames_without_a_pose_are_counted(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)])
-    with pytest.raises(DataError, match=r"traj\.txt holds 2 poses, but results/ has a frame 2"):
-        ReplicaNiceSlam(root, scene="room0")
+    sequence = ReplicaNiceSlam(root, scene="room0")
+    assert "frame 2: traj.txt has 2 poses and none for it" in fault_of(sequence, 2)
+    result, _ = mapped(sequence)
+    assert (result.frames, result.frames_skipped) == (FRAMES, 1)
+
+
+def test_poses_without_a_frame_do_not_matter(root: Path) -> None:
+    write_poses(root / "room0", [pose_at(k) for k in range(FRAMES + 2)])
+    assert len(list(ReplicaNiceSlam(root, scene="room0"))) == FRAMES
+
+
+def test_the_scenes_folder_may_be_the_working_directory(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root / "room0")
+    assert ReplicaNiceSlam(Path()).camera == Camera(24, 16, 12.0, 12.0, 11.5, 7.5)
 
 
 def test_a_bad_line_of_poses_is_named(root: Path) -> None:

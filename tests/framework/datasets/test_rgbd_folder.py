@@ -332,11 +332,12 @@ def test_a_truncated_color_image(folder, suffix, share):
     assert "000002" in read_all_but(folder, 2)
 
 
-def test_zeros_behind_a_jpeg_are_no_fault(folder):
+@pytest.mark.parametrize("padding", [b"\0" * 10, b"\0" * 100_000, b"\n", b"\r\n", b"\0" * 100 + b"\n"])
+def test_zeros_and_a_line_end_behind_a_jpeg_are_no_fault(folder, padding):
     (folder / "color/000002.png").unlink()
     path = folder / "color/000002.jpg"
     cv2.imwrite(str(path), picture(2))
-    path.write_bytes(path.read_bytes() + b"\0" * 10)
+    path.write_bytes(path.read_bytes() + padding)
     assert RgbdFolder(folder)[2].index == 2
 
 
