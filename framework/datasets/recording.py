@@ -190,7 +190,7 @@ def _within_reach(recorded: RecordedFrame) -> RecordedFrame:
     distance = math.hypot(*recorded.T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return recorded
-    told = f"its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
+    told = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
     return RecordedFrame(recorded.images, recorded.timestamp, fault=told)
 
 

@@ -51,7 +51,8 @@ class ReplicaNiceSlam(Recording):
 def _recorded(images: ImageFiles, k: int, poses: Sequence[PrintedMatrix]) -> RecordedFrame:
     if k < len(poses):
         return RecordedFrame.posed(images, k / FRAME_RATE, poses[k].pose)
-    return RecordedFrame(images, k / FRAME_RATE, fault=f"traj.txt has {len(poses)} poses and none for it")
+    why = f"{images.color_name}: traj.txt has {len(poses)} poses and none for it"
+    return RecordedFrame(images, k / FRAME_RATE, fault=why)
 
 
 def _read_camera(path: Path) -> tuple[Camera, float]:

@@ -107,7 +107,7 @@ def test_without_a_scene_the_camera_is_missing(root: Path) -> None:
 def test_frames_without_a_pose_are_counted(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)])
     sequence = ReplicaNiceSlam(root, scene="room0")
-    assert "frame 2: traj.txt has 2 poses and none for it" in fault_of(sequence, 2)
+    assert "frame000002.jpg: traj.txt has 2 poses and none for it" in fault_of(sequence, 2)
     result, _ = mapped(sequence)
     assert (result.frames, result.frames_skipped) == (FRAMES, 1)
 

@@ -171,10 +171,10 @@ def test_a_pose_far_off_is_the_fault_of_its_frame_and_not_of_the_truth(folder, c
     set_pose_line(folder, 1, "0.1 0 1e4 0 0 0 0 1")
     RgbdFolder(folder)[1]
     set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
-    assert "frame 1: its pose is 100000 m from the origin" in read_all_but(folder, 1)
+    assert "000001.png: its pose is 100000 m from the origin" in read_all_but(folder, 1)
     others = RgbdFolder(folder).scene_truth()
     assert np.abs(others.points_world).max() < 10
-    assert "ground truth: left out frame 1: its pose is 100000 m from the origin" in caplog.text
+    assert "ground truth: left out frame 1: " in caplog.text
 
 
 # Faults of the whole sequence: known when it is built.
