@@ -75,7 +75,7 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
         return SPACES[name_or_path]
     path = Path(name_or_path).expanduser()
     try:
-        lines = path.read_text("utf-8").rstrip().splitlines()
+        lines = path.read_text("utf-8-sig").rstrip().splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigError(
             f"labels must be one of {', '.join(SPACES)}, or a text file with one name a line, found {name_or_path}"

@@ -17,7 +17,9 @@ from framework.ply_format.binary import BinaryBody
 from framework.ply_format.header import TYPES, parse_header
 from framework.ply_format.rows import Body, Int64, Rows
 from framework.ply_format.text import TextBody
+from framework.whole_files import read_bytes
 
+LARGEST_FILE = 2**32  # bytes; the mesh of a room has some 2^26
 AXES = ("x", "y", "z")
 INDICES = ("vertex_indices", "vertex_index")  # what writers call a face's list
 TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # the classic names: float, not float32
@@ -39,10 +41,7 @@ def read_ply(path: Path) -> PlyMesh:
     Raises DataError, naming line or byte, for a file that is damaged, does not hold what its header announces, or has
     vertices that are not finite or triangles of vertices that it does not have.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+    data = read_bytes(path, LARGEST_FILE)
     header = parse_header(path, data)
     body: Body = TextBody(path, data, header) if header.format == "ascii" else BinaryBody(path, data, header)
     tables = {element.name: body.rows(element) for element in header.elements}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -16,6 +17,7 @@ from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.number_lines import numbers, read_lines
 
+COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is what Microsoft's C library prints for NaN
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits and not another kind of number
 
@@ -66,7 +68,7 @@ def read_tum_lines(path: Path) -> list[TumLine]:
     Raises DataError, naming file and line, when one does not hold eight numbers, the first of them finite.
     """
     lines = read_lines(path, missing="does not exist: expected a trajectory in TUM format")
-    words = [line.split("#", 1)[0].split() for line in lines]
+    words = [COMMENT.sub("", line).split() for line in lines]
     return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
 
 

@@ -9,20 +9,21 @@ from pathlib import Path
 from typing import Any
 
 from framework.data import Camera
+from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError
+from framework.whole_files import MOST_TEXT, read_bytes
 
 
-def read_json_object(path: Path) -> dict[str, Any]:
-    """The JSON object that a file holds. Raises DataError, naming the file, when it holds none."""
+def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
+    """The JSON object that a file of at most so many bytes holds. Raises DataError, naming it, when it holds none."""
+    content = read_bytes(path, most)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+        found = json.loads(content)  # with or without a byte order mark
     except (ValueError, RecursionError) as error:
         raise DataError(f"{path} is not valid JSON: {error}") from error
-    if not isinstance(content, dict):
-        raise DataError(f"{path} must hold a JSON object, found {type(content).__name__}")
-    return content
+    if not isinstance(found, dict):
+        raise DataError(f"{path} must hold a JSON object, found {type(found).__name__}")
+    return found
 
 
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
@@ -36,8 +37,11 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
         if value != int(value):
             raise DataError(f"{path}: {key} must be a whole number of pixels, found {value}")
     width, height, fx, fy, cx, cy, depth_scale = values
-    if depth_scale <= 0:
-        raise DataError(f"{path}: {keys[-1]} must be positive (depth units per metre), found {depth_scale}")
+    if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
+        raise DataError(
+            f"{path}: {keys[-1]} must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], as metres = value / {keys[-1]} "
+            f"(1000 for millimetres), found {depth_scale:g}"
+        )
     try:
         return Camera(int(width), int(height), fx, fy, cx, cy), depth_scale
     except DataError as error:

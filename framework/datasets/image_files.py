@@ -9,7 +9,10 @@ import numpy as np
 
 from framework.data import Array, UInt8, UInt16
 from framework.datasets.image_header import check_image
-from framework.errors import FrameError
+from framework.errors import DataError, FrameError
+from framework.whole_files import read_bytes
+
+LARGEST_FILE = 2**28  # bytes; MOST_PIXELS of four channels of 16 bits, unpacked
 
 
 def read_color(path: Path) -> UInt8:
@@ -36,9 +39,9 @@ def read_uint16(path: Path) -> UInt16:
 
 def _read(path: Path) -> bytes:
     try:
-        return path.read_bytes()
-    except OSError as error:
-        raise FrameError(f"{path} could not be read: {error.strerror or error}") from error
+        return read_bytes(path, LARGEST_FILE)
+    except DataError as error:
+        raise FrameError(str(error)) from error
 
 
 def _decode(name: Path | str, data: bytes, flags: int) -> Array:

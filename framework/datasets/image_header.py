@@ -11,6 +11,7 @@ from framework.errors import FrameError
 MOST_PIXELS = 2**25  # 8K video; decoders allocate what a header claims, and a damaged one can claim 10^10
 PNG_START, PNG_HEADER, PNG_END = b"\x89PNG\r\n\x1a\n", b"IHDR", b"IEND"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
+JPEG_PADDING = b"\0\r\n"  # some cameras fill their files up with zeros, and some programs add a line end
 JPEG_SIZES = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}  # the markers SOF of ITU T.81, table B.1
 JPEG_SCAN = 0xDA  # the marker SOS: the picture begins
 
@@ -54,7 +55,7 @@ def _png_size(name: Path | str, data: bytes) -> tuple[int, int]:
 
 def _jpeg_size(name: Path | str, data: bytes) -> tuple[int, int]:
     """(width, height) of a JPEG file that has its end."""
-    if not data[-64:].rstrip(b"\0").endswith(JPEG_END):  # some cameras pad their files with zeros
+    if not data.rstrip(JPEG_PADDING).endswith(JPEG_END):
         raise FrameError(f"{name} is truncated: it ends after {len(data)} bytes without its end marker")
     position = len(JPEG_START)
     while position + 9 <= len(data) and data[position] == 0xFF and data[position + 1] != JPEG_SCAN:

@@ -6,7 +6,8 @@ import logging
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Protocol
 
@@ -18,7 +19,9 @@ from framework.datasets.image_files import read_color, read_uint16
 from framework.errors import ConfigError, DataError, FrameError
 from framework.interfaces import RGBDSequence
 
-FRAME_RATE = 30.0  # Hz, for the timestamps of recordings without any
+FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
+FRAME_RATE = 30.0  # Hz, of recordings without timestamps, or with some that cannot be
+COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # units a metre that stored depth may have; most sensors' have 1000
 NO_READING = 65535  # uint16 that several sensors write instead of 0
 
 log = logging.getLogger(__name__)
@@ -110,7 +113,9 @@ class Recording(RGBDSequence):
         if not self.folder.is_dir():
             raise DataError(f"dataset.root: the folder {self.folder} does not exist")
         self.name = self.folder.resolve().name
-        self.contents = self.open()
+        contents = self.open()
+        frames = [_within_reach(recorded) for recorded in contents.frames]
+        self.contents = replace(contents, frames=_in_order_of_time(self.name, frames))
         self.camera = self.contents.camera
         self.chosen = choose_frames(
             len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
@@ -176,6 +181,26 @@ class Recording(RGBDSequence):
                 continue  # damaged or of a wrong type: counted when the frame is read
             if shape[:2] != self.camera.shape:
                 raise DataError(f"{name} is {_size(shape)}, but {self._expected_size()}")
+
+
+def _within_reach(recorded: RecordedFrame) -> RecordedFrame:
+    """The frame, with a fault where its pose is farther off than anything is mapped."""
+    if recorded.T_world_camera is None:
+        return recorded
+    distance = math.hypot(*recorded.T_world_camera[:3, 3])
+    if distance <= FARTHEST:
+        return recorded
+    told = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
+    return RecordedFrame(recorded.images, recorded.timestamp, fault=told)
+
+
+def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
+    """The frames, at 30 Hz where the times of those that can be used do not grow."""
+    times = [recorded.timestamp for recorded in frames if not recorded.fault]
+    if all(a < b for a, b in pairwise(times)):
+        return frames
+    log.warning("%s: the times do not grow from frame to frame; frames are taken to come at %g Hz", name, FRAME_RATE)
+    return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:

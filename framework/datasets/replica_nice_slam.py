@@ -10,6 +10,7 @@ The camera's axes are x right, y down, z forward: NICE-SLAM turns them for its o
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +18,7 @@ from framework.data import Camera
 from framework.datasets.camera_json import camera_of, read_json_object
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
 from framework.errors import DataError
-from framework.matrix_file import read_matrix_lines
+from framework.matrix_file import PrintedMatrix, read_matrix_lines
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 
@@ -27,30 +28,31 @@ class ReplicaNiceSlam(Recording):
     """A scene of Replica in NICE-SLAM's layout: exact depth and poses, and no instances."""
 
     def open(self) -> Contents:
-        path = self.folder.parent / "cam_params.json"
+        path = self.folder.absolute().parent / "cam_params.json"  # not resolved: a scene may be a link
         camera, depth_scale = _read_camera(path)
         color = numbered_images(self.folder / "results", (".jpg",))
         depth = numbered_images(self.folder / "results", (".png",))
         poses = read_matrix_lines(self.folder / "traj.txt")
-        numbers = sorted(color.keys() | depth.keys())
-        if numbers[-1] >= len(poses):
-            raise DataError(
-                f"{self.folder / 'traj.txt'} holds {len(poses)} poses, but results/ has a frame {numbers[-1]}, "
-                "counted from 0: one line a frame is needed"
-            )
         # a frame of which one image is missing is there: reading it says which
         frames = [
-            RecordedFrame.posed(
+            _recorded(
                 ImageFiles(
                     color.get(k, self.folder / "results" / f"frame{k:06d}.jpg"),
                     depth.get(k, self.folder / "results" / f"depth{k:06d}.png"),
                 ),
-                k / FRAME_RATE,
-                poses[k].pose,
+                k,
+                poses,
             )
-            for k in numbers
+            for k in sorted(color.keys() | depth.keys())
         ]
         return Contents(camera, path, depth_scale, frames)
+
+
+def _recorded(images: ImageFiles, k: int, poses: Sequence[PrintedMatrix]) -> RecordedFrame:
+    if k < len(poses):
+        return RecordedFrame.posed(images, k / FRAME_RATE, poses[k].pose)
+    why = f"{images.color_name}: traj.txt has {len(poses)} poses and none for it"
+    return RecordedFrame(images, k / FRAME_RATE, fault=why)
 
 
 def _read_camera(path: Path) -> tuple[Camera, float]:

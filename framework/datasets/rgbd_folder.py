@@ -4,7 +4,8 @@
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to colour, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line a frame: timestamp tx ty tz qx qy qz qw
-    instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}
+    instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is one
+                                            of COCO's names, or null = not known
 
 Files belong together by the number in their names; the numbers may start anywhere and have gaps. Line k of poses.txt
 (comments and empty lines not counted) is the k-th frame in the order of these numbers.
@@ -15,6 +16,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from dataclasses import dataclass
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +28,13 @@ from framework.datasets.image_files import read_uint16
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
 from framework.errors import ConfigError, DataError, FrameError
 from framework.evaluation.scene_truth import LabeledDepth, fuse_scene_truth
+from framework.label_spaces import COCO
+from framework.number_lines import SHOWN
 from framework.trajectory_file import TumLine, read_tum_lines
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
+LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16
+MOST_DIGITS = 10  # of an id, zeros in front among them
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +90,7 @@ class RgbdFolder(Recording):
             recorded = self.contents.frames[index]
             try:
                 if recorded.fault:
-                    raise FrameError(recorded.fault)
+                    raise FrameError(f"frame {index}: {recorded.fault}")
                 depth, truth = self.metric_depth(index), self.truth_in(index)
             except FrameError as error:
                 log.warning("ground truth: left out %s", error)
@@ -146,9 +152,22 @@ def _read_poses(path: Path, frames: int) -> list[TumLine] | None:
 def _read_class_names(path: Path) -> dict[int, str | None]:
     class_names: dict[int, str | None] = {}
     for key, entry in _read_json(path).items():
-        if not key.isdecimal() or not 0 < int(key) < 2**16:
-            raise DataError(f"{path}: an instance id is a whole number from 1 to 65535, found {key!r}")
-        if not isinstance(entry, dict) or not isinstance(entry.get("class"), str | None):
-            raise DataError(f'{path}: instance {key} must be {{"name": ..., "class": name or null}}, found {entry!r}')
-        class_names[int(key)] = entry.get("class")
+        if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= LARGEST_ID):
+            raise DataError(f"{path}: an instance id is a whole number from 1 to {LARGEST_ID}, found {key!r:.60}")
+        if int(key) in class_names:
+            raise DataError(f"{path}: instance {int(key)} is there twice, the second time as {key!r}")
+        class_names[int(key)] = _class_of(f"{path}: instance {key}", entry)
     return class_names
+
+
+def _class_of(where: str, entry: Any) -> str | None:
+    if not isinstance(entry, dict) or "class" not in entry:
+        raise DataError(
+            f'{where} must be {{"name": ..., "class": name or null}}, where null means not known, found {entry!r:.60}'
+        )
+    name = entry["class"]
+    if name is None or (isinstance(name, str) and name in COCO):
+        return name
+    close = get_close_matches(str(name)[:SHOWN].strip().lower(), COCO, n=1)
+    hint = f"; did you mean {close[0]!r}?" if close else ""
+    raise DataError(f"{where}: class must be one of COCO's names, or null for not known, found {name!r:.60}{hint}")

@@ -18,7 +18,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -30,13 +29,14 @@ from framework.datasets.labeled_mesh import LabeledMesh
 from framework.datasets.labeled_recording import LabeledRecording, mesh_of
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
 from framework.datasets.scannet_annotation import LABEL_TABLE, read_label_table, read_labeled_mesh
-from framework.datasets.sens_file import SensFile, SensFrame, open_sens
+from framework.datasets.sens_file import SensFile, open_sens
 from framework.errors import DataError, FrameError
 from framework.geometry import inverse, rotation_angle
 from framework.matrix_file import PrintedMatrix, read_matrix
 
 MESH, SEGMENTS, OBJECTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"
 DEPTH_SCALE = 1000.0  # units a metre, of exported depth
+MICROSECONDS = 1e6  # a second
 COLOR_SIZE = (1296, 968)  # px; exported colour may be smaller, its intrinsics are still those of this size
 NEAR = 2.0  # m, where what is left of the parallax is told
 SAME_WITHIN = 0.5  # px, of the depth camera: a shift of colour that is not worth a word
@@ -90,8 +90,10 @@ def _sens_contents(path: Path) -> Contents:
     _warn_of_parallax(path, header.color_extrinsics, header.depth_extrinsics, header.depth_camera)
     registration = _registration(path, header.color_camera, header.depth_camera)
     frames = [
-        RecordedFrame.posed(RegisteredImages(frame, registration), time, frame.camera_to_world.pose)
-        for frame, time in zip(file.frames, _times(path, file.frames), strict=True)
+        RecordedFrame.posed(
+            RegisteredImages(frame, registration), frame.depth_time / MICROSECONDS, frame.camera_to_world.pose
+        )
+        for frame in file.frames
     ]
     return Contents(header.depth_camera, path, header.depth_scale, [*frames, *_lost_frames(path, file, frames)])
 
@@ -102,15 +104,6 @@ def _lost_frames(path: Path, file: SensFile, frames: Sequence[RecordedFrame]) ->
     if lost:
         log.warning("%s lacks the last %d of %d frames: %s", path, len(lost), file.header.frames, file.cut)
     return [RecordedFrame(frames[-1].images, k / FRAME_RATE, fault=f"{path}, {file.cut}") for k in lost]
-
-
-def _times(path: Path, frames: Sequence[SensFrame]) -> list[float]:
-    """Seconds of each frame: of its depth image, or at 30 Hz where these do not grow."""
-    times = [frame.depth_time / 1e6 for frame in frames]
-    if all(a < b for a, b in pairwise(times)):
-        return times
-    log.info("%s: the times do not grow from frame to frame; frames are taken to come at %g Hz", path, FRAME_RATE)
-    return [k / FRAME_RATE for k in range(len(frames))]
 
 
 def _exported_contents(folder: Path) -> Contents:

@@ -16,6 +16,7 @@ from framework.datasets.labeled_mesh import LabeledMesh
 from framework.errors import DataError
 from framework.label_spaces import MEANINGS
 from framework.ply import read_ply
+from framework.whole_files import read_text
 
 Int64 = npt.NDArray[np.int64]
 
@@ -92,11 +93,7 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
 
 def read_label_table(path: Path) -> Mapping[str, str]:
     """What an annotator may have written -> its class among NYU40's. Raises DataError, naming file and line."""
-    _check_size(path)
-    try:
-        header, *rows = path.read_text("utf-8").rstrip("\n").split("\n")
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read as text: {error}") from error
+    header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
     if not set(COLUMNS) <= set(columns):
         raise DataError(f"{path}, line 1: expected columns {' and '.join(COLUMNS)}, separated by tabs")
@@ -149,8 +146,7 @@ def _group(where: str, group: Any) -> SegGroup:
 
 
 def _read_list(path: Path, key: str) -> Sequence[Any]:
-    _check_size(path)
-    found = read_json_object(path).get(key)
+    found = read_json_object(path, LARGEST_FILE).get(key)
     if not isinstance(found, list):
         raise DataError(f"{path}: expected a list {key!r}, found {type(found).__name__}")
     return found
@@ -164,12 +160,3 @@ def _whole_numbers(where: str, values: Sequence[Any]) -> Int64:
         return np.array(values, np.int64)
     except OverflowError as error:
         raise DataError(f"{where}: expected whole numbers of 64 bits: {error}") from error
-
-
-def _check_size(path: Path) -> None:
-    try:
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
-    if size > LARGEST_FILE:
-        raise DataError(f"{path} has {size} bytes, more than the {LARGEST_FILE} that such a file can have")

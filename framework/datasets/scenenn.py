@@ -13,7 +13,8 @@ The images are those that the official play-back, or `python -m framework.conver
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import logging
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -31,9 +32,12 @@ from framework.scenenn.annotation import Annotated, read_annotation
 from framework.scenenn.intrinsics import read_intrinsics
 from framework.scenenn.timestamps import read_timestamps
 from framework.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
+from framework.whole_files import read_text
 
 DEPTH_SCALE = 1000.0  # units a metre
 MOST_ID = np.iinfo(np.int32).max
+
+log = logging.getLogger(__name__)
 
 
 class Sensor(StrEnum):
@@ -59,7 +63,8 @@ class SceneNN(LabeledRecording):
         images = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
         depths = numbered_images(self.folder / "depth", (".png",))
         poses = _optional_poses(self.folder / "trajectory.log")
-        times = _optional_times(self.folder / "timestamp.txt")
+        numbers = sorted(images.keys() | depths.keys())
+        times = _optional_times(self.folder / "timestamp.txt", numbers)
         self.mesh = mesh_of([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         if self.mesh is None and self.frame_truth:
             raise DataError(f"dataset.frame_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
@@ -75,7 +80,7 @@ class SceneNN(LabeledRecording):
                 poses,
                 times.get(k, (k - 1) / FRAME_RATE),
             )
-            for k in sorted(images.keys() | depths.keys())
+            for k in numbers
         ]
         ini = self.root / "intrinsic" / f"{self.sensor}.ini"
         return Contents(_camera(ini, images.values()), "the first colour image", DEPTH_SCALE, frames)
@@ -108,8 +113,17 @@ def _optional_poses(path: Path) -> TrajectoryLog | None:
     return read_trajectory_log(path) if path.exists() else None
 
 
-def _optional_times(path: Path) -> Mapping[int, float]:
-    return read_timestamps(path) if path.exists() else {}
+def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
+    """The times of all of these images, or of none: two clocks do not mix."""
+    if not path.exists():
+        return {}
+    times = read_timestamps(path)
+    without = [k for k in images if k not in times]
+    if not without:
+        return times
+    told = "%s has no time for %d of %d images, the first being %d: it is ignored, frames are taken to come at %g Hz"
+    log.warning(told, path, len(without), len(images), without[0], FRAME_RATE)
+    return {}
 
 
 def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
@@ -128,6 +142,7 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
         raise DataError(f"{mesh}: a label must be in [0, {MOST_ID}], found {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
+    _warn_of_unlisted(mesh, annotation, set(present.tolist()) - names.keys() - {0})
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)
     for k, label in enumerate(present.tolist()):
@@ -135,6 +150,12 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
             ids[k] = label
             class_names[label] = SCENENN_TO_COCO.get(_nyu_class(names.get(label)))
     return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names, tuple(SCENENN_TO_COCO.values()))
+
+
+def _warn_of_unlisted(mesh: Path, annotation: Path, labels: Collection[int]) -> None:
+    if labels:
+        told = "%s: %s does not have %d of its labels, like %d: their classes are not known, and they are not evaluated"
+        log.warning(told, mesh, annotation.name, len(labels), min(labels))
 
 
 def _nyu_class(label: Annotated | None) -> str:
@@ -152,7 +173,5 @@ def _is_of_another_class(label: Annotated | None) -> bool:
 
 def _named_release(root: Path) -> str:
     path = root / "release.txt"
-    try:
-        return path.read_text("utf-8").strip().partition("\n")[0] or "not named" if path.exists() else "not named"
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"{path} could not be read: {error}") from error
+    text = read_text(path) if path.exists() else ""
+    return text.strip().partition("\n")[0].strip() or "not named"

@@ -27,13 +27,13 @@ import numpy as np
 from framework.data import Camera, Float64, UInt8, UInt16
 from framework.datasets.image_files import decode_color
 from framework.datasets.image_header import MOST_PIXELS
+from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, FrameError
 from framework.matrix_file import PrintedMatrix
 
 VERSION = 4
 LONGEST_NAME = 1024  # bytes, of the sensor: "StructureSensor" has 15
 MOST_FRAMES = 2**18  # two and a half hours at 30 Hz; ScanNet's longest has some 6,000
-FINEST_DEPTH = 1e6  # units a metre; ScanNet has 1000
 START = struct.Struct("<IQ")
 MATRIX_BYTES = 64
 IMAGES = struct.Struct("<iiIIIIfQ")
@@ -156,9 +156,10 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
     for what, width, height in (("colour", *sizes[:2]), ("depth", *sizes[2:])):
         if not 0 < width * height <= MOST_PIXELS:
             raise DataError(f"{path}, byte {at + 8}: {what} images of {width}x{height} px; at most {MOST_PIXELS} px")
-    if not 1 <= depth_scale <= FINEST_DEPTH:
+    if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         raise DataError(
-            f"{path}, byte {at + 24}: the depth units a metre must be in [1, {FINEST_DEPTH:g}], found {depth_scale:g}"
+            f"{path}, byte {at + 24}: the depth units a metre must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], "
+            f"found {depth_scale:g}"
         )
     if frames > MOST_FRAMES or frames * FRAME.size > length:
         raise DataError(f"{path}, byte {at + 28}: {frames} frames cannot be in a file of {length} bytes")

@@ -162,12 +162,21 @@ def _named(folder: str) -> Intrinsics:
 
 
 def _read_list(path: Path) -> list[ListedImage]:
-    """The images that a list names. Raises DataError, naming file and line, when one is not `timestamp filename`."""
+    """The images that a list names, of those with one timestamp the first: association is quadratic in their number.
+
+    Raises DataError, naming file and line, when a line is not `timestamp filename`.
+    """
     lines = read_lines(path, missing="is missing: it lists the images' times, a line each: timestamp filename")
     listed = [(n, line) for n, line in enumerate(lines, start=1) if line.strip() and not line.lstrip().startswith("#")]
     if not listed:
         raise DataError(f"{path} lists no image")
-    return [_listed(path, n, line) for n, line in listed]
+    at: dict[float, ListedImage] = {}
+    for n, line in listed:
+        image = _listed(path, n, line)
+        at.setdefault(image.timestamp, image)
+    if len(at) < len(listed):
+        log.warning("%s: %d images are left out, as one before has the same timestamp", path, len(listed) - len(at))
+    return list(at.values())
 
 
 def _listed(path: Path, number: int, line: str) -> ListedImage:

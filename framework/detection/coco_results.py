@@ -55,7 +55,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     name of the image's file ("color/000012.png"). `category_id` counts only where there is no `category_name`.
     """
     try:
-        entries = json.loads(path.read_text("utf-8"))
+        entries = json.loads(path.read_bytes())  # with or without a byte order mark
     except OSError as error:
         raise DataError(f"{path} could not be read: {error.strerror or error}") from error
     except ValueError as error:

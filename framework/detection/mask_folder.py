@@ -75,7 +75,7 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
 
 def _read_list(path: Path) -> list[dict[str, object]]:
     try:
-        entries = json.loads(path.read_text("utf-8"))
+        entries = json.loads(path.read_bytes())  # with or without a byte order mark
     except OSError as error:
         raise DataError(f"{path} could not be read: {error.strerror or error}") from error
     except ValueError as error:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from scipy.spatial.transform import Rotation
 from framework.atomic_files import written_whole
 from framework.data import Box, Float64
 from framework.errors import DataError
+from framework.whole_files import read_bytes
 
 LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 9 s and 0.5 GB
 LARGEST_ID = int(np.iinfo(np.int32).max)  # what a label of the mesh can be
@@ -43,15 +44,9 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
     """The labels of an annotation, in the file's order; elements and attributes that are not known are left out.
 
     Raises DataError, naming the line, when the file is not XML, declares a document type (with which entities and
-    default attributes come), or has a label with no integer as its id, or with an id that another one has.
+    default attributes come), has no label, or one with no integer as its id, or two that differ with one id.
     """
-    try:
-        size = path.stat().st_size
-        if size > LARGEST_FILE:
-            raise DataError(f"{path} is no annotation: it has {size} bytes, more than {LARGEST_FILE}")
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+    content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
     parser = DefusedXMLParser(target=labels, forbid_dtd=True)
     labels.expat = parser.parser
@@ -66,7 +61,9 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
         raise DataError(f"{path}, line {error.position[0]}: this is not XML: {ErrorString(error.code)}") from error
     except (ValueError, LookupError) as error:
         raise DataError(f"{path}, line {labels.line}: its encoding is not known, expected UTF-8") from error
-    return tuple(label for label, _ in labels.found.values())
+    if not labels.found:
+        raise DataError(f"{path} holds no <label>: it is no annotation of SceneNN's")
+    return tuple(_annotated(id_, attributes) for id_, (attributes, _) in labels.found.items())
 
 
 def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
@@ -74,6 +71,8 @@ def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
 
     Raises DataError when it would not, or the disk does not take the file.
     """
+    if not objects:
+        raise DataError(f"{path}: an annotation has at least one label")
     lines = ['<?xml version="1.0" encoding="utf-8"?>', "<annotation>"]
     ids = set()
     for label in objects:
@@ -100,33 +99,36 @@ class _Labels:
     def __init__(self, path: Path) -> None:
         self._path = path
         self.expat: Any = None  # it knows the line
-        self.found: dict[int, tuple[Annotated, int]] = {}  # by id: the label and its line
+        self.found: dict[int, tuple[dict[str, str], int]] = {}  # by id: the label's attributes and its line
 
     @property
     def line(self) -> int:
         return int(self.expat.CurrentLineNumber)
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
-        if tag != "label":
+        if tag.rpartition("}")[2] != "label":  # behind its namespace, if it has one
             return
         id_ = _id(attributes.get("id", ""))
         if id_ is None:
             found = repr(attributes["id"][:40]) if "id" in attributes else "none"
             raise self._fault(f"a label needs an id from 0 to {LARGEST_ID}, found {found}")
-        if id_ in self.found:
-            raise self._fault(f"the label {id_} is there already in line {self.found[id_][1]}")
-        label = Annotated(
-            id=id_,
-            text=attributes.get("text", ""),
-            nyu_class=attributes.get("nyu_class", ""),
-            color=_color(attributes.get("color", "")),
-            aabb=_aabb(attributes.get("aabbox", "")),
-            obb=_obb(attributes.get("obbox", "")),
-        )
-        self.found[id_] = label, self.line
+        before, line = self.found.setdefault(id_, (attributes, self.line))
+        if attributes != before:
+            raise self._fault(f"the label {id_} is there already in line {line}, with other attributes")
 
     def _fault(self, message: str) -> DataError:
         return DataError(f"{self._path}, line {self.line}: {message}")
+
+
+def _annotated(id_: int, attributes: Mapping[str, str]) -> Annotated:
+    return Annotated(
+        id=id_,
+        text=attributes.get("text", ""),
+        nyu_class=attributes.get("nyu_class", ""),
+        color=_color(attributes.get("color", "")),
+        aabb=_aabb(attributes.get("aabbox", "")),
+        obb=_obb(attributes.get("obbox", "")),
+    )
 
 
 def _attributes(label: Annotated) -> dict[str, str]:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 import re
+from codecs import BOM_UTF8
 from pathlib import Path
 
 from framework.atomic_files import written_whole
 from framework.data import Camera
 from framework.errors import DataError
+from framework.whole_files import read_bytes
 
 KEYS = ("fx", "fy", "cx", "cy")  # px
 SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px, whose middle is the centre where the file has none
@@ -19,13 +21,14 @@ LARGEST_FILE = 2**20  # bytes; such a file has some hundred
 def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     """fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
 
-    Comments (# or ;), section headers and other keys are left out. Without cx or cy, it is half of depth_width or
-    depth_height, as ethz-asl/scenenn_to_rosbag takes it. Raises DataError, naming file and line, when a key is
-    missing, there twice, or its value is no finite number, positive for focal lengths and sizes.
+    Keys may be in upper case; comments (# or ;), section headers and other keys are left out. Without cx or cy, it is
+    half of depth_width or depth_height, as ethz-asl/scenenn_to_rosbag takes it. Raises DataError, naming file and line,
+    when a key is missing, there twice, or its value is no finite number, positive for focal lengths and sizes.
     """
     values: dict[str, float] = {}
     for number, line in enumerate(_lines(path), start=1):
         key, *found = re.split(r"\s*[=:]\s*|\s+", re.split("[#;]", line)[0].strip(), maxsplit=1)
+        key = key.lower()
         if key not in POSITIVE and key not in KEYS:
             continue
         value = _number(found[0] if found else "")
@@ -53,13 +56,7 @@ def write_intrinsics(path: Path, camera: Camera) -> None:
 
 
 def _lines(path: Path) -> list[str]:
-    try:
-        with path.open("rb") as file:
-            content = file.read(LARGEST_FILE + 1)
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
-    if len(content) > LARGEST_FILE:
-        raise DataError(f"{path} is no file of intrinsics: it has more than {LARGEST_FILE} bytes")
+    content = read_bytes(path, LARGEST_FILE).removeprefix(BOM_UTF8)
     return [line.decode("latin-1") for line in content.splitlines()]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from framework.atomic_files import written_whole
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.geometry import nearest_rigid
+from framework.number_lines import number
+from framework.whole_files import MOST_TEXT, read_bytes
 
 LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
 BLOCK = 5  # lines of a frame
@@ -25,7 +28,7 @@ class TrajectoryLog:
     """What a file says of each frame; frames that it does not name are in neither mapping."""
 
     poses: Mapping[int, Float64]  # frame from 0 -> T_world_camera (4, 4), exactly rigid
-    unusable: Mapping[int, str]  # frame from 0 -> why: not rigid (tracking was lost), not finite, cut off
+    unusable: Mapping[int, str]  # frame from 0 -> why: not rigid (tracking was lost), not finite, cut off, two
 
 
 @dataclass(frozen=True)
@@ -39,14 +42,14 @@ class _Line:
 
 
 def read_trajectory_log(path: Path) -> TrajectoryLog:
-    """The poses of a trajectory.log. A frame that the end of the file cuts off is unusable.
+    """The poses of a trajectory.log. A frame that the end of the file cuts off, or with two poses, is unusable.
 
-    Raises DataError, naming file and line, when a line elsewhere is not as it should be, or a frame is there twice.
+    Raises DataError, naming file and line, when a line elsewhere is not as it should be.
     """
     lines = _read_lines(path)
     poses: dict[int, Float64] = {}
     unusable: dict[int, str] = {}
-    line_of: dict[int, int] = {}
+    given: dict[int, tuple[int, Float64]] = {}  # line and matrix of each frame
     for first in range(0, len(lines), BLOCK):
         header, *rows = lines[first : first + BLOCK]
         at_end = first + BLOCK >= len(lines)
@@ -54,15 +57,17 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
         if cut and len(header.words) == 1 and _are_digits(header.words):
             break  # the frame's number may be cut off itself
         frame = _frame(path, header, least=2 if cut else 3)
-        if frame in line_of:
-            raise DataError(
-                f"{path}, line {header.number}: frame {frame} is there already, in line {line_of[frame]}; remove one"
-            )
-        line_of[frame] = header.number
         matrix = _matrix(path, rows, at_end)
+        if frame in given:
+            before, first_matrix = given[frame]
+            if matrix is None or not np.array_equal(matrix, first_matrix, equal_nan=True):
+                poses.pop(frame, None)
+                unusable[frame] = f"it has two poses, in lines {before} and {header.number}"
+            continue
         if matrix is None:
             unusable[frame] = CUT_OFF
             continue
+        given[frame] = header.number, matrix
         try:
             poses[frame] = nearest_rigid(matrix)
         except DataError as error:
@@ -90,10 +95,7 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
 
 def _read_lines(path: Path) -> list[_Line]:
     """The lines that hold something."""
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
+    content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
     lines = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
     return [line for line in lines if line.words]
 
@@ -124,7 +126,7 @@ def _matrix(path: Path, rows: list[_Line], at_end: bool) -> Float64 | None:
 def _numbers(words: list[str]) -> list[float]:
     """The words as numbers; empty when one is none."""
     try:
-        return [float(word) for word in words]
+        return [number(word) for word in words]
     except ValueError:
         return []
 

@@ -16,6 +16,19 @@ def test_numbers_are_read_as_python_writes_them() -> None:
 
 
 @pytest.mark.parametrize(
+    "word", ["-1.#IND", "1.#IND00", "1.#QNAN", "-1.#QNAN0", "1.#INF", "-1.#INF000000", "-nan(ind)", "nan(snan)", "-nan"]
+)
+def test_what_microsofts_library_prints_where_there_is_no_number_is_nan(word: str) -> None:
+    assert np.isnan(numbers("here", [word], 1)).all()
+
+
+@pytest.mark.parametrize("word", ["1.#", "1#IND", "2.#IND", "nan(", "nan()", "nan(a b)", "1.#IND-"])
+def test_what_only_looks_like_it_is_no_number(word: str) -> None:
+    with pytest.raises(DataError, match="expected 1 numbers"):
+        numbers("here", [word], 1)
+
+
+@pytest.mark.parametrize(
     ("words", "message"),
     [
         (["1", "2"], r"here: expected 3 numbers \(x y z\), found 2"),

@@ -7,7 +7,7 @@ import pytest
 
 from framework.errors import DataError
 from framework.geometry import exp_se3
-from framework.trajectory_file import read_tum, write_tum
+from framework.trajectory_file import read_tum, read_tum_lines, write_tum
 
 GOOD = "0.0 1 2 3 0 0 0 1\n"
 
@@ -30,6 +30,15 @@ def test_known_line(tmp_path):
     timestamps, poses = read_tum(path)
     assert timestamps.tolist() == [0.5]
     np.testing.assert_allclose(poses[0], [[0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
+
+
+def test_comments_may_follow_a_pose_and_be_anything(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_text("#\n0.5 1 2 3 0 0 0 1# found # by ICP\n#0.6 1\n0.7 1 2 3 0 0 0 1.#IND # lost\n")
+    first, second = read_tum_lines(path)
+    np.testing.assert_array_equal(first.pose()[:3, 3], [1, 2, 3])
+    with pytest.raises(DataError, match="line 4: the pose is not finite"):
+        second.pose()
 
 
 def test_empty(tmp_path):

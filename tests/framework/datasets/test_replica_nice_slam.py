@@ -81,6 +81,9 @@ def test_a_pose_that_is_none_is_the_fault_of_its_frame(root: Path) -> None:
     assert "traj.txt, line 2: the pose is not rigid" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
     write_poses(root / "room0", [pose_at(0), np.full((4, 4), np.nan), pose_at(2)])
     assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
+    text = (root / "room0/traj.txt").read_text()
+    (root / "room0/traj.txt").write_text(text.replace("nan", "-nan(ind)"))
+    assert "traj.txt, line 2: the pose is not finite" in fault_of(ReplicaNiceSlam(root, scene="room0"), 1)
 
 
 @pytest.mark.parametrize("name", ["frame000001.jpg", "depth000001.png"])
@@ -101,10 +104,28 @@ def test_without_a_scene_the_camera_is_missing(root: Path) -> None:
         ReplicaNiceSlam(root)
 
 
-def test_fewer_poses_than_frames(root: Path) -> None:
+def test_frames_without_a_pose_are_counted(root: Path) -> None:
     write_poses(root / "room0", [pose_at(0), pose_at(1)])
-    with pytest.raises(DataError, match=r"traj\.txt holds 2 poses, but results/ has a frame 2"):
-        ReplicaNiceSlam(root, scene="room0")
+    sequence = ReplicaNiceSlam(root, scene="room0")
+    assert "frame000002.jpg: traj.txt has 2 poses and none for it" in fault_of(sequence, 2)
+    result, _ = mapped(sequence)
+    assert (result.frames, result.frames_skipped) == (FRAMES, 1)
+
+
+def test_poses_without_a_frame_do_not_matter(root: Path) -> None:
+    write_poses(root / "room0", [pose_at(k) for k in range(FRAMES + 2)])
+    assert len(list(ReplicaNiceSlam(root, scene="room0"))) == FRAMES
+
+
+def test_the_scenes_folder_may_be_the_working_directory(root: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(root / "room0")
+    assert ReplicaNiceSlam(Path()).camera == Camera(24, 16, 12.0, 12.0, 11.5, 7.5)
+
+
+def test_a_scene_may_be_a_link_to_elsewhere(root: Path, tmp_path: Path) -> None:
+    (root / "room0").rename(tmp_path / "elsewhere")
+    (root / "room0").symlink_to(tmp_path / "elsewhere")
+    assert len(ReplicaNiceSlam(root, scene="room0")) == FRAMES
 
 
 def test_a_bad_line_of_poses_is_named(root: Path) -> None:

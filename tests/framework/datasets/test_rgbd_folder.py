@@ -124,6 +124,22 @@ def test_without_poses_the_pose_is_not_known(folder):
     assert sequence.scene_truth() is None
 
 
+@pytest.mark.parametrize("times", [(0, 0, 0, 0), (5, 6, 7, 6.5), (5, 6, 6, 7)])
+def test_where_times_do_not_grow_frames_come_at_30_hz(folder, caplog, times):
+    for k, time in enumerate(times):
+        set_pose_line(folder, k, f"{time} {k} 0 0 0 0 0 1")
+    sequence = RgbdFolder(folder)
+    assert [frame.timestamp for frame in sequence] == [0, 1 / 30, 2 / 30, 3 / 30]
+    assert [frame.T_world_camera[0, 3] for frame in sequence] == [0, 1, 2, 3]
+    assert caplog.text.count("kitchen: the times do not grow") == 1
+
+
+def test_the_time_of_a_frame_that_cannot_be_used_does_not_matter(folder, caplog):
+    set_pose_line(folder, 1, "0 nan nan nan nan nan nan nan")
+    assert [RgbdFolder(folder)[k].timestamp for k in (0, 2, 3)] == [0, 0.2, 0.3]
+    assert not caplog.records
+
+
 def test_without_instances_there_is_no_truth(folder):
     shutil.rmtree(folder / "instance")
     (folder / "instances.json").unlink()
@@ -149,6 +165,16 @@ def test_scene_truth_lies_on_the_labelled_surface(folder):
 def test_scene_truth_leaves_out_frames_that_cannot_be_read(folder):
     (folder / "depth/000001.png").write_bytes(b"")
     assert len(RgbdFolder(folder).scene_truth().points_world) > 100
+
+
+def test_a_pose_far_off_is_the_fault_of_its_frame_and_not_of_the_truth(folder, caplog):
+    set_pose_line(folder, 1, "0.1 0 1e4 0 0 0 0 1")
+    RgbdFolder(folder)[1]
+    set_pose_line(folder, 1, "0.1 0 1e5 0 0 0 0 1")
+    assert "000001.png: its pose is 100000 m from the origin" in read_all_but(folder, 1)
+    others = RgbdFolder(folder).scene_truth()
+    assert np.abs(others.points_world).max() < 10
+    assert "ground truth: left out frame 1: " in caplog.text
 
 
 # Faults of the whole sequence: known when it is built.
@@ -179,12 +205,18 @@ def test_a_missing_camera_key_is_named(folder, key):
         RgbdFolder(folder)
 
 
-@pytest.mark.parametrize(
-    "changes", [{"fx": "wide"}, {"fx": -1.0}, {"width": 24.5}, {"depth_scale": 0}, {"cx": float("nan")}, {"fy": True}]
-)
+@pytest.mark.parametrize("changes", [{"fx": "wide"}, {"fx": -1.0}, {"width": 24.5}, {"cx": float("nan")}, {"fy": True}])
 def test_a_bad_camera_value_is_named(folder, changes):
     change_camera(folder, **changes)
     with pytest.raises(DataError, match=rf"camera\.json.*{next(iter(changes))}"):
+        RgbdFolder(folder)
+
+
+@pytest.mark.parametrize("scale", [0, -1000, 0.001, 1e7])
+def test_a_depth_scale_that_cannot_be(folder, scale):
+    told = r"depth_scale must be in \[1, 1e\+06\], as metres = value / depth_scale \(1000 for millimetres\), found"
+    change_camera(folder, depth_scale=scale)
+    with pytest.raises(DataError, match=rf"camera\.json: {told} {scale:g}".replace("+07", r"\+07")):
         RgbdFolder(folder)
 
 
@@ -241,12 +273,25 @@ def test_instance_images_without_names(folder):
 
 
 @pytest.mark.parametrize(
-    "entry", [{"0": {"class": None}}, {"chair": {"class": "chair"}}, {"7": "chair"}, {"7": {"class": 3}}]
+    ("entry", "message"),
+    [
+        ({"0": {"class": None}}, "an instance id is .* found '0'"),
+        ({"chair": {"class": "chair"}}, "an instance id is a whole number from 1 to 65535, found 'chair'"),
+        ({"1" * 5000: {"class": None}}, "an instance id is a whole number from 1 to 65535, found '11"),
+        ({"٣": {"class": None}}, "an instance id is"),
+        ({"7": {"class": None}, "07": {"class": "chair"}}, "instance 7 is there twice, the second time as '07'"),
+        ({"7": "chair"}, "instance 7 must be .* found 'chair'"),
+        ({"7": {"name": "n" * 5000}}, "instance 7 must be .*, where null means not known, found {'name': 'nnn"),
+        ({"7": {"class": 3}}, "instance 7: class must be one of COCO's names, or null for not known, found 3$"),
+        ({"7": {"class": "flurb" * 1000}}, "instance 7: class must be one of COCO's names, .* found 'flurb"),
+        ({"7": {"class": " Chairs"}}, r"instance 7: .* found ' Chairs'; did you mean 'chair'\?"),
+    ],
 )
-def test_a_bad_entry_of_instances(folder, entry):
+def test_a_bad_entry_of_instances(folder, entry, message):
     (folder / "instances.json").write_text(json.dumps(entry))
-    with pytest.raises(DataError, match=r"instances\.json"):
+    with pytest.raises(DataError, match=rf"instances\.json: {message}") as caught:
         RgbdFolder(folder)
+    assert len(str(caught.value)) < 300
 
 
 def test_images_of_another_size_than_the_camera(folder):
@@ -287,11 +332,12 @@ def test_a_truncated_color_image(folder, suffix, share):
     assert "000002" in read_all_but(folder, 2)
 
 
-def test_zeros_behind_a_jpeg_are_no_fault(folder):
+@pytest.mark.parametrize("padding", [b"\0" * 10, b"\0" * 100_000, b"\n", b"\r\n", b"\0" * 100 + b"\n"])
+def test_zeros_and_a_line_end_behind_a_jpeg_are_no_fault(folder, padding):
     (folder / "color/000002.png").unlink()
     path = folder / "color/000002.jpg"
     cv2.imwrite(str(path), picture(2))
-    path.write_bytes(path.read_bytes() + b"\0" * 10)
+    path.write_bytes(path.read_bytes() + padding)
     assert RgbdFolder(folder)[2].index == 2
 
 
@@ -327,6 +373,7 @@ def test_depth_that_is_not_uint16(folder):
     [
         ("0.1 nan 0 0 0 0 0 1", "not finite"),
         ("0.1 0 0 inf 0 0 0 1", "not finite"),
+        ("0.1 -1.#IND -1.#IND -1.#IND 0 0 0 1", "not finite"),
         ("0.1 0 0 0 0 0 0 0.5", "length 0.5, expected 1"),
         ("0.1 0 0 0 0 0 0 0", "length 0, expected 1"),
     ],

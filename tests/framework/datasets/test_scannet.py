@@ -100,13 +100,15 @@ def test_the_sens_file_goes_before_exported_images_and_the_log_says_so(
     assert f"{SCENE}.sens is read, not the images exported" in caplog.text
 
 
-def test_times_are_those_of_the_depth_where_they_grow(tmp_path: Path) -> None:
+def test_times_are_those_of_the_depth_where_they_grow(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     frames = shots()
     as_sens(tmp_path / SCENE, frames)
     assert [frame.timestamp for frame in ScanNet(tmp_path, SCENE)] == [7e-6, 0.03334, 0.066673]
+    assert not caplog.records
     frames[2].times = (0, 0)
     as_sens(tmp_path / SCENE, frames)
     assert [frame.timestamp for frame in ScanNet(tmp_path, SCENE)] == pytest.approx([0, 1 / 30, 2 / 30])
+    assert caplog.text.count("the times do not grow") == 1
 
 
 def test_points_are_mapped_where_they_are(tmp_path: Path, write: Writer) -> None:
@@ -137,6 +139,7 @@ def test_frames_that_a_cut_sens_file_lacks_are_counted(tmp_path: Path, caplog: p
     assert len(sequence) == 4
     assert "lacks the last 1 of 4 frames" in caplog.text
     assert "before frame 3 of 4 does" in fault_of(sequence, 3)
+    assert "times do not grow" not in caplog.text
     result, _ = mapped(sequence)
     assert (result.frames, result.frames_skipped) == (4, 1)
 

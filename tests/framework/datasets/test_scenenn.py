@@ -99,6 +99,21 @@ def test_only_the_nine_classes_were_looked_for(root: Path) -> None:
     assert "toilet" in (truth.classes or ())
 
 
+def test_labels_that_the_annotation_does_not_have_are_counted(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    SceneNN(root, "016")
+    assert caplog.text.count("016.ply: 016.xml does not have 1 of its labels, like 55") == 1
+    write_annotation(root / "016" / "016.xml", [*labels(), Annotated(UNLISTED, "x", "chair")])
+    caplog.clear()
+    SceneNN(root, "016")
+    assert not caplog.records
+
+
+def test_an_annotation_without_labels_is_named(root: Path) -> None:
+    (root / "016" / "016.xml").write_text("<annotation/>")
+    with pytest.raises(DataError, match=r"016\.xml holds no <label>"):
+        SceneNN(root, "016")
+
+
 def test_a_label_without_a_text_or_of_an_unknown_class_is_not_evaluated(root: Path) -> None:
     changed = [
         Annotated(CHAIR, "", "chair", (0, 0, 0), None, None),
@@ -156,6 +171,18 @@ def test_a_missing_image_is_the_fault_of_its_frame(root: Path, name: str) -> Non
 def test_without_timestamps_frames_come_at_30_hz(root: Path) -> None:
     (root / "016" / "timestamp.txt").unlink()
     assert SceneNN(root, "016")[3].timestamp == pytest.approx(0.1)
+
+
+def test_where_times_do_not_grow_frames_come_at_30_hz(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_timestamps(root / "016" / "timestamp.txt", dict.fromkeys(range(1, FRAMES + 1), 0))
+    assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
+    assert caplog.text.count("the times do not grow") == 1
+
+
+def test_timestamps_that_lack_an_image_are_left_out(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_timestamps(root / "016" / "timestamp.txt", {k: 7 + k / 10 for k in (1, 2, 4)})
+    assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
+    assert caplog.text.count("timestamp.txt has no time for 1 of 4 images, the first being 3: it is ignored") == 1
 
 
 @pytest.mark.parametrize("line", ["2 x 5", "2 5", "1 0 0", "2 0 nan"])

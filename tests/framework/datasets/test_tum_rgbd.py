@@ -121,6 +121,16 @@ def test_colour_images_without_depth_are_left_out_and_counted(folder: Path, capl
     assert "1 of 3 colour images have no depth image" in caplog.text
 
 
+def test_of_images_with_one_timestamp_the_first_is_taken(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    for name in ("rgb", "depth"):
+        path = folder / f"{name}.txt"
+        path.write_text(path.read_text() + path.read_text().replace(".png", "_again.png") * 1000)
+    sequence = TumRgbd(folder)  # 3 million pairs of these lines are within max_difference
+    assert [frame.timestamp for frame in sequence] == [color_time(k) for k in range(FRAMES)]
+    assert caplog.text.count("rgb.txt: 3000 images are left out") == 1
+    assert caplog.text.count("depth.txt: 3000 images are left out") == 1
+
+
 def test_nothing_that_belongs_together_is_a_fault(folder: Path) -> None:
     with pytest.raises(DataError, match=r"within dataset\.max_difference \(0\.01 s\)"):
         TumRgbd(folder, max_difference=0.01)

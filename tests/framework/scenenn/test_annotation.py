@@ -76,6 +76,25 @@ def test_what_is_not_known_is_left_out(path):
     assert_same(label, Annotated(7, "", "", NO_COLOR, None, None))
 
 
+def test_a_namespace_is_left_out(path):
+    path.write_text('<annotation xmlns="http://a.b/c"><label id="7" text="chair"/></annotation>')
+    assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
+    path.write_text('<n:annotation xmlns:n="http://a.b/c"><n:label id="7" text="chair"/></n:annotation>')
+    assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
+
+
+def test_a_label_that_is_there_twice_counts_once_when_both_say_the_same(path):
+    path.write_text('<a><label id="5" text="chair"/><label id="6"/><label id="5" text="chair"/></a>')
+    assert [label.id for label in read_annotation(path)] == [5, 6]
+
+
+@pytest.mark.parametrize("text", ["<annotation/>", "<annotation><labels/></annotation>", "<a><b id='1'/></a>"])
+def test_a_file_without_labels_is_no_annotation(path, text):
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"011.xml holds no <label>"):
+        read_annotation(path)
+
+
 @pytest.mark.parametrize("text", ["", "1 2", "1 2 3 4", "1 2 256", "1 2 -1", "1 2 x", "1 2 nan", "1 2 2.5"])
 def test_a_color_that_is_none(path, text):
     assert read_label(path, f'id="1" color="{text}"').color == NO_COLOR
@@ -100,7 +119,7 @@ def test_an_oriented_box_that_is_none(path, text):
         ('<label id="-1"/>', "line 3: .* found '-1'"),
         ('<label id="1.0"/>', "line 3: .* found '1.0'"),
         ('<label id="2147483648"/>', "line 3: .* found '2147483648'"),
-        ('<label id="5"/>', "line 3: the label 5 is there already in line 2"),
+        ('<label id="5" text="a"/>', "line 3: the label 5 is there already in line 2, with other attributes"),
         ("<label id=5/>", r"line 3: this is not XML: not well-formed \(invalid token\)"),
         ('<label id="6">', "line 4: this is not XML: mismatched tag"),
         ('<label id="&a;"/>', "line 3: this is not XML: undefined entity"),
@@ -157,10 +176,10 @@ def test_a_file_that_is_too_large_or_not_there(path, monkeypatch):
     with pytest.raises(DataError, match=r"011.xml could not be read: No such file"):
         read_annotation(path)
     monkeypatch.setattr(annotation, "LARGEST_FILE", 100)
-    path.write_text("<a>" + " " * 93 + "</a>")
-    assert read_annotation(path) == ()
-    path.write_text("<a>" + " " * 94 + "</a>")
-    with pytest.raises(DataError, match=r"011.xml is no annotation: it has 101 bytes, more than 100"):
+    path.write_text("<a><label id='1'/>" + " " * 78 + "</a>")
+    assert len(read_annotation(path)) == 1
+    path.write_text("<a><label id='1'/>" + " " * 79 + "</a>")
+    with pytest.raises(DataError, match=r"011.xml has 101 bytes, more than the 100"):
         read_annotation(path)
 
 
@@ -179,4 +198,6 @@ def test_a_file_that_is_too_large_or_not_there(path, monkeypatch):
 def test_what_could_not_be_read_back_is_not_written(path, change, message):
     with pytest.raises(DataError, match=message):
         write_annotation(path, (OBJECTS[1], dataclasses.replace(Annotated(5, "chair", "chair"), **change)))
+    with pytest.raises(DataError, match="at least one label"):
+        write_annotation(path, ())
     assert list(path.parent.iterdir()) == []

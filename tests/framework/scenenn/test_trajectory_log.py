@@ -84,6 +84,9 @@ def test_a_frame_that_was_lost_is_unusable(path):
     [
         ("-1.60032", "nan", "not finite"),
         ("-1.60032", "-inf", "not finite"),
+        ("-1.60032", "-1.#IND", "not finite"),
+        ("-1.60032", "1.#QNAN0", "not finite"),
+        ("-1.60032", "-nan(ind)", "not finite"),
         ("0.0228115", "1e300", "not rigid"),
         ("0.0228115", "0.0428115", "not rigid"),
         ("-0.999735 -0.0221085 -0.00642794", "0.999735 0.0221085 0.00642794", "det R -1"),  # a reflection
@@ -111,6 +114,20 @@ def test_wherever_the_file_is_cut_only_its_last_frame_is_lost(path):
         assert log.unusable == ({6: "the file ends before the pose does"} if known and not whole else {})
 
 
+def test_a_frame_that_is_there_twice_counts_when_both_say_the_same(path):
+    path.write_text(PUBLISHED + PUBLISHED.replace("1.0 0.0", "1 0"))
+    log = read_trajectory_log(path)
+    assert (list(log.poses), log.unusable) == ([0, 6], {})
+    path.write_text(PUBLISHED + PUBLISHED.replace("-1.60032", "-1.7"))
+    log = read_trajectory_log(path)
+    assert (list(log.poses), log.unusable) == ([0], {6: "it has two poses, in lines 6 and 16"})
+    path.write_text(PUBLISHED + PUBLISHED.replace("-1.60032", "-1.7") + PUBLISHED[:-20])
+    log = read_trajectory_log(path)
+    assert (list(log.poses), log.unusable) == ([0], {6: "it has two poses, in lines 6 and 26"})
+    path.write_text(LOST + LOST.replace("3.15572", "nan") + PUBLISHED)
+    assert list(read_trajectory_log(path).unusable) == [1259]
+
+
 def test_an_empty_file_has_no_poses(path):
     path.write_text("\n")
     log = read_trajectory_log(path)
@@ -131,7 +148,6 @@ def test_an_empty_file_has_no_poses(path):
         (4, "", "line 6: expected row 4 .* found '6 6 7'"),
         (8, "0 0 0 0 0", "line 8: expected row 2"),
         (10, "0 0 0 1 0", "line 10: expected row 4"),
-        (6, "0 0 1", "line 6: frame 0 is there already, in line 1; remove one"),
     ],
 )
 def test_faults_name_file_and_line(path, line, new, message):

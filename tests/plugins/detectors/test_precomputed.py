@@ -178,6 +178,12 @@ def write_folder(folder: Path, ids: np.ndarray | None = None, listed: Any = None
     return folder
 
 
+def test_a_byte_order_mark_is_left_out(tmp_path: Path) -> None:
+    path = write_folder(tmp_path) / "000003.json"
+    path.write_text(path.read_text(), encoding="utf-8-sig")
+    assert len(Precomputed(tmp_path).detect(frame(3))) == 2
+
+
 def test_a_folder_of_masks(tmp_path: Path) -> None:
     found = Precomputed(write_folder(tmp_path)).detect(frame(3))
     corner = np.zeros_like(MASK)
