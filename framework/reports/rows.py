@@ -119,13 +119,7 @@ def rows_of(
     parameters = _differing(
         [((one.row, *map(one.choices.get, stages)), one.parameters) for one in told]
         + [("", {DATA: one.parameters[DATA]}) for one in told if DATA in one.parameters]
-        + [
-            ((stage, one.choices.get(stage)), {key: value})
-            for one in told
-            for key, value in one.parameters.items()
-            for stage in (key.partition(".")[0],)
-            if (not one.row or one.row in overrides) and not _is_below(key, changed)
-        ]
+        + [kept for one in told if not one.row or one.row in overrides for kept in _kept(one, changed)]
     )
     rows: dict[tuple[str, tuple[str, ...]], dict[Run, Record]] = {}
     for one in told:
@@ -147,6 +141,14 @@ def _changed(override: str) -> str:
     """The key that an override changes: refiner for refiner=chain, refiner.links.x for refiner@refiner.links.x=y."""
     group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
     return package or group.replace("/", ".")
+
+
+def _kept(one: _Told, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+    """The parameters that no row says it changes, under their stage and its option: runs of two rows share them."""
+    for key, value in one.parameters.items():
+        if not _is_below(key, changed):
+            stage = key.partition(".")[0]
+            yield (stage, one.choices.get(stage)), {key: value}
 
 
 def _is_below(key: str, others: Collection[str]) -> bool:
