@@ -94,7 +94,7 @@ def test_a_column_is_a_sequence(tmp_path: Path) -> None:
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
     assert "| system | poses | 011 | 078 | mean |" in lines
     assert "| Rival | ground truth | **2.00** | **2.00** | **2.00** |" in lines
-    assert "| Rival | ground truth | -1.000 | -1.000 | -1.000 ± 0.000 * | 2 |" in lines
+    assert "| Rival | ground truth | -1.000 | -1.000 | -1.000 ± 0.000 | 2 |" in lines
     out = tmp_path / "outputs" / "fake_scenes"
     assert (out / "dataset.scene=078,row=rival,seed=1,tracker=fake" / "metrics.json").exists()
 
