@@ -131,8 +131,8 @@ def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
 
     Labels that have no name, or that the annotation does not have, are instances of unknown class: what is found there
     is neither right nor wrong. Labels of other classes (wall, cabinet, ...) are known to be none of the nine: instance
-    0, as is label 0. Of other classes nobody says what is there. Raises DataError, naming the file, when one cannot be
-    read or the mesh has no labels.
+    0, as is label 0. A detection of a class beyond the nine is neither right nor wrong. Raises DataError, naming the
+    file, when one cannot be read or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")

@@ -45,10 +45,9 @@ class Record:
     @property
     def code(self) -> str:
         """What ran, and what evaluated it where that is other code."""
-        prefix = len(EVALUATION)
-        anew = commit_of({key[prefix:]: told for key, told in self.metrics.items() if key.startswith(EVALUATION)})
-        told = f"{EVALUATION}git_commit" in self.metrics and anew != self.commit
-        return f"{self.commit}, evaluated by {anew}" if told else self.commit
+        anew = {key.removeprefix(EVALUATION): told for key, told in self.metrics.items() if key.startswith(EVALUATION)}
+        evaluator = commit_of(anew) if anew else self.commit
+        return self.commit if evaluator == self.commit else f"{self.commit}, evaluated by {evaluator}"
 
     @property
     def annotation(self) -> str:

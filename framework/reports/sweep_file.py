@@ -12,6 +12,7 @@ from hydra.errors import HydraException
 
 SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
 MOST_VALUES = 1000  # of a key; a range may claim any number
+MOST_RUNS = 100_000  # of all keys together
 
 
 def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str, ...]]:
@@ -27,7 +28,7 @@ def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str,
     except HydraException:  # glob(*), which means nothing without the config groups
         return []
     plain = not any("${" in value for column in values for value in column)
-    return list(itertools.product(*values)) if plain else []
+    return list(itertools.islice(itertools.product(*values), MOST_RUNS)) if plain else []
 
 
 def _overrides(sweep: Mapping[str, Any]) -> list[Override]:

@@ -35,6 +35,8 @@ def test_values_are_those_that_the_config_will_hold(override: str, values: list[
 
 def test_a_range_cannot_claim_the_memory() -> None:
     assert len(asked_runs(sweep({}, ["seed=range(0,100000000)"]), ["seed"])) == 1000
+    both = sweep({}, ["seed=range(0,100000000)", "frames=range(0,100000000)"])
+    assert len(asked_runs(both, ["seed", "frames"])) == 100_000
 
 
 @pytest.mark.parametrize(
