@@ -1,45 +1,59 @@
-"""`python -m framework`: one run, or with -m or an experiment a sweep of runs."""
+"""`instancemap [COMMAND] ...`, the same as `python -m framework [COMMAND] ...`; without a command, a run or a sweep."""
 
 from __future__ import annotations
 
+import sys
+from difflib import get_close_matches
+from importlib import import_module
 from pathlib import Path
 
-import hydra
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
+COMMANDS = {
+    "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
+    "figures": "run records below a folder become the paper's figures",
+    "evaluate": "evaluates stored runs anew, without running them again",
+    "detect": "writes a video's detections as a COCO result file",
+    "show-refinement": "draws one frame's masks before and after refinement",
+    "plugins": "lists what is registered for each stage, with its parameters",
+    "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
+    "train-detector": "trains Mask R-CNN on rendered rooms",
+    "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
+    "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
+}
+"""What each does. A command is the module of framework.commands with its name."""
 
-from framework.command_line import CONF, Jobs
-from framework.directory_lock import locked
-from framework.experiment import with_row
-from framework.reports.records import is_recorded
-from framework.sweep import ending
+HELP = """\
+{program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video
 
-jobs = Jobs()
+Without a command, KEY=VALUE ... make one run; with -m, or with an experiment, a sweep of runs:
+  {program} dataset=rgbd_folder dataset.root=DIR detector=maskrcnn2go
+  {program} -m refiner=identity,kmeans,gmm_em seed=0,1,2
 
+Commands; each explains itself with --help:
+{commands}
 
-@hydra.main(version_base="1.3", config_path=str(CONF), config_name="config")
-@jobs.reported
-def job(config: DictConfig) -> None:
-    """One run: builds the stages that the config names, maps the sequence, leaves the record in Hydra's directory."""
-    hydra_config = HydraConfig.get()
-    directory = Path(hydra_config.runtime.output_dir)
-    config, choices = with_row(config, hydra_config)
-    with locked(directory, wait=config.resume):  # where the sweep was killed and not its workers, they go on
-        if config.resume and is_recorded(directory, config):
-            return
-        from framework.run import run  # here, so that a misspelt name is answered before the heavy libraries load
-
-        run(config, directory, choices)
+debug=true, for any of them, shows where an error comes from. The keys of a run: --cfg job; Hydra's own options:
+--hydra-help.
+"""
 
 
 def main() -> None:
     """The console script `instancemap`."""
-    jobs.run(job_or_sweep)
-
-
-def job_or_sweep() -> None:
-    with ending:
-        job()
+    program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
+    word = sys.argv[1] if len(sys.argv) > 1 else ""
+    if word in ("--help", "-h", "help"):
+        width = max(map(len, COMMANDS))
+        listed = "\n".join(f"  {name:<{width}}  {says}" for name, says in COMMANDS.items())
+        print(HELP.format(program=program, commands=listed), end="")
+        return
+    if word in COMMANDS:
+        sys.argv[:2] = [f"{program} {word}"]
+    elif word and "=" not in word and not word.startswith(("-", "~")):
+        close = get_close_matches(word, COMMANDS, n=1)
+        suggestion = f"did you mean {close[0]}?" if close else f"the commands are {', '.join(COMMANDS)}"
+        sys.exit(f"error: there is no command {word!r}; {suggestion}")
+    else:
+        word = "run"
+    import_module(f"framework.commands.{word.replace('-', '_')}").main()
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.corner_room import CornerRoom
+from tests.scenes.corner_room import CornerRoom
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
 CHECKOUT = Path(__file__).resolve().parent.parent

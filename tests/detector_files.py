@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from framework.detect import write_detections, write_labels
-from tests.corner_room import CornerRoom, SphereDetector
+from framework.commands.detect import write_detections, write_labels
+from tests.scenes.corner_room import CornerRoom, SphereDetector
 from tests.tiny_mask_rcnn import tiny_network_file
 
 

@@ -14,7 +14,7 @@ from framework.pipeline import Pipeline
 from plugins.detectors.none import NoDetections
 from plugins.trackers.ground_truth import GroundTruth
 from tests import registered
-from tests.corner_room import GridFuser, KeepAll
+from tests.scenes.corner_room import GridFuser, KeepAll
 
 
 def write_color(path: Path, rgb: tuple[int, int, int], shape: tuple[int, int] = (480, 640)) -> None:

@@ -7,9 +7,9 @@ from typing import Any
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from framework.build import STAGES, build
-from framework.command_line import CONF
-from framework.plugins import registered
+from framework.commands.plugins import registered
+from framework.files.search_paths import CONF
+from framework.registry import STAGES, build
 
 OPTIONS = [(stage, option.name) for stage in STAGES for option in registered(stage)]
 

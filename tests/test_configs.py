@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 from omegaconf import OmegaConf
 
-from framework.build import STAGES
-from framework.command_line import CONF
+from framework.commands.plugins import registered as options_of
 from framework.errors import ConfigError, DataError
-from framework.plugins import registered as options_of
+from framework.files.search_paths import CONF
+from framework.registry import STAGES
 from tests import registered
 
 

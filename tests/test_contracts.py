@@ -14,7 +14,7 @@ from framework.errors import ConfigError, DataError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from tests import detector_files, registered
-from tests.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
+from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 from tests.thread_counts import by_one_thread_and_two
 
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from framework.datasets.synthetic import Synthetic
 from framework.evaluation.instances import PredictedInstances, evaluate
 from framework.mapping.instance_map import InstanceMap
 from framework.pipeline import Pipeline
+from framework.synthetic.sequence import Synthetic
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.simulated import SimulatedDetector
 from plugins.fusers.bayesian_tsdf import BayesianTsdf

@@ -14,22 +14,22 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
-from framework.build import STAGES, build
-from framework.command_line import CONF
 from framework.data import Camera, Frame
+from framework.files.search_paths import CONF
 from framework.geometry import lift
 from framework.interfaces import Detector
+from framework.registry import STAGES, build
 from tests import registered
-from tests.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
+from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 CHECKOUT = Path(__file__).resolve().parent.parent
 README = (CHECKOUT / "README.md").read_text()
 LINES = [line for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
 COMMANDS = {  # by the main config that they compose
-    line: config
+    line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
     for line in LINES
-    for config in ("config", *(path.stem for path in CONF.glob("*.yaml")))
-    if line.startswith(f"python -m framework{'' if config == 'config' else f'.{config}'} ")
+    if (words := line.split())[:3] == ["python", "-m", "framework"]
+    and ("=" in words[3] or words[3] == "-m" or (CONF / f"{words[3].replace('-', '_')}.yaml").exists())
 }
 BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
 
@@ -80,7 +80,7 @@ def test_the_detector_finds_what_it_says(my_plugins: Path) -> None:
 
 def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
     """The README's command, with the other stages faked for speed."""
-    fakes = [f"{stage}._target_=tests.corner_room.{name}" for stage, name in FAKES.items()]
+    fakes = [f"{stage}._target_=tests.scenes.corner_room.{name}" for stage, name in FAKES.items()]
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
     for stage in FAKES:

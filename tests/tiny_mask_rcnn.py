@@ -6,9 +6,9 @@ from pathlib import Path
 
 import torch
 
-from framework.detection.mask_rcnn import Architecture, MaskRCNN
-from framework.detection.network_file import save_network
-from framework.detection.resnet import ResNetShape
+from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
+from framework.detection.mask_rcnn.network_file import save_network
+from framework.detection.mask_rcnn.resnet import ResNetShape
 
 TINY = Architecture(
     classes=("chair", "couch", "dining table"),

@@ -11,7 +11,7 @@ from typing import Any
 from framework.data import Camera
 from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError
-from framework.whole_files import MOST_TEXT, read_bytes
+from framework.files.whole_files import MOST_TEXT, read_bytes
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:

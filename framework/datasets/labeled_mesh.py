@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from framework import rasterizer
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
 from framework.detection.fingerprint import file_hash
-from framework.rasterizer import Rasterizer
+from framework.rendering import rasterizer
+from framework.rendering.rasterizer import Rasterizer
 
 
 @dataclass(frozen=True)
@@ -52,10 +52,10 @@ class LabeledMesh:
     @cached_property
     def _fingerprint(self) -> str:
         """SHA-256 (hex) of what is rendered, and of the code that does."""
-        told = hashlib.sha256()
+        digest = hashlib.sha256()
         for array in (self.vertices, self.triangles, self.instance_ids):
-            told.update(f"{array.dtype.str}{array.shape}".encode())
-            told.update(np.ascontiguousarray(array).data)
+            digest.update(f"{array.dtype.str}{array.shape}".encode())
+            digest.update(np.ascontiguousarray(array).data)
         for source in (__file__, rasterizer.__file__):
-            told.update(file_hash(Path(source)).encode())
-        return told.hexdigest()
+            digest.update(file_hash(Path(source)).encode())
+        return digest.hexdigest()

@@ -15,8 +15,8 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
-from framework.datasets.image_files import read_color, read_uint16
 from framework.errors import ConfigError, DataError, FrameError
+from framework.files.image_files import read_color, read_uint16
 from framework.interfaces import RGBDSequence
 
 FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
@@ -190,8 +190,8 @@ def _within_reach(recorded: RecordedFrame) -> RecordedFrame:
     distance = math.hypot(*recorded.T_world_camera[:3, 3])
     if distance <= FARTHEST:
         return recorded
-    told = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
-    return RecordedFrame(recorded.images, recorded.timestamp, fault=told)
+    fault = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
+    return RecordedFrame(recorded.images, recorded.timestamp, fault=fault)
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:

@@ -18,7 +18,7 @@ from framework.data import Camera
 from framework.datasets.camera_json import camera_of, read_json_object
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
 from framework.errors import DataError
-from framework.matrix_file import PrintedMatrix, read_matrix_lines
+from framework.files.matrix_file import PrintedMatrix, read_matrix_lines
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 

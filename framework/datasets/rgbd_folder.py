@@ -24,13 +24,13 @@ import numpy as np
 
 from framework.data import FrameTruth, Int32, SceneTruth
 from framework.datasets.camera_json import camera_of, read_json_object
-from framework.datasets.image_files import read_uint16
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
+from framework.datasets.scene_truth import LabeledDepth, fuse_scene_truth
 from framework.errors import ConfigError, DataError, FrameError
-from framework.evaluation.scene_truth import LabeledDepth, fuse_scene_truth
+from framework.files.image_files import read_uint16
+from framework.files.number_lines import SHOWN
+from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.label_spaces import COCO
-from framework.number_lines import SHOWN
-from framework.trajectory_file import TumLine, read_tum_lines
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
 LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16

@@ -18,10 +18,10 @@ import numpy as np
 from numba import njit
 
 from framework.data import Camera, Float64, UInt8, UInt16
-from framework.datasets.image_files import read_color, read_uint16
 from framework.datasets.recording import FRAME_RATE, NO_READING, Contents, RecordedFrame, Recording
 from framework.errors import DataError
-from framework.matrix_file import read_matrix
+from framework.files.image_files import read_color, read_uint16
+from framework.files.matrix_file import read_matrix
 
 DEPTH_SCALE = 1000.0  # units a metre
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published

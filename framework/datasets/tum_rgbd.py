@@ -23,10 +23,10 @@ import numpy as np
 from framework.data import Camera, Float64
 from framework.datasets.recording import Contents, ImageFiles, RecordedFrame, Recording
 from framework.errors import ConfigError, DataError
+from framework.files.number_lines import SHOWN, read_lines
+from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.geometry import interpolate
-from framework.number_lines import SHOWN, read_lines
 from framework.parameters import require
-from framework.trajectory_file import TumLine, read_tum_lines
 
 DEPTH_SCALE = 5000.0  # units a metre
 LONGEST_NAME = 255  # characters of an image's

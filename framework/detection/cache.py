@@ -12,10 +12,10 @@ from pathlib import Path
 import numpy as np
 from omegaconf import DictConfig
 
-from framework.atomic_files import written_whole
 from framework.data import Array, Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
+from framework.files.atomic_files import written_whole
 from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ class CachedDetector(Detector):
     An entry is found by what the answer depends on: the detector's `fingerprint()`, its classes, and the fields of the
     frame that it `reads`. So a changed parameter, weight or image misses, and the same image of another video hits.
     Several processes may share a folder: entries are written whole, and two that write one write the same. A damaged
-    entry is told in the log and computed again. Entries are never removed here; whoever needs the disk may delete any.
+    entry is named in the log and computed again. Entries are never removed here; whoever needs the disk may delete any.
     """
 
     detector: Detector
@@ -141,26 +141,26 @@ def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
 
     Truth that is not rendered yet counts by its origin, so that a hit spares the rendering.
     """
-    told = hashlib.sha256()
+    digest = hashlib.sha256()
     for name in sorted(reads):
         value = getattr(frame, name)
         if isinstance(value, FrameTruth):
             if isinstance(value, DeferredTruth):
-                told.update(f"{name} of {value.origin};".encode())
+                digest.update(f"{name} of {value.origin};".encode())
             else:
-                _tell(told, name, value.instance_ids)
+                _tell(digest, name, value.instance_ids)
             # repr tells None from "None", and no order of insertion
-            told.update(repr(sorted(value.class_names.items())).encode())
+            digest.update(repr(sorted(value.class_names.items())).encode())
         elif isinstance(value, np.ndarray):
-            _tell(told, name, value)
+            _tell(digest, name, value)
         else:  # numbers, the camera and None: Python writes floats so that they read back exactly
-            told.update(f"{name}={value!r};".encode())
-    return told.hexdigest()
+            digest.update(f"{name}={value!r};".encode())
+    return digest.hexdigest()
 
 
-def _tell(told: hashlib._Hash, name: str, array: Array) -> None:
-    told.update(f"{name}={array.dtype.str}{array.shape};".encode())
-    told.update(np.ascontiguousarray(array).data)
+def _tell(digest: hashlib._Hash, name: str, array: Array) -> None:
+    digest.update(f"{name}={array.dtype.str}{array.shape};".encode())
+    digest.update(np.ascontiguousarray(array).data)
 
 
 def pack(detections: Detections) -> bytes:

@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
 
-from framework.detection.places import places
 from framework.errors import ConfigError
+from framework.files.search_paths import candidates
 
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Another version may give other last digits."""
@@ -32,10 +32,10 @@ def fingerprint(detector: object) -> str:
     identifies it, with a method `fingerprint`.
     """
     kind = type(detector)
-    told = hashlib.sha256()
+    digest = hashlib.sha256()
     for part in (f"{kind.__module__}.{kind.__qualname__}", *_code(kind), *_parameters(detector)):
-        told.update(f"{len(part)}:{part}".encode())
-    return told.hexdigest()
+        digest.update(f"{len(part)}:{part}".encode())
+    return digest.hexdigest()
 
 
 def _code(kind: type) -> Iterator[str]:
@@ -75,7 +75,7 @@ def _parameters(detector: object) -> Iterator[str]:
 
 def _is_path(value: str) -> bool:
     """Whether a parameter that may be a name or a path (labels, a model) is a path, and not a word like `auto`."""
-    return value not in ("", ".") and any(_exists(place) for place in places(Path(value)))
+    return value not in ("", ".") and any(_exists(candidate) for candidate in candidates(Path(value)))
 
 
 def _exists(path: Path) -> bool:
@@ -95,17 +95,17 @@ def content_hash(path: Path) -> str:
     """SHA-256 of a file, or of the names and the bytes of all files below a folder; "" for a path that is not given."""
     if path == NOT_GIVEN:
         return ""
-    found = next((place for place in places(path) if place.exists()), None)
+    found = next((candidate for candidate in candidates(path) if candidate.exists()), None)
     if found is None:
-        looked = " and ".join(str(place) for place in places(path))
+        looked = " and ".join(str(candidate) for candidate in candidates(path))
         raise ConfigError(f"there is no {looked}, by which the detector would be identified: give it a fingerprint()")
     if found.is_file():
         return file_hash(found)
-    told = hashlib.sha256()
+    digest = hashlib.sha256()
     for file in sorted(file for file in found.rglob("*") if file.is_file()):
         name = file.relative_to(found).as_posix()
-        told.update(f"{len(name)}:{name}:{file_hash(file)}".encode())
-    return told.hexdigest()
+        digest.update(f"{len(name)}:{name}:{file_hash(file)}".encode())
+    return digest.hexdigest()
 
 
 def file_hash(path: Path) -> str:

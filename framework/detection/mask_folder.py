@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Bool
-from framework.datasets.image_files import read_uint16
 from framework.detection.stored_detection import (
     Segmentation,
     StoredDetection,
@@ -20,6 +19,7 @@ from framework.detection.stored_detection import (
     read_score,
 )
 from framework.errors import DataError
+from framework.files.image_files import read_uint16
 
 _read_ids = lru_cache(maxsize=1)(read_uint16)  # the detections of a frame share its image
 

@@ -15,8 +15,8 @@ import numpy as np
 
 from framework.data import Float32
 from framework.detection.onnx_file import Signature, TensorType, read_signature
-from framework.detection.places import places
 from framework.errors import ConfigError, DataError
+from framework.files.search_paths import candidates
 
 INPUT_DTYPES = ("float32", "float16", "uint8")
 
@@ -90,10 +90,10 @@ class OnnxNetwork:
 def find_file(path: Path) -> Path:
     """The file `path`. A relative one is tried from the working folder, then from the project's."""
     path = path.expanduser()
-    for place in places(path):
-        if place.is_file():
-            return place
-    looked = " or ".join(str(place.resolve()) for place in places(path))
+    for candidate in candidates(path):
+        if candidate.is_file():
+            return candidate
+    looked = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
     raise DataError(f"detector.weights: there is no file {looked}; put the network there, or name another")
 
 

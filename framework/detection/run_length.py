@@ -11,10 +11,8 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
-from framework.data import Bool
+from framework.data import Bool, Int64
 from framework.errors import DataError
-
-Int64 = np.ndarray[tuple[int, ...], np.dtype[np.int64]]
 
 FIRST_CHARACTER = 48  # stands for 0; each character carries five bits, and a sixth that says that more follow
 MORE, SIGN, BITS = 0x20, 0x10, 5

@@ -28,10 +28,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, SceneTruth
+from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh, Int32, Int64, SceneTruth
 from framework.errors import DataError
-
-Int64 = npt.NDArray[np.int64]
 
 MAX_DISTANCE = 0.05  # m, to the nearest neighbor that a label is taken from
 MIN_POINTS = 100  # true instances with fewer points do not count

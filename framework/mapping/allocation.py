@@ -7,7 +7,6 @@ numbered in a serial pass, so that the map is the same with any number of thread
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, Frame, Int32
@@ -24,8 +23,6 @@ from framework.mapping.voxel_grid import (
     pack_key,
     unpack_key,
 )
-
-Int64 = npt.NDArray[np.int64]
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once

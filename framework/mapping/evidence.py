@@ -30,12 +30,11 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32, UInt8
+from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.errors import DataError
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more
 
-Int64 = npt.NDArray[np.int64]
 Integers = npt.NDArray[Any]  # of int16 or int64
 
 INSTANCE_SLOTS, CLASS_SLOTS = 4, 16  # labels that a voxel can tell apart in compact storage

@@ -13,9 +13,9 @@ from typing import IO, Any
 import numpy as np
 from isal import isal_zlib
 
-from framework.atomic_files import written_whole
 from framework.data import Array
 from framework.errors import DataError
+from framework.files.atomic_files import written_whole
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 

@@ -21,6 +21,7 @@ from framework.data import Camera, Float32, Float64, SurfaceView, View
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.frustum import solid_blocks_in_view
+from framework.mapping.row_interpolation import blend_colors, gather_corners, points_of_row, step_to_surface
 from framework.mapping.sensor import Sensor, depth_noise, pinhole, ray_direction, seen_point
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
@@ -30,7 +31,6 @@ from framework.mapping.voxel_grid import (
     device,
     find_block,
 )
-from framework.mapping.voxel_rows import blend_colors, gather_corners, points_of_row, step_to_surface
 from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, voxel_number
 
 TILE = 8  # px; one tile's rays share blocks in the cache

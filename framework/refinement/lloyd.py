@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Float32, Float64, Int32
-
-Int64 = npt.NDArray[np.int64]
+from framework.data import Float32, Float64, Int32, Int64
 
 
 def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:

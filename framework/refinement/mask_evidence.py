@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from framework.data import Float32
-from framework.refinement.neighborhood import Int64, Neighborhoods
+from framework.data import Float32, Int64
+from framework.refinement.neighborhood import Neighborhoods
 
 
 def mask_log_odds(around: Neighborhoods, largest: float, expected_bleed: float) -> Float32:

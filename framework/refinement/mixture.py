@@ -10,10 +10,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.refinement.gaussian import (
     ABSENT,
     add_moments,
@@ -29,8 +28,6 @@ from framework.refinement.gaussian import (
     raise_to_density,
     set_coefficients,
 )
-
-Int64 = npt.NDArray[np.int64]
 
 MIN_SUPPORT = 4.0  # points that a component needs to have a covariance of its own in 3D; with fewer it is dropped
 BLOCK = 256  # points that a kernel handles at once: their densities stay in the first-level cache

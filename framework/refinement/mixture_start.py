@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.refinement.lloyd import depth_groups_of, lloyd, nearest
-from framework.refinement.neighborhood import Int64, Neighborhoods
+from framework.refinement.neighborhood import Neighborhoods
 
 START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
 

@@ -10,10 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Float32, Float64, Int32
+from framework.data import Float32, Float64, Int32, Int64
 from framework.refinement import mixture
 from framework.refinement.gaussian import (
     ABSENT,
@@ -26,8 +25,6 @@ from framework.refinement.gaussian import (
 )
 from framework.refinement.mixture import BLOCK, MIN_SUPPORT
 from framework.refinement.neighborhood import grouped
-
-Int64 = npt.NDArray[np.int64]
 
 SHARE_ITERATIONS = 20  # of EM over which side a node's points are on; the error at least halves where sides are clear
 

@@ -9,10 +9,9 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Camera, Float32, Frame, Int32, PointClusters
+from framework.data import Bool, Camera, Float32, Frame, Int32, Int64, PointClusters
 
 Int16 = npt.NDArray[np.int16]
-Int64 = npt.NDArray[np.int64]
 
 # 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, at most 8 % from the Euclidean one
 CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)

@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Frame, UInt8
-from framework.refinement.neighborhood import Int64, pinhole
+from framework.data import Bool, Float32, Float64, Frame, Int64, UInt8
+from framework.refinement.neighborhood import pinhole
 
 CELL = 16  # px a side: 9 cm at 3 m and 540 px focal length, smaller than what should count as a plane
 STEP = 2  # px between the readings of a cell that are looked at

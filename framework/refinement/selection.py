@@ -5,12 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Int32, PointClusters
-
-Int64 = npt.NDArray[np.int64]
+from framework.data import Bool, Float32, Int32, Int64, PointClusters
 
 PART = 8192  # rows that a thread copies at once
 

@@ -14,9 +14,8 @@ import numpy as np
 
 from framework.data import Camera, Float64, Int32
 from framework.errors import DataError
-from framework.synthetic import clutter, fixtures
-from framework.synthetic.camera_path import CameraPath, plan_path
-from framework.synthetic.cluttered_groups import (
+from framework.synthetic.furniture import clutter, fixtures
+from framework.synthetic.furniture.cluttered_groups import (
     board_group,
     chair_row,
     cluttered_bed_group,
@@ -24,7 +23,7 @@ from framework.synthetic.cluttered_groups import (
     cluttered_couch_group,
     desk_row,
 )
-from framework.synthetic.groups import (
+from framework.synthetic.furniture.groups import (
     Group,
     bed_group,
     couch_group,
@@ -35,10 +34,11 @@ from framework.synthetic.groups import (
     toilet_group,
     tv_group,
 )
-from framework.synthetic.piece import Rng
+from framework.synthetic.furniture.piece import Rng
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.renderer import ids_met
 from framework.synthetic.room import Room, furnish_with
+from framework.synthetic.walk import CameraPath, plan_path
 
 SMALLEST = (4.2, 3.8)  # m, width and depth of the smallest room tried
 ATTEMPTS = 6  # scenes drawn, of which the walk that shows most is kept

@@ -13,9 +13,9 @@ import numpy as np
 
 from framework.data import Float64
 from framework.errors import DataError
-from framework.synthetic.groups import Group, Place
-from framework.synthetic.piece import Furniture, Rng
-from framework.synthetic.solids import axis_rotation
+from framework.synthetic.furniture.groups import Group, Place
+from framework.synthetic.furniture.piece import Furniture, Rng
+from framework.synthetic.furniture.solids import axis_rotation
 
 CLEARANCE = 0.06  # m, between groups
 MARGIN = 0.05  # m, between a group and the corner of the room

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32, UInt8
-from framework.rasterizer import NO_TRIANGLE, Rasterizer, Sight
+from framework.rendering.rasterizer import NO_TRIANGLE, Rasterizer, VisibilityBuffer
 from framework.synthetic.lights import Lamp, bake
 from framework.synthetic.ray_caster import RayCaster, image_rays
 from framework.synthetic.shading import WHITE, lit, shade
@@ -38,17 +38,17 @@ class Renderer:
     def render(self, camera: Camera, T_world_camera: Float64, material_table: Float32 | None = None) -> Rendering:
         """The picture of the room, or of one with the same light and other materials (see textures.material_table)."""
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
-        sight = self._rasterizer.draw(camera, T_world_camera)
-        light, incidence = shade(surfaces, self.caster, sight, camera, T_world_camera)
-        return Rendering(to_srgb(light), sight.depth, self._ids(sight), incidence)
+        buffer = self._rasterizer.draw(camera, T_world_camera)
+        light, incidence = shade(surfaces, self.caster, buffer, camera, T_world_camera)
+        return Rendering(to_srgb(light), buffer.depth, self._ids(buffer), incidence)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
         """Exact depth and instance ids only, (H, W) each."""
-        sight = self._rasterizer.draw(camera, T_world_camera)
-        return sight.depth, self._ids(sight)
+        buffer = self._rasterizer.draw(camera, T_world_camera)
+        return buffer.depth, self._ids(buffer)
 
-    def _ids(self, sight: Sight) -> Int32:
-        return np.asarray(_looked_up(sight.triangle, self.surfaces.instance_ids), np.int32)
+    def _ids(self, buffer: VisibilityBuffer) -> Int32:
+        return np.asarray(_looked_up(buffer.triangle, self.surfaces.instance_ids), np.int32)
 
 
 def ids_met(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:

@@ -8,12 +8,13 @@ from enum import StrEnum
 import numpy as np
 
 from framework.data import Float64
-from framework.synthetic import clutter, fixtures, groups, palette, seating
-from framework.synthetic.groups import Group, single
+from framework.synthetic import paints
+from framework.synthetic.furniture import clutter, fixtures, groups, seating
+from framework.synthetic.furniture.groups import Group, single
+from framework.synthetic.furniture.piece import Furniture, Rng
+from framework.synthetic.furniture.solids import panel, rounded_box
 from framework.synthetic.layout import Layout, arrange, place_on_wall
 from framework.synthetic.lights import Lamp, globe, rectangle
-from framework.synthetic.piece import Furniture, Rng
-from framework.synthetic.solids import panel, rounded_box
 from framework.synthetic.surfaces import Surfaces, assemble
 from framework.synthetic.textures import Material, Texture
 
@@ -99,11 +100,11 @@ def _shell(width: float, depth: float, rng: Rng) -> Furniture:
     shell = Furniture("shell", None)
     shell.add(panel(width, depth).turned("x", np.pi / 2).moved(y=depth / 2), _floor(rng))
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
-    shell.add(ceiling, palette.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12))
-    color = palette.pick(rng, palette.WALLS)
-    plain, pattern = palette.paint(rng, color, 0.88), int(rng.integers(4096))
-    paper = Material(Texture.WALLPAPER, color, palette.shade(color, 0.78), rng.uniform(0.13, 0.2), seed=pattern)
-    papered, skirting = int(rng.integers(4)), palette.wood(rng)
+    shell.add(ceiling, paints.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12))
+    color = paints.pick(rng, paints.WALLS)
+    plain, pattern = paints.paint(rng, color, 0.88), int(rng.integers(4096))
+    paper = Material(Texture.WALLPAPER, color, paints.shade(color, 0.78), rng.uniform(0.13, 0.2), seed=pattern)
+    papered, skirting = int(rng.integers(4)), paints.wood(rng)
     for wall in range(4):
         length = width if wall % 2 == 0 else depth
         x, y, angle = place_on_wall(wall, 0.0, width, depth)
@@ -116,14 +117,18 @@ def _shell(width: float, depth: float, rng: Rng) -> Furniture:
 def _floor(rng: Rng) -> Material:
     style = rng.uniform()
     if style < 0.65:
-        first, second = palette.WOODS[int(rng.integers(len(palette.WOODS)))]
+        first, second = paints.WOODS[int(rng.integers(len(paints.WOODS)))]
         return Material(Texture.PLANKS, first, second, rng.uniform(0.11, 0.17), seed=int(rng.integers(4096)))
     if style < 0.85:
-        tone = palette.pick(rng, ((0.72, 0.66, 0.58), (0.60, 0.61, 0.62), (0.76, 0.52, 0.38)))
+        tone = paints.pick(rng, ((0.72, 0.66, 0.58), (0.60, 0.61, 0.62), (0.76, 0.52, 0.38)))
         return Material(
-            Texture.TILES, tone, palette.shade(tone, 0.6), rng.uniform(0.28, 0.42), seed=int(rng.integers(4096))
+            Texture.TILES,
+            tone,
+            paints.shade(tone, 0.6),
+            rng.uniform(0.28, 0.42),
+            seed=int(rng.integers(4096)),
         )
-    return palette.cloth(rng, palette.pick(rng, palette.CLOTHS))
+    return paints.cloth(rng, paints.pick(rng, paints.CLOTHS))
 
 
 def _lamps(pieces: list[Furniture]) -> list[Lamp]:

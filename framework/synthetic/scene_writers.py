@@ -24,9 +24,9 @@ import cv2
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from framework.atomic_files import written_whole
+from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.errors import ConfigError, DataError
-from framework.scenenn.intrinsics import write_intrinsics
+from framework.files.atomic_files import written_whole
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 

@@ -5,11 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
-from framework.data import Bool, Camera, Float32, Float64, Int32
-from framework.rasterizer import NO_TRIANGLE, Sight
+from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
+from framework.rendering.rasterizer import NO_TRIANGLE, VisibilityBuffer
 from framework.synthetic.ray_caster import RayCaster, pixel_rays
 from framework.synthetic.surfaces import Surfaces
 from framework.synthetic.textures import surface_color
@@ -18,7 +17,6 @@ EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.12
 EDGE_STEP = 0.04  # relative step of depth that counts as an edge
 WHITE = 2.2  # linear light that becomes full white: lamps and windows may burn out
 
-Int64 = npt.NDArray[np.int64]
 
 GRAZING = np.float32(0.05)  # the least cosine that a pixel's footprint is computed with
 
@@ -67,7 +65,7 @@ def lit(surfaces: Surfaces, irradiance: Float32) -> LitSurfaces:
 
 
 def shade(
-    surfaces: LitSurfaces, caster: RayCaster, sight: Sight, camera: Camera, T_world_camera: Float64
+    surfaces: LitSurfaces, caster: RayCaster, buffer: VisibilityBuffer, camera: Camera, T_world_camera: Float64
 ) -> tuple[Float32, Float32]:
     """The light (H, W, 3) of a picture, and under which cosines (H, W) to their normals surfaces are seen.
 
@@ -75,21 +73,21 @@ def shade(
     """
     view = View.of(camera, T_world_camera)
     light, incidence = np.empty((*camera.shape, 3), np.float32), np.empty(camera.shape, np.float32)
-    _shade(surfaces, view, sight.triangle, sight.depth, sight.uv, light, incidence)
-    v, u = np.nonzero(edges(sight, surfaces.parts))
+    _shade(surfaces, view, buffer.triangle, buffer.depth, buffer.uv, light, incidence)
+    v, u = np.nonzero(edges(buffer, surfaces.parts))
     if len(u):
         offsets = np.array(EDGE_SAMPLES)
         rays = pixel_rays(camera, T_world_camera, u[:, None] + offsets[:, 0], v[:, None] + offsets[:, 1])
         hits = caster.cast(rays)
         _smooth(
-            surfaces, view, u, v, offsets, hits.triangle, hits.distance, hits.uv, sight.triangle, sight.depth, light
+            surfaces, view, u, v, offsets, hits.triangle, hits.distance, hits.uv, buffer.triangle, buffer.depth, light
         )
     return light, incidence
 
 
-def edges(sight: Sight, parts: Int32) -> Bool:
+def edges(buffer: VisibilityBuffer, parts: Int32) -> Bool:
     """The pixels (H, W) on either side of a border between two parts, or of a step of depth."""
-    return np.asarray(_edges(sight.triangle, parts, sight.depth), np.bool_)
+    return np.asarray(_edges(buffer.triangle, parts, buffer.depth), np.bool_)
 
 
 @njit(cache=True, nogil=True)

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from framework.data import Float32, Float64, Int32
-from framework.synthetic.piece import Furniture
+from framework.synthetic.furniture.piece import Furniture
 from framework.synthetic.textures import Material, material_table
 
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.detection.mask_rcnn import DELTA_WEIGHTS, MaskRCNN
+from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN
 from framework.training.targets import BACKGROUND, box_iou, encode, mask_targets, match, sample
 
 BETA = 1.0 / 9.0  # where the smooth L1 loss becomes linear

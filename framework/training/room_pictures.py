@@ -24,13 +24,13 @@ import numpy as np
 from tqdm import tqdm
 
 from framework.data import Bool, Camera, Float64, UInt8
-from framework.datasets.image_files import read_color, read_uint16
 from framework.errors import DataError
-from framework.synthetic.camera_path import look
+from framework.files.image_files import read_color, read_uint16
+from framework.synthetic.depth_camera import noisy_color
 from framework.synthetic.layout import CELL
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.room import Room, RoomKind, furnish
-from framework.synthetic.sensor import noisy_color
+from framework.synthetic.walk import look
 
 STREAM = 0x7261_696E  # apart from the streams of all datasets, whatever their seed
 WIDTH, HEIGHT = 320, 240  # px

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from framework.detection.roi_align import roi_align
+from framework.detection.mask_rcnn.roi_align import roi_align
 
 BACKGROUND, IGNORED = -1, -2  # in place of an object's index
 

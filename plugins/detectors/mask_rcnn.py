@@ -12,12 +12,12 @@ from torch import Tensor
 
 from framework.data import Detections, Float32, Frame, Int32
 from framework.detection.boxes import to_original_image
-from framework.detection.checkpoint import read_network
 from framework.detection.device import torch_device
 from framework.detection.fusion import fuse_batch_norms
-from framework.detection.mask_rcnn import select
+from framework.detection.mask_rcnn.checkpoint import read_network
+from framework.detection.mask_rcnn.network import select
+from framework.detection.mask_rcnn.published_weights import find_network
 from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
-from framework.detection.published import find_network
 from framework.errors import DataError
 from framework.interfaces import Detector
 from framework.parameters import require

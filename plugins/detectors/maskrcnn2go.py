@@ -19,11 +19,11 @@ from torch.nn import functional
 from framework.data import Detections, Float32, Frame, Int32
 from framework.detection.boxes import anchor_grid, clip, decode, to_original_image
 from framework.detection.device import torch_device
+from framework.detection.mask_rcnn.roi_align import roi_align
 from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
 from framework.detection.nms import suppress_boxes
-from framework.detection.places import places
-from framework.detection.roi_align import roi_align
 from framework.errors import DataError
+from framework.files.search_paths import candidates
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
 from framework.parameters import require
@@ -214,10 +214,10 @@ def _as_torch(operator: Mapping[str, Any], tensors: Tensors) -> Callable[..., Te
 
 def _find_weights(folder: Path) -> Path:
     """The folder of the network. A relative path is tried from the working folder, then from the project's."""
-    for place in places(folder):
+    for place in candidates(folder):
         if place.is_dir():
             return place
-    looked = " and ".join(str(place.resolve()) for place in places(folder))
+    looked = " and ".join(str(place.resolve()) for place in candidates(folder))
     raise DataError(f"detector.weights: there is no folder {looked}; put {' and '.join(SHA256)} there")
 
 

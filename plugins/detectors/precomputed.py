@@ -30,7 +30,7 @@ FRAMES_IN_DOUBT = 30  # frames in a row, from the first, without an entry: time 
 class Precomputed(Detector):
     """Returns what a COCO result file or a folder of masks has for the frame's number.
 
-    `python -m framework.detect` writes such a file, and so does any program that COCO's evaluation accepts; a folder
+    `python -m framework detect` writes such a file, and so does any program that COCO's evaluation accepts; a folder
     has NNNNNN.png with 16-bit instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Either may
     give `class_probabilities`, over its own labels. Labels become COCO's names as `label_spaces.yaml` says, and a
     detection whose best label means none of them is dropped.

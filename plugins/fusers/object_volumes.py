@@ -11,9 +11,9 @@ from framework.mapping.association import OverlapRule, Overlaps, count_overlaps,
 from framework.mapping.instance_fuser import VOTES_ACROSS
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceRecord
-from framework.mapping.object_map import ObjectMap
 from framework.mapping.tsdf_fuser import VoxelHashingFuser, require_same_classes
 from framework.parameters import check_bounds
+from framework.rivals.object_map import ObjectMap
 
 
 def existence(record: InstanceRecord) -> float:
@@ -29,7 +29,7 @@ class ObjectVolumes(VoxelHashingFuser):
 
     A detection belongs to the object that it overlaps most with, several may belong to one, and an object's masks of a
     frame are taken together. The defaults are Fusion++'s rule; MaskFusion's is `overlap_rule=CLUSTER overlap=0.05
-    same_class=true`. How the maps differ from the originals': framework/mapping/object_map.py.
+    same_class=true`. How the maps differ from the originals': framework/rivals/object_map.py.
     """
 
     overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap

@@ -9,9 +9,9 @@ import numpy as np
 from framework.data import Float64, Frame, Int32, PointClusters, Pose
 from framework.mapping.association import PixelLists
 from framework.mapping.instance_fuser import InstanceFuser, floored_log
-from framework.mapping.open3d_grid import BlockGridSettings
-from framework.mapping.open3d_map import Open3DMap
 from framework.parameters import check_bounds
+from framework.rivals.open3d_grid import BlockGridSettings
+from framework.rivals.open3d_map import Open3DMap
 
 
 @dataclass

@@ -8,11 +8,11 @@ import numpy as np
 
 from framework.data import Float64, Frame, PointClusters, Pose
 from framework.mapping.association import list_points_by_pixel
-from framework.mapping.class_evidence import mask_classes
 from framework.mapping.integration import Integrator
-from framework.mapping.semantic_map import SemanticMap
 from framework.mapping.tsdf_fuser import VoxelHashingFuser, require_same_classes
 from framework.parameters import check_bounds
+from framework.rivals.class_evidence import mask_classes
+from framework.rivals.semantic_map import SemanticMap
 
 
 @dataclass

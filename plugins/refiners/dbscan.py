@@ -6,17 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Frame, Int32, PointClusters
+from framework.data import Bool, Float32, Frame, Int32, Int64, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.neighborhood import grouped
 from framework.refinement.selection import keep_points
 from framework.refinement.union_find import root
-
-Int64 = npt.NDArray[np.int64]
 
 REACH = 2  # cells on each side that eps spans, with cells whose diagonal is eps
 NEAR, FAR, UNCLEAR = 0, 1, 2  # what a cell tells about the distance of its points to a piece

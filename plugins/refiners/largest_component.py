@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Frame, Int32, PointClusters
+from framework.data import Bool, Float32, Frame, Int32, Int64, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
-from framework.refinement.neighborhood import Int64, bounding_box, members, thread_shares
+from framework.refinement.neighborhood import bounding_box, members, thread_shares
 from framework.refinement.selection import keep_points
 from framework.refinement.union_find import root, unite
 

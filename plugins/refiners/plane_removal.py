@@ -7,10 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Bool, Frame, Int32, PointClusters, UInt8
+from framework.data import Bool, Frame, Int32, Int64, PointClusters, UInt8
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
-from framework.refinement.neighborhood import Int64
 from framework.refinement.planes import Planes, find_planes, plane_image
 from framework.refinement.selection import PART, keep_points
 

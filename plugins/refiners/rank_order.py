@@ -5,17 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Frame, Int32, PointClusters, UInt8
+from framework.data import Bool, Float32, Float64, Frame, Int32, Int64, PointClusters, UInt8
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.neighborhood import grouped
 from framework.refinement.selection import keep_points
 from framework.refinement.union_find import root
-
-Int64 = npt.NDArray[np.int64]
 
 ABSENT = 255  # rank of a point that is not among the nearest
 

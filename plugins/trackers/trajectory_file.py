@@ -10,10 +10,10 @@ import numpy as np
 
 from framework.data import Float64, Frame, Pose
 from framework.errors import DataError
+from framework.files.tum_trajectory import read_tum
 from framework.geometry import inverse
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds
-from framework.trajectory_file import read_tum
 
 
 class World(Enum):

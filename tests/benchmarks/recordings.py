@@ -8,8 +8,8 @@ from pathlib import Path
 
 from framework.data import Detections, Frame
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.datasets.synthetic import Synthetic
 from framework.interfaces import Detector
+from framework.synthetic.sequence import Synthetic
 from plugins.detectors.maskrcnn2go import MaskRCNN2Go
 from plugins.detectors.simulated import SimulatedDetector
 

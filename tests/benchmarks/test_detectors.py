@@ -22,12 +22,12 @@ import torch
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from framework.data import Frame
-from framework.datasets.synthetic import Synthetic
-from framework.detection.mask_rcnn import Architecture, MaskRCNN
-from framework.detection.network_file import save_network
-from framework.detection.resnet import ResNetShape
+from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
+from framework.detection.mask_rcnn.network_file import save_network
+from framework.detection.mask_rcnn.resnet import ResNetShape
 from framework.errors import ConfigError, DataError
 from framework.label_spaces import COCO
+from framework.synthetic.sequence import Synthetic
 from tests import registered
 from tests.benchmarks.comparison import Table
 

@@ -15,9 +15,9 @@ import pytest
 
 from framework.data import Detections, Float64, Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.datasets.synthetic import Synthetic
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
+from framework.synthetic.sequence import Synthetic
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp

@@ -39,8 +39,11 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
     ("override", "said"),
     [
         ("detector=fakke", ["there is no detector=fakke; did you mean fake?", "The options are:"]),
-        ("dataset.frames=many", ["ERROR", "dataset tests.corner_room.CornerRoom", "frames", "'many'", "Integer"]),
-        ("refiner._target_=tests.corner_room.GivenPose", ["ERROR", "refiner", "ClusterRefiner"]),
+        (
+            "dataset.frames=many",
+            ["ERROR", "CornerRoom", "frames", "'many'", "Integer"],
+        ),
+        ("refiner._target_=tests.scenes.corner_room.GivenPose", ["ERROR", "refiner", "ClusterRefiner"]),
         ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
         ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
         ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),

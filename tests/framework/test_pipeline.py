@@ -16,7 +16,7 @@ from framework.data import Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.journal import RunResult
 from framework.pipeline import Pipeline, map_ahead
-from tests.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
+from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
 
 AHEAD = pytest.mark.parametrize("ahead", [0, 1, 3])
 

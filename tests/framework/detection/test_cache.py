@@ -15,19 +15,19 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from framework.command_line import CONF
+from framework.commands.run import run
 from framework.data import Detections, Frame, FrameTruth
 from framework.datasets.labeled_mesh import LabeledMesh
 from framework.detection import cache
 from framework.detection.cache import CachedDetector, CacheMode, cache_metrics, frame_hash, pack, unpack, with_cache
 from framework.errors import ConfigError, DataError, FrameError
+from framework.files.search_paths import CONF
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
-from framework.rasterizer import Rasterizer
-from framework.run import run
+from framework.rendering.rasterizer import Rasterizer
 from plugins.detectors.simulated import SimulatedDetector
 from tests import detector_files, registered
-from tests.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector
+from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 FIELDS = ("masks", "boxes", "scores", "class_probabilities")
@@ -292,7 +292,7 @@ FILL = """
 import sys, time
 from pathlib import Path
 from framework.detection.cache import CachedDetector
-from tests.corner_room import CornerRoom, SphereDetector
+from tests.scenes.corner_room import CornerRoom, SphereDetector
 
 folder = Path(sys.argv[1])
 (folder / sys.argv[2]).touch()
@@ -364,7 +364,7 @@ def test_a_run_with_the_cache_is_the_same_run(tmp_path: Path, monkeypatch: pytes
     asked: list[int] = []
     detect = SphereDetector.detect
     monkeypatch.setattr(SphereDetector, "detect", lambda self, frame: asked.append(frame.index) or detect(self, frame))
-    monkeypatch.setattr("framework.reports.run_record.write_overview", lambda path, *_: path.write_bytes(b""))
+    monkeypatch.setattr("framework.records.run_record.write_overview", lambda path, *_: path.write_bytes(b""))
     counted, records = [], []
     for k, mode in enumerate(("off", "read_write", "read_write", "read_only")):
         asked.clear()

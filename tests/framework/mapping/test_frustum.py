@@ -5,7 +5,7 @@ import numpy as np
 from framework.data import Camera
 from framework.geometry import inverse, project, transform
 from framework.mapping.frustum import boxes_in_view
-from tests.analytic_scene import pose
+from tests.scenes.analytic_scene import pose
 
 CAMERA = Camera(40, 30, 35.0, 33.0, 18.0, 15.5)
 NEAR = 0.2

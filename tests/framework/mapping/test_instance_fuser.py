@@ -14,7 +14,7 @@ from framework.mapping.association import OverlapRule
 from framework.mapping.instance_fuser import InstanceFuser, floored_log
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
-from tests.analytic_scene import CAMERA, Scene, room, walk
+from tests.scenes.analytic_scene import CAMERA, Scene, room, walk
 from tests.true_masks import fuse_masks, masks_of
 
 NewFuser = Callable[..., InstanceFuser]

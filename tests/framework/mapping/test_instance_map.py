@@ -15,7 +15,7 @@ from framework.mapping.instance_list import oriented_box
 from framework.mapping.instance_map import FORMAT, InstanceMap
 from framework.mapping.integration import Integrator
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.analytic_scene import Scene, room, walk
+from tests.scenes.analytic_scene import Scene, room, walk
 
 CLASSES = ("chair", "bed")
 

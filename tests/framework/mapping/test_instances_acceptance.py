@@ -5,8 +5,8 @@ import numpy as np
 from framework.data import Detections, Frame, Pose
 from framework.geometry import lift
 from framework.interfaces import MapFuser
-from tests.box_scene import BoxScene, bled, chair, detected, look_from, table
 from tests.registered import built
+from tests.scenes.box_scene import BoxScene, bled, chair, detected, look_from, table
 
 VOXEL = 0.02  # m
 CHAIR, TABLE, COUCH = 0, 1, 2

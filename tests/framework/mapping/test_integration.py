@@ -8,7 +8,7 @@ from framework.geometry import inverse
 from framework.mapping.integration import GOLDEN, LEAST_BEHIND, Integrator
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
-from tests.analytic_scene import CAMERA, pose, room, walk
+from tests.scenes.analytic_scene import CAMERA, pose, room, walk
 from tests.thread_counts import by_one_thread_and_two
 
 SENSOR = Sensor(*map(np.float32, (0.08, 0.01, 0.2, 4.0, 100.0, 1.5)))

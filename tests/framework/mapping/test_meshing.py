@@ -9,15 +9,15 @@ import pytest
 from scipy.spatial import KDTree
 
 from framework.data import Detections, Frame, InstanceMesh, Pose
-from framework.datasets.synthetic import Synthetic
 from framework.geometry import lift
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.meshing import MAX_JUMP, Surface, SurfaceNets
 from framework.mapping.voxel_grid import UNSEEN, VoxelGrid
 from framework.synthetic.room import RoomKind
+from framework.synthetic.sequence import Synthetic
 from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.analytic_scene import room, walk
+from tests.scenes.analytic_scene import room, walk
 
 VOXEL = 0.05  # m
 BAND = 0.5  # m

@@ -10,7 +10,7 @@ from framework.mapping.raycasting import TILE, cast_coarse, cast_view, render, r
 from framework.mapping.sensor import Sensor, depth_noise, pinhole
 from framework.mapping.voxel_grid import VoxelGrid
 from framework.mapping.voxel_walk import inverses, leave_cell
-from tests.analytic_scene import Scene, pose, room, walk
+from tests.scenes.analytic_scene import Scene, pose, room, walk
 
 VOXEL = 0.02
 SENSOR = Sensor(*map(np.float32, (4 * VOXEL, 0.0, 0.2, 4.0, 100.0, 10.0)))

@@ -13,7 +13,7 @@ from framework.mapping.meshing import Surface
 from framework.mapping.vertex_labels import REACH, vertex_labels
 from framework.mapping.voxel_grid import UNSEEN, find_block
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.analytic_scene import CAMERA, room, walk
+from tests.scenes.analytic_scene import CAMERA, room, walk
 
 
 @pytest.fixture(scope="module")

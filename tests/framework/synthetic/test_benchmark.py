@@ -9,8 +9,8 @@ import pytest
 
 from framework.label_spaces import SCENENN_TO_COCO
 from framework.synthetic.benchmark import SCENES, SceneSpec, furnish_scene, plan_scene
-from framework.synthetic.cluttered_groups import chair_row, cluttered_bed_group, cluttered_couch, desk_row
-from framework.synthetic.groups import toilet_group
+from framework.synthetic.furniture.cluttered_groups import chair_row, cluttered_bed_group, cluttered_couch, desk_row
+from framework.synthetic.furniture.groups import toilet_group
 
 SEEDS = range(3)
 PAPER = ["011", "016", "030", "061", "078", "086", "096", "206", "223", "255"]

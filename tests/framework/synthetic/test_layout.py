@@ -5,8 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from framework.synthetic.furniture import LABELED
 from framework.synthetic.room import RoomKind, furnish
+from tests.scenes.labeled_furniture import LABELED
 
 
 @pytest.mark.parametrize(("kind", "seed"), [(RoomKind.STUDIO, 0), (RoomKind.STUDIO, 1), *((k, 2) for k in RoomKind)])

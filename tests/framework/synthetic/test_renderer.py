@@ -3,16 +3,16 @@
 import numpy as np
 
 from framework.data import Camera
-from framework.rasterizer import NO_TRIANGLE
-from framework.synthetic.camera_path import look
+from framework.rendering.rasterizer import NO_TRIANGLE
+from framework.synthetic.furniture.piece import Furniture
+from framework.synthetic.furniture.solids import panel, rounded_box
 from framework.synthetic.lights import globe
-from framework.synthetic.piece import Furniture
 from framework.synthetic.ray_caster import image_rays, pixel_rays
 from framework.synthetic.renderer import Renderer, ids_met, to_srgb
 from framework.synthetic.shading import EDGE_SAMPLES, EDGE_STEP, WHITE
-from framework.synthetic.solids import panel, rounded_box
 from framework.synthetic.surfaces import assemble
 from framework.synthetic.textures import Material, Texture, surface_color
+from framework.synthetic.walk import look
 
 CAMERA = Camera(64, 48, 50.0, 55.0, 30.7, 22.9)
 GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))

@@ -11,7 +11,7 @@ import pytest
 
 from framework.errors import ConfigError, DataError
 from framework.synthetic.benchmark import SceneSpec
-from framework.synthetic.groups import toilet_group
+from framework.synthetic.furniture.groups import toilet_group
 from framework.synthetic.scene_writers import FRAMES_AT_ONCE, _choose, _Scene, write_scenes
 from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 

@@ -6,17 +6,17 @@ import numpy as np
 import pytest
 
 from framework.data import check_rigid
-from framework.datasets.image_files import read_color, read_uint16
+from framework.datasets.scenenn.scenenn_annotation import read_annotation
+from framework.datasets.scenenn.trajectory_log import read_trajectory_log
 from framework.errors import ConfigError
+from framework.files.image_files import read_color, read_uint16
+from framework.files.ply import PlyMesh, read_ply
 from framework.geometry import inverse
 from framework.label_spaces import SCENENN_TO_COCO, SPACES
-from framework.ply import PlyMesh, read_ply
-from framework.rasterizer import NO_TRIANGLE
-from framework.scenenn.annotation import read_annotation
-from framework.scenenn.trajectory_log import read_trajectory_log
+from framework.rendering.rasterizer import NO_TRIANGLE
 from framework.synthetic.benchmark import SceneSpec
-from framework.synthetic.cluttered_groups import chair_row
-from framework.synthetic.groups import toilet_group
+from framework.synthetic.furniture.cluttered_groups import chair_row
+from framework.synthetic.furniture.groups import toilet_group
 from framework.synthetic.ray_caster import RayCaster, image_rays
 from framework.synthetic.scenenn_scene import (
     _NYU_CLASSES,

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from framework.detection.mask_rcnn import Architecture, MaskRCNN
-from framework.detection.resnet import ResNetShape
+from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
+from framework.detection.mask_rcnn.resnet import ResNetShape
 from framework.errors import ConfigError, DataError
 from framework.training.losses import Budget
 from framework.training.room_pictures import RoomPictures

@@ -1,4 +1,4 @@
-"""`python -m framework.train_detector` from its config to a network that the detector loads."""
+"""`python -m framework train-detector` from its config to a network that the detector loads."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from framework.command_line import CONF
-from framework.detection.network_file import describe_network
+from framework.detection.mask_rcnn.network_file import describe_network
 from framework.errors import ConfigError
-from framework.training.run import HELD_OUT, NETWORK, PRECISION, architecture, train
+from framework.files.search_paths import CONF
+from framework.training.train import HELD_OUT, NETWORK, PRECISION, architecture, train
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY
 from tests.tiny_rooms import PICTURES, write_room
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from framework.data import Camera, Frame
-from framework.detection import mask_rcnn as steps
+from framework.detection.mask_rcnn import network as steps
+from framework.detection.mask_rcnn.network_file import save_network
 from framework.detection.masks import mask_overlaps, tight_boxes
-from framework.detection.network_file import save_network
 from framework.errors import ConfigError, DataError
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
 from tests.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file

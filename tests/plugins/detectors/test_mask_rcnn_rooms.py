@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame
-from framework.detection.network_file import describe_network
+from framework.detection.mask_rcnn.network_file import describe_network
 from framework.evaluation.mask_ap import mask_ap
 from framework.label_spaces import SCENENN_TO_COCO
 from framework.training.augmentation import SMALLEST

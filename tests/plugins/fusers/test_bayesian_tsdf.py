@@ -8,7 +8,7 @@ import pytest
 from framework.data import Frame
 from framework.errors import ConfigError, MapFullError
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.analytic_scene import room, walk
+from tests.scenes.analytic_scene import room, walk
 from tests.thread_counts import by_one_thread_and_two
 from tests.true_masks import fuse_masks, masks_of
 

@@ -13,7 +13,7 @@ from plugins.fusers.label_count import LabelCount
 from plugins.fusers.last_write import LastWrite
 from plugins.fusers.max_confidence import MaxConfidence
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
-from tests.analytic_scene import CAMERA, room, walk
+from tests.scenes.analytic_scene import CAMERA, room, walk
 
 SEEN = [(0.5, [0.6, 0.3, 0.1]), (0.9, [0.2, 0.1, 0.7]), (0.4, [0.6, 0.4, 0.0])]
 """Score and distribution over three classes, frame by frame."""

@@ -12,12 +12,12 @@ from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import lift
 from framework.mapping.integration import Integrator
-from framework.mapping.semantic_map import SemanticMap
+from framework.rivals.semantic_map import SemanticMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.semantic_components import SemanticComponents
-from tests import box_scene
-from tests.analytic_scene import CAMERA, room, walk
-from tests.box_scene import BoxScene, look_from
+from tests.scenes import box_scene
+from tests.scenes.analytic_scene import CAMERA, room, walk
+from tests.scenes.box_scene import BoxScene, look_from
 from tests.thread_counts import by_one_thread_and_two
 from tests.true_masks import CLASSES, PROBABILITIES, fuse_masks, masks_of
 

@@ -13,8 +13,8 @@ from framework.geometry import exp_se3, inverse, rotation_angle
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.open3d_odometry import Method, Open3dOdometry, Reference
 from tests import registered
-from tests.analytic_scene import NOTHING, walk
-from tests.papered_room import CAMERA, papered_frame
+from tests.scenes.analytic_scene import NOTHING, walk
+from tests.scenes.papered_room import CAMERA, papered_frame
 
 LOOKING_INTO_A_CORNER = exp_se3(np.array([0, 0, 0, 0.5, 0.6, 0]))
 BEST = [

@@ -16,13 +16,13 @@ import pytest
 
 from framework.data import Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.datasets.synthetic import Synthetic
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
 from framework.interfaces import SceneMap
+from framework.synthetic.sequence import Synthetic
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.analytic_scene import CAMERA, NOTHING, Scene, pose
+from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, pose
 
 VOXEL = 0.02  # m, of the small images here
 WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as lost, is a lie

@@ -11,7 +11,7 @@ from framework.geometry import inverse, rotation_angle
 from framework.interfaces import SceneMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.analytic_scene import CAMERA, NOTHING, Scene, room, walk
+from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:

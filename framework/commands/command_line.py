@@ -1,0 +1,181 @@
+"""How the commands answer faults: one line on stderr and an exit status; the traceback only where it is asked for."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import wraps
+from pathlib import Path
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from framework.errors import InstanceMapError
+
+log = logging.getLogger(__name__)
+
+KNOWN_ERRORS = (InstanceMapError, HydraException, OmegaConfBaseException, OSError)
+EXIT_FAILED = 1
+EXIT_INTERRUPTED = 130  # what shells report after Ctrl-C
+
+
+def directory_name(overrides: str) -> str:
+    """Overrides as the name of one directory: no separators, and short enough for every file system."""
+    name = overrides.replace(os.sep, "_") or "defaults"
+    if len(name) <= 200:
+        return name
+    import hashlib
+
+    return f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
+
+
+OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
+
+
+@contextmanager
+def one_line_errors() -> Iterator[None]:
+    """Ends the process with one line on stderr and a status when a known error, or Ctrl-C, comes out of the body."""
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors in place of printing them
+    try:
+        yield
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        sys.exit(EXIT_INTERRUPTED)
+    except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
+        if "debug=true" in sys.argv:
+            traceback.print_exception(error)
+        print(f"error: {one_line(error)}", file=sys.stderr)
+        sys.exit(EXIT_FAILED)
+
+
+def quiet_when_cut_off() -> None:
+    """Lets `| head` end this process without a word."""
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+
+
+def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """What the command line asks for; `debug=true`, which all commands understand, is not for the parser."""
+    return parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
+
+
+def print_for_directories(description: str, place: str, write: Callable[[Path], str]) -> None:
+    """A command whose arguments are DIR...: prints what `write` returns for each directory, which is a `place`.
+
+    One that is refused does not stop the others.
+    """
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("directory", metavar="DIR", nargs="+", type=Path, help=place)
+    asked = arguments(parser)
+    refused = 0
+    with one_line_errors():
+        for directory in asked.directory:
+            try:
+                print(write(directory))
+            except KNOWN_ERRORS as error:
+                print(f"error: {one_line(error)}", file=sys.stderr)
+                refused += 1
+    if refused:
+        sys.exit(EXIT_FAILED)
+
+
+@dataclass
+class Jobs:
+    """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and counts the failed."""
+
+    failed: int = 0
+
+    def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
+        """`job`, with its faults in the log: one line for a known error, the traceback for others and with `debug`."""
+
+        @wraps(job)
+        def reported_job(config: DictConfig) -> None:
+            try:
+                job(config)
+            except Exception as error:
+                known = isinstance(error, KNOWN_ERRORS)
+                _log_error(one_line(error), error if config.get("debug") or not known else None)
+                if _in_worker():  # Hydra carries the error, if it can be pickled, to where the sweep was started
+                    raise InstanceMapError(f"a run failed: {one_line(error)}") from None
+                self.failed += 1
+
+        return reported_job
+
+    def run(self, command: Callable[[], None]) -> None:
+        """Runs Hydra's command for a reported job, and ends the process with a status when one has failed."""
+        with one_line_errors():
+            command()
+        if self.failed:
+            sys.exit(EXIT_FAILED)
+
+
+def _in_worker() -> bool:
+    """Whether a job runs in another process than the sweep: in one of a launcher that is not Hydra's own."""
+    own = HydraConfig.get()
+    of_sweep = not OmegaConf.is_missing(own.job, "num")
+    return of_sweep and not str(own.launcher._target_).endswith(".BasicLauncher")
+
+
+def one_line(error: BaseException) -> str:
+    """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _no_such_option(error)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
+        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return _joined(f"{error} {error.__cause__}")
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return _joined(str(error)) or type(error).__name__
+
+
+_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
+"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
+
+
+def _no_such_option(error: MissingConfigException) -> str:
+    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if not group:
+        return _joined(str(error))
+    if group == "hydra/launcher" and name in _EXTRAS:
+        extra = _EXTRAS[name]
+        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
+    options = list(error.options or ())
+    close = get_close_matches(name, options, n=1)
+    suggestion = f"; did you mean {close[0]}?" if close else "."
+    return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
+
+
+def _known_keys(error: OmegaConfBaseException) -> str:
+    """The keys that there are in place of the one that is not."""
+    keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
+    close = get_close_matches(str(error.key), keys, n=1)
+    path = str(error.full_key or error.key)
+    if close:
+        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
+
+
+def _joined(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _log_error(message: str, error: BaseException | None) -> None:
+    """Through the log, which also keeps it beside the job's other files; to stderr where there is no log."""
+    if logging.getLogger().handlers and not log.disabled:
+        log.error("%s", message, exc_info=error)
+        return
+    if error is not None:
+        traceback.print_exception(error)
+    print(f"error: {message}", file=sys.stderr)

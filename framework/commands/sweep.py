@@ -1,0 +1,91 @@
+"""What surrounds the jobs of a sweep, whoever runs them: its place is its own while it lasts, and its table is made."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import textwrap
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from hydra.experimental.callback import Callback
+from omegaconf import DictConfig, OmegaConf
+
+from framework.commands.command_line import one_line
+from framework.errors import InstanceMapError
+from framework.files.directory_lock import locked
+from framework.settings import available_cores
+
+ending = ExitStack()
+"""What this process still has to do when the sweep that it began has ended, in whatever way."""
+
+
+def cores_of(threads: int) -> int:
+    """How many cores a job of so many threads (0 = all) takes of this machine."""
+    return threads or available_cores()
+
+
+def jobs_at_once(threads: int) -> int:
+    """How many such jobs the cores of this machine take."""
+    return max(1, available_cores() // cores_of(threads))
+
+
+OmegaConf.register_new_resolver("cores_of", cores_of, replace=True)
+OmegaConf.register_new_resolver("jobs_at_once", jobs_at_once, replace=True)
+
+
+class SweepCallback(Callback):
+    """How Hydra says that a sweep begins, and where. It calls this in the process that was started, not in workers."""
+
+    def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
+        with_figure = config.get("figure") is not None
+        try:
+            ending.enter_context(sweep_in(Path(config.hydra.sweep.dir), "table" in config, with_figure))
+        except (InstanceMapError, OSError) as error:  # Hydra would make a warning of it, and go on
+            sys.exit(f"error: {one_line(error)}")
+
+
+@contextmanager
+def sweep_in(directory: Path, with_table: bool, with_figure: bool) -> Iterator[None]:
+    """Has `directory` to itself while the body runs, and prints the table of the runs in it however the body ends.
+
+    The picture of the runs is drawn, too, but for Ctrl-C, which shall end at once. Raises InstanceMapError, in place of
+    what the launchers raise when a worker is killed.
+    """
+    # `kill` ends a sweep like Ctrl-C: no worker is left behind
+    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
+    # joblib ends its workers without their help, and Python's own clean-up warns of that
+    os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
+    with locked(directory):
+        try:
+            yield
+        except BaseException as error:
+            with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
+                _report(directory, with_table, with_figure and isinstance(error, Exception))
+            if _is_of_a_launcher(error):
+                reason = textwrap.shorten(one_line(error), 300)
+                raise InstanceMapError(
+                    f"the sweep ended early, and the same command goes on with it: {reason}"
+                ) from error
+            raise
+        _report(directory, with_table, with_figure)
+
+
+def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
+    """Makes of the runs in `directory` what is asked for, here and not where workers import this module."""
+    if with_table:
+        from framework.tables.experiment_tables import write_tables
+
+        print(write_tables(directory))
+    if with_figure:
+        from framework.figures.experiment_figure import write_figure
+
+        print(*write_figure(directory), sep="\n")
+
+
+def _is_of_a_launcher(error: BaseException) -> bool:
+    """Whether not a job but what runs the jobs has failed: joblib and submitit raise RuntimeErrors, Ray its own."""
+    return isinstance(error, RuntimeError) or type(error).__module__.partition(".")[0] == "ray"

@@ -1,0 +1,1 @@
+"""ScanNet's files."""

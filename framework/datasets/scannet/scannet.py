@@ -1,0 +1,194 @@
+"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and a depth sensor on it, with labelled meshes.
+
+    scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or as ScanNet's SensReader exports it:
+    scene0000_00/color/0.jpg            8-bit colour, from 0
+    scene0000_00/depth/0.png            uint16, mm along z
+    scene0000_00/pose/0.txt             T_world_camera, four lines of four numbers, m
+    scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
+    scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
+                                        optional: the mesh, its segments, and the objects made of these
+    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or the one above: which class is meant by
+                                        what the annotators wrote; without it fewer objects are evaluated
+
+Colour (1296x968) is moved into the depth camera (640x480), which is that of the frames.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Array, Camera
+from framework.datasets.color_registration import ColorRegistration, RegisteredImages
+from framework.datasets.labeled_mesh import LabeledMesh
+from framework.datasets.labeled_recording import LabeledRecording, mesh_of
+from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
+from framework.datasets.scannet.scannet_annotation import LABEL_TABLE, read_label_table, read_labeled_mesh
+from framework.datasets.scannet.sens_file import SensFile, open_sens
+from framework.errors import DataError, FrameError
+from framework.files.image_files import read_color, read_uint16
+from framework.files.matrix_file import PrintedMatrix, read_matrix
+from framework.geometry import inverse, rotation_angle
+
+MESH, SEGMENTS, OBJECTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"
+DEPTH_SCALE = 1000.0  # units a metre, of exported depth
+MICROSECONDS = 1e6  # a second
+COLOR_SIZE = (1296, 968)  # px; exported colour may be smaller, its intrinsics are still those of this size
+NEAR = 2.0  # m, where what is left of the parallax is told
+SAME_WITHIN = 0.5  # px, of the depth camera: a shift of colour that is not worth a word
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class ScanNet(LabeledRecording):
+    """A scan of ScanNet v2, from its `.sens` file where there is one, otherwise from exported images.
+
+    Extrinsics between the two cameras are not applied: its authors say that depth is registered to colour already, and
+    publish identities; a warning tells by how many pixels colour is shifted where a recording has others. Truth is the
+    labelled mesh, all of it, whatever frames are chosen.
+    """
+
+    def open(self) -> Contents:
+        tables = [parent / LABEL_TABLE for parent in self.folder.resolve().parents[:2]]
+        self._label_table = next((table for table in tables if table.exists()), None)
+        files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
+        self.mesh = mesh_of(files, self._read_mesh)
+        if self.mesh is None and self.frame_truth:
+            raise DataError(
+                f"dataset.frame_truth needs a labelled mesh: {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
+            )
+        if self.mesh and self._label_table is None:
+            log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[0])
+        self.annotation = f"ScanNet v2{'' if self._label_table else ', no label table'}" if self.mesh else ""
+        sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
+        if len(sens) > 1:
+            raise DataError(f"{self.folder} holds {len(sens)} .sens files, {sens[0].name} and others; leave one")
+        if sens and exported.is_dir():
+            log.info("%s is read, not the images exported to %s: it has times as well", sens[0], exported.parent)
+        if sens:
+            return _sens_contents(sens[0])
+        if exported.is_dir():
+            return _exported_contents(self.folder)
+        raise DataError(f"{self.folder} holds neither {self.name}.sens nor color/; dataset.scene is like scene0000_00")
+
+    def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
+        nyu40 = read_label_table(self._label_table) if self._label_table else {}
+        return read_labeled_mesh(mesh, segments, objects, nyu40)
+
+
+def _sens_contents(path: Path) -> Contents:
+    file = open_sens(path)
+    header = file.header
+    for camera, name in ((header.color_camera, "colour"), (header.depth_camera, "depth")):
+        if not _fits(camera):
+            raise DataError(f"{path}: {name} intrinsics do not belong to images of {camera.width}x{camera.height} px")
+    _warn_of_parallax(path, header.color_extrinsics, header.depth_extrinsics, header.depth_camera)
+    registration = _registration(path, header.color_camera, header.depth_camera)
+    frames = [
+        RecordedFrame.posed(
+            RegisteredImages(frame, registration), frame.depth_time / MICROSECONDS, frame.camera_to_world.pose
+        )
+        for frame in file.frames
+    ]
+    return Contents(header.depth_camera, path, header.depth_scale, [*frames, *_lost_frames(path, file, frames)])
+
+
+def _lost_frames(path: Path, file: SensFile, frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
+    """The frames that the file should hold as well."""
+    lost = range(len(frames), file.header.frames)
+    if lost:
+        log.warning("%s lacks the last %d of %d frames: %s", path, len(lost), file.header.frames, file.cut)
+    return [RecordedFrame(frames[-1].images, k / FRAME_RATE, fault=f"{path}, {file.cut}") for k in lost]
+
+
+def _exported_contents(folder: Path) -> Contents:
+    colors = numbered_images(folder / "color", (".jpg", ".jpeg", ".png"))
+    depths = numbered_images(folder / "depth", (".png",))
+    intrinsic = folder / "intrinsic"
+    depth_camera = _camera(intrinsic / "intrinsic_depth.txt", *_first_size(depths.values(), read_uint16))
+    color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *_first_size(colors.values(), read_color))
+    extrinsics = [intrinsic / f"extrinsic_{name}.txt" for name in ("color", "depth")]
+    if all(path.exists() for path in extrinsics):
+        _warn_of_parallax(intrinsic, read_matrix(extrinsics[0]), read_matrix(extrinsics[1]), depth_camera)
+    registration = _registration(intrinsic, color_camera, depth_camera)
+    # a frame of which one image is missing is there: reading it says which
+    frames = []
+    for k in sorted(colors.keys() | depths.keys()):
+        files = ImageFiles(
+            colors.get(k, folder / "color" / f"{k}.jpg"),
+            depths.get(k, folder / "depth" / f"{k}.png"),
+        )
+        pose = folder / "pose" / f"{files.depth_name.stem}.txt"
+        frames.append(_exported_frame(RegisteredImages(files, registration), pose, k))
+    return Contents(depth_camera, intrinsic / "intrinsic_depth.txt", DEPTH_SCALE, frames)
+
+
+def _exported_frame(images: RegisteredImages, pose: Path, k: int) -> RecordedFrame:
+    if not pose.parent.is_dir():
+        return RecordedFrame(images, k / FRAME_RATE)
+    return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(pose).pose())
+
+
+def _first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
+    """(width, height) px of the first image that can be read."""
+    faults = []
+    for path in paths:
+        try:
+            height, width = read(path).shape[:2]
+        except FrameError as error:
+            faults.append(str(error))
+            continue
+        return width, height
+    raise DataError(f"no image can be read: {faults[0]}")
+
+
+def _camera(path: Path, width: int, height: int) -> Camera:
+    camera = read_matrix(path).camera(width, height)
+    if not _fits(camera):
+        raise DataError(f"{path} does not belong to images of {width}x{height} px")
+    return camera
+
+
+def _color_camera(path: Path, width: int, height: int) -> Camera:
+    """The camera of exported colour, which the SensReader may have made smaller without touching the intrinsics."""
+    camera = read_matrix(path).camera(*COLOR_SIZE)
+    if _fits(read_matrix(path).camera(width, height)) or not _fits(camera):
+        return _camera(path, width, height)
+    u, v = width / camera.width, height / camera.height
+    # pixel centres are at integers
+    return Camera(width, height, u * camera.fx, v * camera.fy, u * (camera.cx + 0.5) - 0.5, v * (camera.cy + 0.5) - 0.5)
+
+
+def _registration(source: Path, color: Camera, depth: Camera) -> ColorRegistration:
+    try:
+        return ColorRegistration(color, depth)
+    except DataError as error:
+        raise DataError(f"{source}: {error}") from error
+
+
+def _fits(camera: Camera) -> bool:
+    """Whether the intrinsics can be those of images of this size: no camera looks so far past their middle."""
+    u, v = camera.cx / camera.width, camera.cy / camera.height
+    return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
+
+
+def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
+    """Says by how much colour is shifted where the two cameras do not have the same extrinsics."""
+    try:
+        T_color_depth = inverse(color.pose()) @ depth.pose()
+    except DataError:
+        log.warning("%s: the extrinsics are no rigid motion; the two cameras are taken to be at one place", source)
+        return
+    baseline, angle = float(np.linalg.norm(T_color_depth[:3, 3])), rotation_angle(T_color_depth[:3, :3])
+    shift = camera.fx * (baseline / NEAR + angle)
+    if shift > SAME_WITHIN:
+        log.warning(
+            "%s: colour and depth camera are %.0f mm and %.2f degrees apart, which is not applied: colour is shifted by"
+            " up to %.0f px %.0f m away",
+            *(source, 1000 * baseline, np.degrees(angle), shift, NEAR),
+        )

@@ -1,0 +1,1 @@
+"""SceneNN's files: one module a format, tolerant in reading and strict in writing."""

@@ -1,0 +1,138 @@
+"""SceneNN's trajectory.log: of each frame a header of three integers and the four rows of T_world_camera, metres."""
+
+from __future__ import annotations
+
+from codecs import BOM_UTF8
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Float64, check_rigid
+from framework.errors import DataError
+from framework.files.atomic_files import written_whole
+from framework.files.number_lines import number
+from framework.files.whole_files import MOST_TEXT, read_bytes
+from framework.geometry import nearest_rigid
+
+LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
+BLOCK = 5  # lines of a frame
+HEADER = "frame frame frame+1"
+LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as the published files have it
+CUT_OFF = "the file ends before the pose does"
+
+
+@dataclass(frozen=True)
+class TrajectoryLog:
+    """What a file says of each frame; frames that it does not name are in neither mapping."""
+
+    poses: Mapping[int, Float64]  # frame from 0 -> T_world_camera (4, 4), exactly rigid
+    unusable: Mapping[int, str]  # frame from 0 -> why: not rigid (tracking was lost), not finite, cut off, two
+
+
+@dataclass(frozen=True)
+class _Line:
+    number: int  # in the file, from 1
+    words: list[str]
+
+    @property
+    def shown(self) -> str:
+        return repr(" ".join(self.words)[:60])
+
+
+def read_trajectory_log(path: Path) -> TrajectoryLog:
+    """The poses of a trajectory.log. A frame that the end of the file cuts off, or with two poses, is unusable.
+
+    Raises DataError, naming file and line, when a line elsewhere is not as it should be.
+    """
+    lines = _read_lines(path)
+    poses: dict[int, Float64] = {}
+    unusable: dict[int, str] = {}
+    given: dict[int, tuple[int, Float64]] = {}  # line and matrix of each frame
+    for first in range(0, len(lines), BLOCK):
+        header, *rows = lines[first : first + BLOCK]
+        at_end = first + BLOCK >= len(lines)
+        cut = at_end and not rows  # within the header or behind it
+        if cut and len(header.words) == 1 and _are_digits(header.words):
+            break  # the frame's number may be cut off itself
+        frame = _frame(path, header, least=2 if cut else 3)
+        matrix = _matrix(path, rows, at_end)
+        if frame in given:
+            before, first_matrix = given[frame]
+            if matrix is None or not np.array_equal(matrix, first_matrix, equal_nan=True):
+                poses.pop(frame, None)
+                unusable[frame] = f"it has two poses, in lines {before} and {header.number}"
+            continue
+        if matrix is None:
+            unusable[frame] = CUT_OFF
+            continue
+        given[frame] = header.number, matrix
+        try:
+            poses[frame] = nearest_rigid(matrix)
+        except DataError as error:
+            unusable[frame] = str(error)
+    return TrajectoryLog(poses, unusable)
+
+
+def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
+    """Writes T_world_camera (4, 4) of each frame, whole or not at all; `read_trajectory_log` gives the same back.
+
+    What is rigid within ROTATION_TOLERANCE but not as exactly as float64 can comes back as the nearest rigid transform.
+    Raises DataError when a frame's number is negative, its pose not rigid, or the disk does not take the file.
+    """
+    lines = []
+    for frame, T_world_camera in sorted(poses.items()):
+        if not 0 <= frame <= LARGEST_FRAME:
+            raise DataError(f"{path}: a frame's number is from 0 to {LARGEST_FRAME}, found {frame}")
+        check_rigid(f"{path}: the pose of frame {frame}", T_world_camera)
+        lines.append(f"{frame} {frame} {frame + 1}")
+        lines.extend(" ".join(repr(float(value)) for value in row) for row in T_world_camera[:3])
+        lines.append(LAST_ROW)
+    with written_whole(path) as temporary:
+        temporary.write_text("".join(line + "\n" for line in lines), encoding="ascii")
+
+
+def _read_lines(path: Path) -> list[_Line]:
+    """The lines that hold something."""
+    content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
+    lines = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
+    return [line for line in lines if line.words]
+
+
+def _frame(path: Path, header: _Line, least: int) -> int:
+    """The frame that a header of at least so many numbers names."""
+    if not least <= len(header.words) <= 3 or not _are_digits(header.words):
+        raise DataError(f"{path}, line {header.number}: expected the header of a frame, {HEADER}, found {header.shown}")
+    return int(header.words[0])
+
+
+def _matrix(path: Path, rows: list[_Line], at_end: bool) -> Float64 | None:
+    """The four rows (4, 4), finite or not; None when the end of the file cuts them off."""
+    matrix = np.empty((4, 4))
+    for k, line in enumerate(rows):
+        numbers = _numbers(line.words)
+        if len(numbers) == 4:
+            matrix[k] = numbers
+        elif at_end and k == len(rows) - 1 and len(line.words) <= 4:
+            return None
+        else:
+            raise DataError(
+                f"{path}, line {line.number}: expected row {k + 1} of a 4x4 matrix, four numbers, found {line.shown}"
+            )
+    return matrix if len(rows) == 4 else None
+
+
+def _numbers(words: list[str]) -> list[float]:
+    """The words as numbers; empty when one is none."""
+    try:
+        return [number(word) for word in words]
+    except ValueError:
+        return []
+
+
+def _are_digits(words: list[str]) -> bool:
+    """Whether these are numbers of a header."""
+    return all(
+        word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1 for word in words
+    )

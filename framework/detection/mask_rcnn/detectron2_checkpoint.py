@@ -1,0 +1,196 @@
+"""detectron2's Mask R-CNN with ResNet-FPN (github.com/facebookresearch/detectron2), as a MaskRCNN.
+
+Its conventions are not torchvision's: images are BGR, their standard deviation is 1; the first convolution of a
+bottleneck has the stride, as in MSRA's networks that it starts from; the background is the last class, and has neither
+deltas nor masks; RoIAlign is the aligned one with a sample for each cell; anchors are not rounded.
+"""
+
+from __future__ import annotations
+
+import pickle
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
+from framework.detection.mask_rcnn.network_file import filled
+from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
+from framework.errors import DataError
+from framework.label_spaces import COCO
+
+PIXEL_MEAN = (123.675, 116.28, 103.53)  # RGB
+PIXEL_STD = (1.0, 1.0, 1.0)
+NAMES = (  # detectron2's, ours
+    (r"backbone\.bottom_up\.stem\.conv1\.weight", r"backbone.body.conv1.weight"),
+    (r"backbone\.bottom_up\.stem\.conv1\.norm\.(\w+)", r"backbone.body.bn1.\1"),
+    (r"backbone\.bottom_up\.res(\d)\.(\d+)\.conv(\d)\.weight", r"backbone.body.layer\1.\2.conv\3.weight"),
+    (r"backbone\.bottom_up\.res(\d)\.(\d+)\.conv(\d)\.norm\.(\w+)", r"backbone.body.layer\1.\2.bn\3.\4"),
+    (r"backbone\.bottom_up\.res(\d)\.(\d+)\.shortcut\.weight", r"backbone.body.layer\1.\2.downsample.0.weight"),
+    (r"backbone\.bottom_up\.res(\d)\.(\d+)\.shortcut\.norm\.(\w+)", r"backbone.body.layer\1.\2.downsample.1.\3"),
+    (r"backbone\.fpn_lateral(\d)\.(\w+)", r"backbone.fpn.inner_blocks.\1.0.\2"),
+    (r"backbone\.fpn_output(\d)\.(\w+)", r"backbone.fpn.layer_blocks.\1.0.\2"),
+    (r"proposal_generator\.rpn_head\.conv\.(\w+)", r"rpn.head.conv.0.0.\1"),
+    (r"proposal_generator\.rpn_head\.objectness_logits\.(\w+)", r"rpn.head.cls_logits.\1"),
+    (r"proposal_generator\.rpn_head\.anchor_deltas\.(\w+)", r"rpn.head.bbox_pred.\1"),
+    (r"roi_heads\.box_head\.fc1\.(\w+)", r"roi_heads.box_head.fc6.\1"),
+    (r"roi_heads\.box_head\.fc2\.(\w+)", r"roi_heads.box_head.fc7.\1"),
+    (r"roi_heads\.box_predictor\.(cls_score|bbox_pred)\.(\w+)", r"roi_heads.box_predictor.\1.\2"),
+    (r"roi_heads\.mask_head\.mask_fcn(\d)\.(\w+)", r"roi_heads.mask_head.\1.0.\2"),
+    (r"roi_heads\.mask_head\.deconv\.(\w+)", r"roi_heads.mask_predictor.conv5_mask.\1"),
+    (r"roi_heads\.mask_head\.predictor\.(\w+)", r"roi_heads.mask_predictor.mask_fcn_logits.\1"),
+)
+COUNTED_FROM = {"layer": 1, "inner_blocks": 2, "layer_blocks": 2, "mask_head": 1}
+"""Where detectron2's first number is not ours: res2 is layer1, fpn_lateral2 inner block 0, mask_fcn1 layer 0."""
+
+NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_tracked)"
+
+
+def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None) -> MaskRCNN:
+    """The network of a state_dict; `where` it is from begins a DataError's line.
+
+    `classes`: their names; without it there must be COCO's 80.
+    """
+    _check_input(state, where)
+    tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}
+    found = len(_taken(tensors, "roi_heads.mask_predictor.mask_fcn_logits.bias", where))
+    if classes is None and found != len(COCO):
+        raise DataError(f"{where}: {found} classes are not COCO's {len(COCO)}: they must be given")
+    classes = classes or COCO
+    if len(classes) != found:
+        raise DataError(f"{where}: the network has {found} classes, {len(classes)} were given")
+    stem = "backbone.body.conv1.weight"
+    tensors[stem] = _taken(tensors, stem, where).flip(1)  # BGR to RGB
+    _put_background_first(tensors, where)
+    architecture = Architecture(
+        classes=classes,
+        backbone=ResNetShape(_depth(tensors, where), len(tensors[stem]), stride_in_1x1=True),
+        fpn_channels=len(_taken(tensors, "backbone.fpn.inner_blocks.0.0.bias", where)),
+        head_features=len(_taken(tensors, "roi_heads.box_head.fc6.bias", where)),
+        anchor_sides=_anchor_sides(state, where),
+        rounded_anchors=False,
+        sampling_ratio=0,
+        half_pixel=True,
+        pixel_mean=PIXEL_MEAN,
+        pixel_std=PIXEL_STD,
+    )
+    return filled(architecture, tensors, where)
+
+
+def is_detectron2(names: Mapping[str, Tensor]) -> bool:
+    """Whether these are the weights of one of detectron2's networks."""
+    return any(name.startswith("backbone.bottom_up.") for name in names)
+
+
+def read_pickle(path: Path) -> dict[str, Tensor]:
+    """The state_dict in one of detectron2's `model_final_*.pkl`, without running code that the file names.
+
+    Raises DataError when it is damaged, or holds more than arrays.
+    """
+    try:
+        with path.open("rb") as file:
+            content = ArraysOnly(file, encoding="latin1").load()
+    except Exception as error:  # a damaged pickle can raise almost anything
+        raise DataError(f"{path} is no pickle of numpy arrays: {' '.join(str(error).split())}") from error
+    state = content.get("model", content) if isinstance(content, dict) else None
+    if not isinstance(state, dict) or not all(isinstance(array, np.ndarray) for array in state.values()):
+        raise DataError(f"{path} must hold a dictionary of numpy arrays, as detectron2 writes it")
+    numeric = {name: array for name, array in state.items() if array.dtype.kind in "fiu"}
+    if len(numeric) < len(state):
+        raise DataError(f"{path}: {min(state.keys() - numeric.keys())} is no array of numbers")
+    return {str(name): torch.from_numpy(np.array(array)) for name, array in numeric.items()}
+
+
+class ArraysOnly(pickle.Unpickler):
+    """Reads what numpy arrays are pickled as, and refuses whatever else a pickle can call."""
+
+    def find_class(self, module: str, name: str) -> Any:
+        if (allowed := ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))) is None:
+            raise pickle.UnpicklingError(f"it wants to call {module}.{name}")
+        return allowed
+
+
+def _encoded(text: str, encoding: str) -> bytes:
+    """What Python 3 writes for bytes in the older protocols."""
+    if encoding != "latin1":
+        raise pickle.UnpicklingError(f"it wants to encode as {encoding}")
+    return text.encode("latin1")
+
+
+ALLOWED: dict[tuple[str, str], Any] = {
+    ("numpy.core.multiarray", "_reconstruct"): np.empty(0).__reduce_ex__(2)[0],
+    ("numpy.core.numeric", "_frombuffer"): np.empty(0).__reduce_ex__(5)[0],
+    ("numpy", "ndarray"): np.ndarray,
+    ("numpy", "dtype"): np.dtype,
+    ("collections", "OrderedDict"): dict,
+    ("_codecs", "encode"): _encoded,
+}
+
+
+def _renamed(name: str, where: str) -> str:
+    for theirs, ours in NAMES:
+        if re.fullmatch(theirs, name):
+            return re.sub(
+                r"(layer|inner_blocks\.|layer_blocks\.|mask_head\.)(\d)",
+                lambda match: f"{match[1]}{int(match[2]) - COUNTED_FROM[match[1].rstrip('.')]}",
+                re.sub(theirs, ours, name),
+                count=1,
+            )
+    raise DataError(f"{where} has the weights {name}, which are not of a Mask R-CNN with ResNet and feature pyramid")
+
+
+def _check_input(state: Mapping[str, Tensor], where: str) -> None:
+    """Older checkpoints say what the image is normalized with; other values mean another backbone, too."""
+    for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
+        if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
+            found = [round(value, 3) for value in state[name].flatten().tolist()]
+            raise DataError(
+                f"{where}: {name} is {found}; only networks that start from MSRA's, with {expected}, are read"
+            )
+
+
+def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
+    """From the anchors in older checkpoints, where they are; newer ones have none, and then they are detectron2's."""
+    sides = list(Architecture.anchor_sides)
+    for level in range(len(sides)):
+        if (anchors := state.get(f"proposal_generator.anchor_generator.cell_anchors.{level}")) is None:
+            continue
+        width, height = (anchors[:, 2:] - anchors[:, :2]).double().unbind(1)
+        sides[level] = round(float((width * height).sqrt().mean()), 3)
+        ratios = torch.tensor(Architecture.anchor_ratios, dtype=torch.float64)
+        if len(anchors) != len(ratios) or not torch.allclose(height / width, ratios, rtol=1e-3):
+            raise DataError(f"{where}: the anchors of level {level} are not three of the ratios 0.5, 1 and 2")
+    return tuple(sides)
+
+
+def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
+    """detectron2's columns: the classes, then the background, which has neither deltas nor masks. Ours: it is first.
+
+    The background's rows of deltas and masks are zeros, and never read.
+    """
+    for kind in ("weight", "bias"):
+        name = f"roi_heads.box_predictor.cls_score.{kind}"
+        tensors[name] = _taken(tensors, name, where).roll(1, dims=0)
+        for name, rows in (("box_predictor.bbox_pred", 4), ("mask_predictor.mask_fcn_logits", 1)):
+            predictor = _taken(tensors, f"roi_heads.{name}.{kind}", where)
+            nothing = predictor.new_zeros((rows, *predictor.shape[1:]))
+            tensors[f"roi_heads.{name}.{kind}"] = torch.cat([nothing, predictor])
+
+
+def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
+    """The name of the residual network, by the number of blocks of its third level."""
+    blocks = len({name.split(".")[3] for name in tensors if name.startswith("backbone.body.layer3.")})
+    for name in WITH_BOTTLENECKS:
+        if DEPTHS[name][2] == blocks:
+            return name
+    raise DataError(f"{where}: there is no residual network here with {blocks} blocks in res4")
+
+
+def _taken(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
+    if name not in tensors:
+        raise DataError(f"{where} lacks the weights {name}: it is no Mask R-CNN with a feature pyramid")
+    return tensors[name]

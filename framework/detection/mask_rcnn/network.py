@@ -1,0 +1,294 @@
+"""Mask R-CNN on a feature pyramid (He et al. 2017; Lin et al. 2017), in plain torch, with torchvision's names.
+
+    image ─► ResNet ─► feature pyramid ─► region proposals ─► boxes and class distributions ─► masks
+
+The network is described by an Architecture, which is stored with its weights; what a user may change between two
+runs (thresholds, the number of proposals) is given to `propose` and `detect`. Boxes are x1 y1 x2 y2 px of the network's
+input, by the newer convention (framework.detection.boxes, extent 0), and class 0 is the background.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from framework.data import Float32, Int32
+from framework.detection.boxes import anchor_grid, clip, decode
+from framework.detection.mask_rcnn.resnet import ResNet, ResNetShape
+from framework.detection.mask_rcnn.roi_align import roi_align
+from framework.detection.nms import suppress_boxes
+
+STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
+POOLED_LEVELS = 4  # P2 to P5; P6 only proposes
+BOX_BINS, MASK_BINS = 7, 14  # of RoIAlign, a side
+CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # px: a box of this side is pooled from P4 (Lin et al. 2017, eq. 1)
+DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # the box head's deltas are scaled by these
+PROPOSAL_NMS = 0.7  # IoU
+
+
+@dataclass(frozen=True)
+class Architecture:
+    """What must be known of a network to run its weights."""
+
+    classes: tuple[str, ...]  # without the background, in the order of the network's columns after it
+    backbone: ResNetShape = field(default_factory=ResNetShape)
+    fpn_channels: int = 256
+    head_features: int = 1024  # of the box head
+    anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, a level
+    anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height over width
+    rounded_anchors: bool = True  # torchvision rounds them to pixels
+    truncated_strides: bool = False  # torchvision spaces P6's by the input's size over P6's, rounded down: 61 at 800 px
+    sampling_ratio: int = 2  # of RoIAlign; 0 = one sample a cell
+    half_pixel: bool = False  # RoIAlign's convention: True is "aligned"
+    pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
+    pixel_std: tuple[float, float, float] = (58.395, 57.12, 57.375)
+    short_side: int = 800  # px, to which images were resized in training
+    long_side: int = 1333  # px, bound on the other side
+
+
+class MaskRCNN(nn.Module):
+    """The network; `propose`, `classify` and `segment` are its steps."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        self.architecture = architecture
+        self.backbone = Backbone(architecture)
+        self.rpn = RegionProposals(architecture)
+        self.roi_heads = RoiHeads(architecture)
+        self._anchors = [_anchors(side, architecture) for side in architecture.anchor_sides]
+
+    def normalize(self, images: Tensor) -> Tensor:
+        """The network's input from RGB images (N, 3, H, W), 0..255, padded at the end to multiples of 32 px."""
+        mean, std = (
+            torch.tensor(values, device=images.device)[:, None, None]
+            for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
+        )
+        height, width = images.shape[2:]
+        padded = functional.pad((images.float() - mean) / std, (0, -width % 32, 0, -height % 32))
+        return padded.to(self.rpn.head.cls_logits.weight.dtype)
+
+    def extract(self, images: Tensor) -> list[Tensor]:
+        """P2 to P6, each (N, C, H / stride, W / stride), of normalized images."""
+        levels: list[Tensor] = self.backbone(images)
+        return levels
+
+    def score_anchors(self, pyramid: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
+        """(objectness (N, A), deltas (N, A, 4)) of the anchors of all levels, in the order of `anchors`."""
+        objectness, deltas = zip(*(self.rpn.head(level) for level in pyramid), strict=True)
+        n = len(pyramid[0])
+        return (
+            torch.cat([level.permute(0, 2, 3, 1).reshape(n, -1) for level in objectness], dim=1),
+            torch.cat([level.permute(0, 2, 3, 1).reshape(n, -1, 4) for level in deltas], dim=1),
+        )
+
+    def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
+        """The (A, 4) anchors of each level."""
+        shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
+        height, width = (STRIDES[0] * cells for cells in shapes[0])
+        truncated = self.architecture.truncated_strides
+        return [
+            anchor_grid(anchors, rows, columns, (height // rows, width // columns) if truncated else stride)
+            for anchors, (rows, columns), stride in zip(self._anchors, shapes, STRIDES, strict=True)
+        ]
+
+    def propose(
+        self,
+        anchors: Sequence[Float32],
+        objectness: Float32,
+        deltas: Float32,
+        shape: tuple[int, int],
+        before_nms: int,
+        after_nms: int,
+    ) -> Float32:
+        """The boxes (P, 4), best first, in which one image of `shape` (height, width) may have objects.
+
+        objectness (A,) and deltas (A, 4) as from `score_anchors`; the best `before_nms` of each level are decoded.
+        """
+        boxes, scores, levels = [], [], []
+        first = 0
+        for level, of_level in enumerate(anchors):
+            own = slice(first, first + len(of_level))
+            first += len(of_level)
+            best = _best(objectness[own], before_nms)
+            decoded = clip(decode(of_level[best], deltas[own][best], extent=0.0), shape, extent=0.0)
+            wide = (decoded[:, 2:] - decoded[:, :2] >= 1e-3).all(axis=1)
+            boxes.append(decoded[wide])
+            scores.append(objectness[own][best][wide])
+            levels.append(np.full(int(wide.sum()), level, np.int32))
+        all_boxes, all_levels = np.concatenate(boxes), np.concatenate(levels)
+        kept = suppress_boxes(all_boxes, np.concatenate(scores), PROPOSAL_NMS, all_levels, limit=after_nms, extent=0.0)
+        return all_boxes[kept]
+
+    def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
+        """(logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image, whose pyramid is (1, C, H, W)."""
+        x = self.roi_heads.box_head(self.pool(pyramid, boxes, BOX_BINS))
+        logits, deltas = self.roi_heads.box_predictor(x)
+        return logits, deltas.view(*logits.shape, 4)  # also without boxes, where a -1 would be ambiguous
+
+    def segment(self, pyramid: Sequence[Tensor], boxes: Tensor) -> Tensor:
+        """The logits (P, 1 + C, 28, 28) of being inside the object of each class, over each box of one image."""
+        logits: Tensor = self.roi_heads.mask_predictor(self.roi_heads.mask_head(self.pool(pyramid, boxes, MASK_BINS)))
+        return logits
+
+    def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
+        """RoIAlign (P, C, bins, bins) of each box from the level that suits its size."""
+        sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
+        level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
+        level = level.clamp(0, POOLED_LEVELS - 1)
+        pooled = pyramid[0].new_zeros((len(boxes), pyramid[0].shape[1], bins, bins))
+        for k in range(POOLED_LEVELS):
+            own = torch.nonzero(level == k)[:, 0]
+            if len(own):
+                a = self.architecture
+                pooled[own] = roi_align(
+                    pyramid[k], boxes[own], bins, 1 / STRIDES[k], a.sampling_ratio, a.half_pixel
+                ).to(pooled.dtype)
+        return pooled
+
+
+class Backbone(nn.Module):
+    """Image to pyramid."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        self.body = ResNet(architecture.backbone)
+        self.fpn = FeaturePyramid(architecture.backbone.channels, architecture.fpn_channels)
+
+    def forward(self, images: Tensor) -> list[Tensor]:
+        levels: list[Tensor] = self.fpn(self.body(images))
+        return levels
+
+
+class FeaturePyramid(nn.Module):
+    """P2 to P6 from C2 to C5 (Lin et al., "Feature Pyramid Networks", 2017)."""
+
+    def __init__(self, channels: Sequence[int], out: int) -> None:
+        super().__init__()
+        self.inner_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(c, out, 1)) for c in channels)
+        self.layer_blocks = nn.ModuleList(nn.Sequential(nn.Conv2d(out, out, 3, 1, 1)) for _ in channels)
+
+    def forward(self, levels: Sequence[Tensor]) -> list[Tensor]:
+        inner = self.inner_blocks[-1](levels[-1])
+        out = [self.layer_blocks[-1](inner)]
+        for k in range(len(levels) - 2, -1, -1):
+            lateral = self.inner_blocks[k](levels[k])
+            inner = lateral + functional.interpolate(inner, size=lateral.shape[-2:], mode="nearest")
+            out.insert(0, self.layer_blocks[k](inner))
+        return [*out, functional.max_pool2d(out[-1], 1, 2)]
+
+
+class RegionProposals(nn.Module):
+    """One head for all levels."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        self.head = ProposalHead(architecture.fpn_channels, len(architecture.anchor_ratios))
+
+
+class ProposalHead(nn.Module):
+    """Objectness and deltas of the anchors of every cell (Ren et al., "Faster R-CNN", 2015)."""
+
+    def __init__(self, channels: int, anchors: int) -> None:
+        super().__init__()
+        self.conv = nn.Sequential(_convolution(channels, channels))
+        self.cls_logits = nn.Conv2d(channels, anchors, 1)
+        self.bbox_pred = nn.Conv2d(channels, 4 * anchors, 1)
+
+    def forward(self, level: Tensor) -> tuple[Tensor, Tensor]:
+        x = self.conv(level)
+        return self.cls_logits(x), self.bbox_pred(x)
+
+
+class RoiHeads(nn.Module):
+    """What looks at the regions."""
+
+    def __init__(self, architecture: Architecture) -> None:
+        super().__init__()
+        labels, channels = 1 + len(architecture.classes), architecture.fpn_channels
+        self.box_head = BoxHead(channels, architecture.head_features)
+        self.box_predictor = BoxPredictor(architecture.head_features, labels)
+        self.mask_head = nn.Sequential(*(_convolution(channels, channels) for _ in range(4)))
+        self.mask_predictor = MaskPredictor(channels, labels)
+
+
+class BoxHead(nn.Module):
+    """Two full layers."""
+
+    def __init__(self, channels: int, features: int) -> None:
+        super().__init__()
+        self.fc6 = nn.Linear(channels * BOX_BINS**2, features)
+        self.fc7 = nn.Linear(features, features)
+
+    def forward(self, pooled: Tensor) -> Tensor:
+        return functional.relu(self.fc7(functional.relu(self.fc6(pooled.flatten(1)))))
+
+
+class BoxPredictor(nn.Module):
+    """A distribution over the labels, and a box for each."""
+
+    def __init__(self, features: int, labels: int) -> None:
+        super().__init__()
+        self.cls_score = nn.Linear(features, labels)
+        self.bbox_pred = nn.Linear(features, 4 * labels)
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        return self.cls_score(x), self.bbox_pred(x)
+
+
+class MaskPredictor(nn.Module):
+    """A mask for each label, twice as fine as what it is made from."""
+
+    def __init__(self, channels: int, labels: int) -> None:
+        super().__init__()
+        self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
+        self.mask_fcn_logits = nn.Conv2d(channels, labels, 1)
+
+    def forward(self, x: Tensor) -> Tensor:
+        logits: Tensor = self.mask_fcn_logits(functional.relu(self.conv5_mask(x)))
+        return logits
+
+
+def select(
+    proposals: Float32,
+    probabilities: Float32,
+    deltas: Float32,
+    shape: tuple[int, int],
+    score_threshold: float,
+    nms: float,
+    limit: int,
+) -> tuple[Float32, Int32, Int32]:
+    """The surviving boxes (N, 4) of one image, best first, their proposals (N,) and labels (N,) from 1.
+
+    probabilities (P, 1 + C), deltas (P, 1 + C, 4): every label of a proposal above `score_threshold` is a candidate,
+    moved by its own deltas; within a label, boxes fall to better ones by the IoU `nms`.
+    """
+    proposal, label = np.nonzero(probabilities[:, 1:] > score_threshold)
+    label += 1
+    own = np.asarray(deltas[proposal, label] / np.array(DELTA_WEIGHTS), np.float32)
+    boxes = clip(decode(proposals[proposal], own, extent=0.0), shape, extent=0.0)
+    wide = (boxes[:, 2:] - boxes[:, :2] >= 1e-2).all(axis=1)
+    boxes, proposal, label = boxes[wide], proposal[wide], label[wide]
+    kept = suppress_boxes(boxes, probabilities[proposal, label], nms, label.astype(np.int32), limit=limit, extent=0.0)
+    return boxes[kept], np.asarray(proposal[kept], np.int32), np.asarray(label[kept], np.int32)
+
+
+def _convolution(channels: int, out: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(channels, out, 3, 1, 1), nn.ReLU(inplace=True))
+
+
+def _anchors(side: float, architecture: Architecture) -> Float32:
+    """The (R, 4) anchors of one cell, around the origin."""
+    ratios = np.array(architecture.anchor_ratios)
+    widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
+    anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2
+    return np.asarray(np.round(anchors) if architecture.rounded_anchors else anchors, np.float32)
+
+
+def _best(scores: Float32, n: int) -> Int32:
+    """The indices of the n best scores, best first, ties in the order of the input."""
+    return np.asarray(np.argsort(-scores, kind="stable")[:n], np.int32)

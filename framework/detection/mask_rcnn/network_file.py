@@ -1,0 +1,174 @@
+"""Networks as files: safetensors, whose metadata say what the network is and where it comes from.
+
+architecture     the Architecture as JSON
+card             the model card's facts as JSON: data, steps, AP, limits, ...
+tensors_sha256   of all names, shapes and values, so that a damaged file is noticed
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import typing
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import safetensors
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
+from framework.errors import DataError
+from framework.files.atomic_files import written_whole
+
+Fact = str | int | float | bool | None
+COUNTERS = ".num_batches_tracked"  # of the batch normalization; only a running training needs them
+
+
+@dataclass(frozen=True)
+class NetworkDescription:
+    """What a file says of its network."""
+
+    architecture: Architecture
+    card: Mapping[str, Fact]
+
+
+def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: bool = False) -> None:
+    """Writes the network to `path`, whole or not at all. `half`: weights as float16, which halves the file.
+
+    Only weights of two or more dimensions are halved: biases and statistics are few, and variances may be too large
+    for float16. Raises DataError when a weight is not finite, or the disk does not take the file.
+    """
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in _stored(network).items()}
+    if half:
+        tensors = {name: tensor.half() if tensor.ndim >= 2 else tensor for name, tensor in tensors.items()}
+    _check_finite(tensors, str(path))
+    metadata = {
+        "architecture": json.dumps(dataclasses.asdict(network.architecture)),
+        "card": json.dumps(dict(card)),
+        "tensors_sha256": _digest(tensors),
+    }
+    with written_whole(path) as temporary:
+        try:
+            save_file(tensors, temporary, metadata)
+        except safetensors.SafetensorError as error:
+            raise DataError(f"{path} could not be written: {' '.join(str(error).split())}") from error
+
+
+def load_network(path: Path) -> MaskRCNN:
+    """The network in `path`, in float32 and ready to run (`eval`). Raises DataError when it is no such file."""
+    with _opened(path) as file:
+        description = _description(file.metadata(), path)
+        names = file.keys()
+        tensors = {name: file.get_tensor(name) for name in names}
+        if file.metadata().get("tensors_sha256") != _digest(tensors):
+            raise DataError(f"{path} is damaged: its tensors are not those that were written; get it again")
+    return filled(description.architecture, tensors, str(path))
+
+
+def describe_network(path: Path) -> NetworkDescription:
+    """What `path` says of its network, without reading the weights."""
+    with _opened(path) as file:
+        return _description(file.metadata(), path)
+
+
+def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str) -> MaskRCNN:
+    """A network with these weights, in float32 and ready to run. `where` they are from begins a DataError's line.
+
+    The tensors must be exactly the network's, but for the counters of the batch normalization.
+    """
+    try:
+        with torch.device("meta"):  # no memory, no random numbers for weights that are replaced at once
+            network = MaskRCNN(architecture)
+    except (KeyError, ValueError, RuntimeError) as error:
+        raise DataError(f"{where}: there is no such architecture: {' '.join(str(error).split())}") from error
+    expected = _stored(network)
+    given = {name: tensor for name, tensor in tensors.items() if not name.endswith(COUNTERS)}
+    _check_names(expected.keys(), given.keys(), where)
+    for name, tensor in given.items():
+        if tensor.shape != expected[name].shape:
+            wanted, found = (" x ".join(map(str, shape)) for shape in (expected[name].shape, tensor.shape))
+            raise DataError(f"{where}: {name} must be {wanted}, found {found}")
+    _check_finite(given, where)
+    counters = {name: torch.tensor(0) for name in network.state_dict() if name.endswith(COUNTERS)}
+    network.load_state_dict({name: tensor.float() for name, tensor in given.items()} | counters, assign=True)
+    return network.eval()
+
+
+def _stored(network: MaskRCNN) -> dict[str, Tensor]:
+    return {name: tensor for name, tensor in network.state_dict().items() if not name.endswith(COUNTERS)}
+
+
+def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[str], where: str) -> None:
+    for names, fault in ((expected - found, "lacks"), (found - expected, "has the unknown")):
+        if names:
+            more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+            raise DataError(f"{where} {fault} weights {min(names)}{more}: it is not of the network that it should be")
+
+
+def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
+    for name, tensor in tensors.items():
+        if not torch.isfinite(tensor).all():
+            raise DataError(f"{where}: the weights {name} are not finite numbers")
+
+
+def _digest(tensors: Mapping[str, Tensor]) -> str:
+    """SHA-256 (hex) of names, types, shapes and values."""
+    digest = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name]
+        digest.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().data)
+    return digest.hexdigest()
+
+
+def _opened(path: Path) -> Any:
+    """A handle of safetensors; DataError when there is no such file."""
+    if not path.is_file():
+        raise DataError(f"there is no network {path}")
+    try:
+        return safetensors.safe_open(path, framework="pt")
+    except (safetensors.SafetensorError, OSError) as error:
+        raise DataError(f"{path} is damaged, or no safetensors file: {' '.join(str(error).split())}") from error
+
+
+def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescription:
+    if not metadata or "architecture" not in metadata:
+        raise DataError(f"{path} does not say what network it is: its metadata have no architecture")
+    try:
+        card = json.loads(metadata.get("card", "{}"))
+        return NetworkDescription(_parsed(Architecture, json.loads(metadata["architecture"]), "architecture"), card)
+    except ValueError as error:  # what json raises is one, too
+        raise DataError(f"{path}: {error}") from error
+
+
+def _parsed(kind: Any, value: Any, name: str) -> Any:
+    """A value from JSON as what a field is annotated with; raises ValueError, in one line, when it is not that."""
+    if dataclasses.is_dataclass(kind):
+        if not isinstance(value, dict):
+            raise ValueError(f"{name} must have fields, found {value!r}")
+        kinds = typing.get_type_hints(kind)
+        if unknown := sorted(value.keys() - kinds.keys()):
+            raise ValueError(f"{name} has the unknown field {unknown[0]}; was it written by a newer version?")
+        fields = {field: _parsed(kinds[field], part, f"{name}.{field}") for field, part in value.items()}
+        try:
+            return typing.cast(Any, kind)(**fields)
+        except TypeError as error:
+            raise ValueError(f"{name} is not complete: {error}") from error
+    if typing.get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"{name} must be a list, found {value!r}")
+        kinds_of_parts = typing.get_args(kind)
+        if kinds_of_parts[-1] is Ellipsis:
+            kinds_of_parts = kinds_of_parts[:1] * len(value)
+        if len(kinds_of_parts) != len(value):
+            raise ValueError(f"{name} must have {len(kinds_of_parts)} values, found {len(value)}")
+        return tuple(_parsed(part, v, name) for part, v in zip(kinds_of_parts, value, strict=True))
+    accepted = (int, float) if kind is float else kind
+    if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
+        raise ValueError(f"{name} must be {kind.__name__}, found {value!r}")
+    return kind(value)

@@ -1,0 +1,136 @@
+"""Where networks come from: a file that the user has, or one that its authors publish, downloaded once and checked."""
+
+from __future__ import annotations
+
+import hashlib
+import http.client
+import os
+import urllib.request
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import platformdirs
+from tqdm import tqdm
+
+from framework.errors import DataError
+from framework.files.atomic_files import written_whole
+from framework.files.search_paths import candidates
+
+OFFLINE = "INSTANCEMAP_OFFLINE"
+"""An environment variable: set to anything, nothing is downloaded."""
+
+TIMEOUT = 30.0  # s without an answer
+BLOCK = 1 << 20  # bytes
+
+
+@dataclass(frozen=True)
+class PublishedNetwork:
+    """A file that is known by how its hash begins, because its authors put that into its name."""
+
+    url: str
+    algorithm: str  # of hashlib
+    digest: str  # hex, the first digits or all
+
+    @property
+    def file(self) -> Path:
+        """Where it is in the user's cache, or is to be put."""
+        return networks_folder() / self.url.rpartition("/")[2]
+
+
+DETECTRON2 = "https://dl.fbaipublicfiles.com/detectron2/COCO-InstanceSegmentation/"
+PUBLISHED = {
+    "resnet50_fpn_coco": PublishedNetwork(
+        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth", "sha256", "bf2d0c1e"
+    ),
+    "resnet50_fpn_coco_detectron2": PublishedNetwork(
+        f"{DETECTRON2}mask_rcnn_R_50_FPN_3x/137849600/model_final_f10217.pkl", "md5", "f10217"
+    ),
+    "resnet101_fpn_coco_detectron2": PublishedNetwork(
+        f"{DETECTRON2}mask_rcnn_R_101_FPN_3x/138205316/model_final_a3ec72.pkl", "md5", "a3ec72"
+    ),
+}
+"""torchvision's first one (COCO mask AP 34.6) and detectron2's (CC BY-SA 3.0; 37.2 and 38.6), as published."""
+
+
+def networks_folder() -> Path:
+    """The folder of downloaded networks in the user's cache."""
+    return platformdirs.user_cache_path("instancemap", appauthor=False) / "networks"
+
+
+def find_network(weights: Path) -> Path:
+    """The file that `weights` means: a name in PUBLISHED, downloaded if need be, or a path.
+
+    A relative path is tried from the working folder, then from the project's. Raises DataError, with what to do, when
+    there is no such file, it cannot be downloaded, or its hash is not the published one.
+    """
+    if published := PUBLISHED.get(str(weights)):
+        if not published.file.exists():
+            download(published)
+        check(published)
+        return published.file
+    for candidate in candidates(weights):
+        if candidate.is_file():
+            return candidate.resolve()
+    looked = " and no ".join(str(candidate) for candidate in candidates(weights))
+    raise DataError(f"there is no network {looked}; give a file, or one of the published: {', '.join(PUBLISHED)}")
+
+
+def check(published: PublishedNetwork) -> None:
+    """Raises DataError unless the cached file is the published one."""
+    try:
+        with published.file.open("rb") as file:
+            found = hashlib.file_digest(file, published.algorithm).hexdigest()
+    except OSError as error:
+        raise DataError(f"{published.file} could not be read: {error.strerror}") from error
+    if not found.startswith(published.digest):
+        raise DataError(
+            f"{published.file} is damaged: its {published.algorithm} begins with {found[: len(published.digest)]},"
+            f" expected {published.digest}; delete it, and it is downloaded again from {published.url}"
+        )
+
+
+def download(published: PublishedNetwork) -> None:
+    """Fetches the file into the cache, with a progress bar, whole or not at all."""
+    by_hand = f"download {published.url} and put it at {published.file}"
+    if os.environ.get(OFFLINE):
+        raise DataError(f"there is no {published.file}, and {OFFLINE} forbids to download it: {by_hand}")
+    path = published.file
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DataError(f"{path.parent} could not be made: {error.strerror}") from error
+    digest = hashlib.new(published.algorithm)
+    with written_whole(path) as temporary, temporary.open("wb") as file:
+        for block in _received(published.url, path.name, by_hand):
+            file.write(block)
+            digest.update(block)
+        found = digest.hexdigest()[: len(published.digest)]
+        if found != published.digest:
+            raise DataError(
+                f"{published.url} is not what was published: its {published.algorithm} begins with {found},"
+                f" expected {published.digest}"
+            )
+
+
+def _received(url: str, name: str, by_hand: str) -> Iterator[bytes]:
+    """The blocks of what `url` sends; a fault of the connection, and no other, is a DataError that says `by_hand`."""
+    try:
+        with (
+            urllib.request.urlopen(url, timeout=TIMEOUT) as response,
+            tqdm(total=response.length, unit="B", unit_scale=True, desc=name, disable=None) as progress,
+        ):
+            announced, received = response.length or 0, 0
+            while block := response.read(BLOCK):
+                received += len(block)
+                progress.update(len(block))
+                yield block
+    except (OSError, http.client.HTTPException) as error:
+        raise DataError(f"{url} could not be downloaded ({_reason(error)}): {by_hand}") from error
+    if received < announced:
+        raise DataError(f"{url} ended after {received} of {announced} bytes: try again, or {by_hand}")
+
+
+def _reason(error: Exception) -> str:
+    """What is wrong, in a few words."""
+    return " ".join(str(getattr(error, "reason", None) or error).split()) or type(error).__name__

@@ -1,0 +1,1 @@
+"""Run records become the paper's figures."""

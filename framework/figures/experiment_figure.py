@@ -1,0 +1,191 @@
+"""The picture of an experiment, from the records of its runs to PNG and PDF."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
+
+from tqdm import tqdm
+
+from framework.data import SceneTruth
+from framework.errors import DataError, InstanceMapError
+from framework.figures.figure_choice import FigureChoice
+from framework.figures.figure_page import Page
+from framework.figures.map_figure import CaptionedLine, map_figure, panel_size
+from framework.figures.map_panels import panel_line
+from framework.figures.stage_times import WINDOW, MeanTimes, stage_times_figure
+from framework.parameters import checked_rows
+from framework.records.reevaluation import Truth
+from framework.records.rows import Row, Run, natural, rows_of
+from framework.records.stored_map import StoredMap
+from framework.records.stored_runs import Incomplete, Record, find_records, read_yaml
+from framework.records.sweep_file import SWEEP
+from framework.records.timings_file import StageTimes, read_timings
+from framework.tables.table_notes import counted, machine
+
+NAME = "figure"  # of the files, and of the block in the experiment's config
+
+log = logging.getLogger(__name__)
+
+Read = TypeVar("Read")
+
+
+def write_figure(directory: Path) -> list[Path]:
+    """Writes figure.png and figure.pdf into `directory`, from the records below it; returns their paths.
+
+    Runs that are not complete, or cannot be read, are named in the log and left out. Raises DataError when there is
+    nothing to draw.
+    """
+    pictured = Pictured.below(directory)
+    if missing := list(pictured.missing()):
+        log.warning("not in the picture: %s", "; ".join(missing))
+    return DRAWN[pictured.choice.kind](pictured).write(directory / NAME)
+
+
+@dataclass(frozen=True)
+class Pictured:
+    """The runs that a picture shows."""
+
+    choice: FigureChoice
+    rows: Mapping[str, Row | None]  # by what it is called; None = no run of it is complete
+    incomplete: Sequence[Incomplete]
+
+    @classmethod
+    def below(cls, directory: Path) -> Pictured:
+        """From the records at and below `directory`, as the experiment that ran there says.
+
+        Raises DataError when it has no picture or no run is complete, ConfigError when its picture is nonsense.
+        """
+        if not directory.is_dir():
+            raise DataError(f"{directory} is not a folder with records of runs")
+        if not (directory / SWEEP).exists():
+            raise DataError(
+                f"{directory} has no {SWEEP}: pictures are of experiments, like experiment=figure4_progress"
+            )
+        sweep = read_yaml(directory / SWEEP)
+        if not sweep.get(NAME):
+            raise DataError(
+                f"{directory / SWEEP} has no block `{NAME}:`, which says what to draw: only some experiments have one, "
+                "like experiment=figure4_progress"
+            )
+        choice = FigureChoice.of(sweep[NAME])
+        overrides = checked_rows(sweep.get("rows"))
+        records, incomplete = find_records(directory)
+        if not records:
+            why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
+            raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
+        found = rows_of(records, choice.over, overrides)
+        rows: dict[str, Row | None] = {}
+        for system in dict.fromkeys([*overrides, *(row.system for row in found)]):
+            of_system: dict[str, Row | None] = {choice.called(row): row for row in found if row.system == system}
+            rows |= of_system or {choice.names.get(system, system): None}
+        return cls(choice, rows, incomplete)
+
+    @property
+    def runs(self) -> list[Run]:
+        """All that a row has, by sequence."""
+        found = {run for row in self.rows.values() if row for run in row.records}
+        return sorted(found, key=lambda run: natural(run[::-1]))
+
+    @property
+    def records(self) -> list[Record]:
+        return [record for row in self.rows.values() if row for record in row.records.values()]
+
+    def called(self, run: Run) -> str:
+        """The sequence, and the seed where there are several."""
+        seeds = {other[0] for other in self.runs}
+        return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
+
+    def missing(self) -> Iterator[str]:
+        """The runs that are not complete, and why; and those that only other rows have."""
+        for one in self.incomplete:
+            yield f"{one.directory.name}: {one.reason}"
+        for name, row in self.rows.items():
+            if absent := [self.called(run) for run in self.runs if row is None or run not in row.records]:
+                yield f"{name} without {', '.join(absent)}"
+
+
+def _stage_times(pictured: Pictured) -> Page:
+    read = {name: _times_of(row) for name, row in pictured.rows.items()}
+    means = {name: MeanTimes.of(list(times.values())) if times else None for name, times in read.items()}
+    shown = [one for one in means.values() if one is not None]
+    if not shown:
+        raise DataError("no timings.csv can be read; the log says why")
+    counts = "/".join(map(str, dict.fromkeys(one.count for one in shown)))
+    sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
+    note = (
+        f"Mean of {counts} sequences ({', '.join(sequences)}), of running medians over {WINDOW} frames; bands: from "
+        f"the fastest sequence to the slowest. Right: median over all frames, and × the median of the last third of "
+        f"the frames by that of the first."
+    )
+    if any(one.longest > one.frames[-1] for one in shown):
+        note += " Lines end where the shortest sequence does."
+    return stage_times_figure(means, f"{note} {_origin(pictured.records)}")
+
+
+def _times_of(row: Row | None) -> dict[Run, StageTimes]:
+    """Of the runs that can be read."""
+    records = row.records if row else {}
+    read = {run: _if_readable(_times, record) for run, record in records.items()}
+    return {run: times for run, times in read.items() if times is not None}
+
+
+def _times(record: Record) -> StageTimes:
+    return read_timings(record.directory / "timings.csv")
+
+
+def _maps(pictured: Pictured) -> Page:
+    heads = [*pictured.rows, "ground truth"]
+    lines = []
+    for run in tqdm(pictured.runs, unit=" lines", disable=None, dynamic_ncols=True):
+        records = [row.records.get(run) if row else None for row in pictured.rows.values()]
+        maps = [_if_readable(StoredMap.of, record) if record else None for record in records]
+        shown = [one for one in maps if one is not None]
+        if not shown:
+            continue
+        truth = _if_readable(_truth, shown[-1].record)
+        line = panel_line(maps, truth, panel_size(len(heads)), pictured.choice.zoom)
+        captions = [*map(_caption, maps), f"{line.true_count} instances" if truth else ""]
+        lines.append(CaptionedLine(pictured.called(run), line, captions))
+    if not lines:
+        raise DataError("no map can be read; the log says why")
+    note = (
+        "An object has one colour in all pictures of a line. Dark: it is no true object, or too little of one. "
+        "Beige: a true object of unknown class, which is not evaluated."
+    )
+    if any(record.annotation for record in pictured.records):
+        note += f" Annotation: {counted(record.annotation or 'not told' for record in pictured.records)}."
+    return map_figure(heads, lines, f"{note} {_origin(pictured.records)}")
+
+
+DRAWN: Mapping[str, Callable[[Pictured], Page]] = {"stage_times": _stage_times, "maps": _maps}
+"""By FigureChoice.kind."""
+
+
+def _truth(record: Record) -> SceneTruth | None:
+    return Truth.of(record.config).scene
+
+
+def _caption(stored: StoredMap | None) -> str:
+    if stored is None:
+        return ""
+    metrics = stored.record.metrics
+    ap50 = metrics.get("instances.ap50")
+    caption = f"{metrics.get('frames')} frames, {len(stored.class_names)} instances"
+    return caption if ap50 is None else f"{caption}, AP50 {ap50:.2f}"
+
+
+def _if_readable(read: Callable[[Record], Read], record: Record) -> Read | None:
+    """None, with the reason in the log, where the record's files, or its dataset's, cannot be read."""
+    try:
+        return read(record)
+    except InstanceMapError as error:
+        log.warning("not in the picture: %s", error)
+        return None
+
+
+def _origin(records: Sequence[Record]) -> str:
+    return f"{counted(map(machine, records))}; code {counted(record.commit for record in records)}."

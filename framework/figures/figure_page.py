@@ -1,0 +1,85 @@
+"""A page for a printed figure: places in millimetres, letters in points, small type below, and the two files."""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.font_manager import FontProperties
+from matplotlib.textpath import text_to_path
+
+from framework.files.atomic_files import written_whole
+
+COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of a journal's column, and of two
+TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0
+INK, FAINT_INK = "#20242a", "#787e86"
+INCH_MM = 25.4
+PNG_DPI = 200
+PDF_DPI = 300  # of the rasters in it
+NOTE_LINE_MM = 2.35  # from one line of small type to the next
+MARGIN_MM = 1.0
+
+logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells a hundred lines about each font in a PDF
+
+
+class Page:
+    """A white page with a note at its foot. Places are mm from the lower left corner of what is above the note."""
+
+    def __init__(self, width: float, height: float, note: str) -> None:
+        lines = _wrapped(note, width - 2 * MARGIN_MM)
+        self._foot = NOTE_LINE_MM * len(lines) + 2 * MARGIN_MM
+        self._size = width, height + self._foot
+        self.figure = Figure((self._size[0] / INCH_MM, self._size[1] / INCH_MM), facecolor="white")
+        self.text(MARGIN_MM, MARGIN_MM - self._foot, "\n".join(lines), fontsize=NOTE_PT, color=FAINT_INK, va="bottom")
+
+    def axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
+        """Axes without ticks, in a thin frame."""
+        x, y = self._share(left, bottom)
+        axes = self.figure.add_axes((x, y, width / self._size[0], height / self._size[1]))
+        axes.set_xticks([])
+        axes.set_yticks([])
+        for side in axes.spines.values():
+            side.set(color=FAINT_INK, linewidth=0.3)
+        return axes
+
+    def text(self, x: float, y: float, text: str, **style: Any) -> None:
+        self.figure.text(*self._share(x, y), text, **style)
+
+    def write(self, path: Path) -> list[Path]:
+        """Writes the page as `path`.png and `path`.pdf, and returns these; the same page gives the same bytes."""
+        png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
+        with written_whole(png) as temporary:
+            self.figure.savefig(temporary, dpi=PNG_DPI)
+        with written_whole(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # letters that can be searched
+            self.figure.savefig(temporary, dpi=PDF_DPI, metadata={"CreationDate": None})
+        return [png, pdf]
+
+    def _share(self, x: float, y: float) -> tuple[float, float]:
+        return x / self._size[0], (y + self._foot) / self._size[1]
+
+
+def text_width(text: str, size: float) -> float:
+    """How wide a text of this size, pt, is printed, mm."""
+    width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
+    return float(width) / 72 * INCH_MM
+
+
+def _wrapped(text: str, width: float) -> list[str]:
+    """The lines of small type, mm wide at most, that hold the text."""
+    lines: list[str] = []
+    for word in text.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and text_width(longer, NOTE_PT) <= width:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    return lines
+
+
+def say_inside(axes: Axes, text: str) -> None:
+    """Writes why there is nothing else in the axes."""
+    axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=TEXT_PT, color=FAINT_INK)

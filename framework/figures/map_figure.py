@@ -1,0 +1,134 @@
+"""The paper's Figures 4 and 5: maps side by side with the true instances beside them, as a page."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.patches import Rectangle
+from matplotlib.patheffects import withStroke
+
+from framework.figures.figure_page import (
+    FAINT_INK,
+    INCH_MM,
+    INK,
+    NOTE_PT,
+    PAGE_MM,
+    PDF_DPI,
+    SMALL_PT,
+    TEXT_PT,
+    Page,
+    say_inside,
+    text_width,
+)
+from framework.figures.map_panels import Name, Panel, PanelLine, Window
+from framework.rendering.camera_path import CameraPath
+
+HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
+LEFT_MM, RIGHT_MM = 3.5, 0.3  # beside the panels
+ASPECT = 0.78  # height by width of a panel
+NAME_ROOM_MM = 0.8  # around the middle of an object, for its name to be written there
+NAME_HEIGHT_MM = 1.9
+
+
+@dataclass(frozen=True)
+class CaptionedLine:
+    """A line of panels with what is said beside and below them."""
+
+    name: str  # the sequence
+    panels: PanelLine
+    captions: Sequence[str]  # below each map, and the truth as the last one
+
+    @property
+    def rows(self) -> int:
+        """Of panels, below each other."""
+        return 2 if self.panels.window else 1
+
+
+def panel_size(columns: int) -> tuple[int, int]:
+    """Width and height of one of so many panels beside each other, px."""
+    width = _panel_mm(columns)
+    return round(width * PDF_DPI / INCH_MM), round(width * ASPECT * PDF_DPI / INCH_MM)
+
+
+def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) -> Page:
+    """The page. `heads` name the columns, the truth as the last one; `note` stands below in small type."""
+    width = _panel_mm(len(heads))
+    height = width * ASPECT
+    lefts = [LEFT_MM + k * (width + GAP_MM) for k in range(len(heads))]
+    top = sum(line.rows * (height + GAP_MM) - GAP_MM + CAPTION_MM for line in lines)
+    page = Page(PAGE_MM, top + HEAD_MM, note)
+    for left, head in zip(lefts, heads, strict=True):
+        page.text(left + width / 2, top + 1.2, head, ha="center", fontsize=TEXT_PT, color=INK)
+    for line in lines:
+        foot = top - line.rows * (height + GAP_MM) + GAP_MM
+        beside = {"rotation": 90, "ha": "center", "va": "center"}
+        page.text(LEFT_MM / 2 - 0.2, (top + foot) / 2, line.name, fontsize=TEXT_PT, color=INK, **beside)
+        for left, caption in zip(lefts, line.captions, strict=True):
+            page.text(left + width / 2, foot - 1, caption, ha="center", va="top", fontsize=SMALL_PT, color=FAINT_INK)
+        overall = [page.axes(left, top - height, width, height) for left in lefts]
+        for axes, panel in zip(overall, line.panels.maps, strict=False):
+            _draw(axes, panel, "not complete")
+        _draw(overall[-1], line.panels.truth, "no true instances")
+        _draw_names(overall[-1], line.panels.truth, width)  # they tell the colours of the other columns, too
+        if line.panels.window:
+            for left, axes, panel in zip(lefts, overall, line.panels.zoomed, strict=True):
+                larger = page.axes(left, foot, width, height)
+                _draw(larger, panel, "")
+                _draw_names(larger, panel, width)
+                _draw_window(axes, panel, line.panels.window)
+        top = foot - CAPTION_MM
+    return page
+
+
+def _panel_mm(columns: int) -> float:
+    return (PAGE_MM - LEFT_MM - RIGHT_MM - GAP_MM * (columns - 1)) / columns
+
+
+def _draw(axes: Axes, panel: Panel | None, otherwise: str) -> None:
+    if panel is None:
+        say_inside(axes, otherwise)
+        return
+    height, width = panel.image.shape[:2]
+    axes.imshow(panel.image, interpolation="antialiased", aspect="auto")
+    if panel.path is not None:
+        _draw_path(axes, panel.path)
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+
+
+def _draw_path(axes: Axes, path: CameraPath) -> None:
+    """Thin where something stands before it."""
+    shades = path.shades() / 255.0
+    segments = [path.pixels[k : k + 2] for k in range(len(path.pixels) - 1)]
+    widths = [0.4 if hidden else 0.9 for hidden in path.hidden[:-1]]
+    axes.add_collection(LineCollection(segments, colors=shades[:-1], linewidths=widths, capstyle="round"))
+    for k in (0, -1) if len(path.pixels) else ():
+        axes.plot(*path.pixels[k], "o", color=shades[k], markersize=2.6, markeredgecolor="white", markeredgewidth=0.4)
+
+
+def _draw_window(axes: Axes, panel: Panel | None, window: Window) -> None:
+    if panel is not None:
+        corner = window.left - 0.5, window.top - 0.5
+        axes.add_patch(Rectangle(corner, window.width, window.height, fill=False, edgecolor=INK, linewidth=0.5))
+
+
+def _draw_names(axes: Axes, panel: Panel | None, width_mm: float) -> None:
+    """On the objects that have room for their names, the large ones first; none over another."""
+    if panel is None:
+        return
+    scale = panel.image.shape[1] / width_mm  # px by mm
+    taken: list[tuple[Name, float]] = []  # with half the width, px
+    for name in panel.names:
+        half = text_width(name.text, NOTE_PT) * scale / 2
+        if name.room < NAME_ROOM_MM * scale or any(
+            abs(name.v - other.v) < NAME_HEIGHT_MM * scale and abs(name.u - other.u) < half + other_half
+            for other, other_half in taken
+        ):
+            continue
+        taken.append((name, half))
+        halo = [withStroke(linewidth=1.2, foreground="white", alpha=0.85)]
+        place: dict[str, Any] = {"ha": "center", "va": "center", "path_effects": halo}
+        axes.text(name.u, name.v, name.text, fontsize=NOTE_PT, color=INK, **place)

@@ -1,0 +1,191 @@
+"""The paper's Figure 3: how long each stage takes over the frames of a sequence, averaged over sequences."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+
+from framework.data import Float64, Int64
+from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, say_inside
+from framework.records.timings_file import StageTimes
+
+WINDOW = 9  # frames, of the running median: single slow frames, such as the first, are no trend
+SUM = "sum"
+COLORS = {
+    "detect": "#0072b2",
+    "track": "#009e73",
+    "lift": "#8c6bb1",
+    "refine": "#d55e00",
+    "fuse": "#b5830a",
+    SUM: "#20242a",
+}
+"""By stage, in the order of the pipeline; colours that the colour-blind tell apart, too."""
+
+STAGES = tuple(stage for stage in COLORS if stage != SUM)
+RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms a frame
+PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights, of one row's diagram, its heading and what is below its axis
+LEFT_MM, RIGHT_MM = 9.5, 27.5  # beside the diagram
+PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
+LABEL_PLACES_MM = (2.2, 2.8, 20.0, 27.0)  # right of the diagram: the end of the line, the stage, its median, its growth
+LABEL_MM = 2.9  # from one label's line to the next
+LOWEST_MS = 0.1  # what is shorter is drawn as long
+
+
+@dataclass(frozen=True)
+class MeanTimes:
+    """The times of several sequences, smoothed, as far as the shortest of them goes."""
+
+    frames: Int64  # (G,) numbers of the video's frames
+    mean: Mapping[str, Float64]  # by stage, and SUM: (G,) ms, NaN where no sequence knows it
+    lowest: Mapping[str, Float64]  # the same of the sequence that was fastest there
+    highest: Mapping[str, Float64]  # and of the slowest
+    count: int  # sequences
+    longest: int  # the last frame of the longest sequence
+
+    @classmethod
+    def of(cls, runs: Sequence[StageTimes]) -> MeanTimes:
+        """Of one run or more, each with a frame or more."""
+        end = min(int(run.frames[-1]) for run in runs)
+        frames = np.unique(np.concatenate([run.frames[run.frames <= end] for run in runs]))
+        mean, lowest, highest = {}, {}, {}
+        for stage in COLORS:
+            smooth = np.full((len(runs), len(frames)), np.nan)
+            for line, run in zip(smooth, runs, strict=True):
+                line[np.searchsorted(frames, run.frames[run.frames <= end])] = running_median(
+                    _of_stage(run, stage), WINDOW
+                )[run.frames <= end]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", RuntimeWarning)  # where all are NaN
+                mean[stage] = np.nanmean(smooth, axis=0)
+                lowest[stage], highest[stage] = np.nanmin(smooth, axis=0), np.nanmax(smooth, axis=0)
+        return cls(frames, mean, lowest, highest, len(runs), max(int(run.frames[-1]) for run in runs))
+
+    @property
+    def stages(self) -> list[str]:
+        """Those that took some time."""
+        return [stage for stage, values in self.mean.items() if np.isfinite(values).any()]
+
+    def growth(self, stage: str) -> float:
+        """The median over the last third of the frames by that over the first; NaN where either is not known."""
+        third = max(1, len(self.frames) // 3)
+        first, last = self.mean[stage][:third], self.mean[stage][-third:]
+        if not np.isfinite(first).any() or not np.isfinite(last).any():
+            return float("nan")
+        return float(np.nanmedian(last) / max(np.nanmedian(first), 1e-9))
+
+
+def running_median(values: Float64, window: int) -> Float64:
+    """(F,) the median of the `window` (odd) values around each of `values` (F,), of fewer at the ends.
+
+    NaN are left out, and stay.
+    """
+    half = window // 2
+    around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), window)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)  # windows of NaN alone
+        medians = np.nanmedian(around, axis=1)
+    return np.where(np.isnan(values), np.nan, medians)
+
+
+def spread(positions: Sequence[float], gap: float) -> list[float]:
+    """The positions moved apart, as little as can be, until neighbours are `gap` or more from each other.
+
+    Those that would touch become a group, evenly spaced about its own mean, as often as groups touch.
+    """
+    order = np.argsort(positions, kind="stable")
+    groups: list[list[float]] = []  # of the positions wished for
+    for k in order:
+        groups.append([positions[k]])
+        while len(groups) > 1 and _end(groups[-2], gap) + gap > _begin(groups[-1], gap):
+            last = groups.pop()
+            groups[-1] += last
+    placed = [_begin(group, gap) + gap * k for group in groups for k in range(len(group))]
+    result = [0.0] * len(positions)
+    for k, position in zip(order, placed, strict=True):
+        result[k] = position
+    return result
+
+
+def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
+    """One diagram for each row, below each other; None = it has no run. `note` stands below in small type."""
+    step = HEAD_MM + PLOT_MM + AXIS_MM
+    page = Page(COLUMN_MM, step * len(rows), note)
+    for k, (name, times) in enumerate(rows.items(), start=1):
+        axes = page.axes(LEFT_MM, step * (len(rows) - k) + AXIS_MM, PLOT_WIDTH_MM, PLOT_MM)
+        axes.set_title(name, fontsize=TEXT_PT, loc="left", pad=3, color=INK)
+        if times is None:
+            say_inside(axes, "not complete")
+        else:
+            _draw(axes, times)
+    return page
+
+
+def _of_stage(run: StageTimes, stage: str) -> Float64:
+    nothing = np.full(len(run.frames), np.nan)
+    if stage == SUM:
+        return np.asarray(np.sum([run.milliseconds.get(one, nothing) for one in STAGES], axis=0), np.float64)
+    return run.milliseconds.get(stage, nothing)
+
+
+def _begin(group: list[float], gap: float) -> float:
+    return sum(group) / len(group) - gap * (len(group) - 1) / 2
+
+
+def _end(group: list[float], gap: float) -> float:
+    return _begin(group, gap) + gap * (len(group) - 1)
+
+
+def _draw(axes: Axes, times: MeanTimes) -> None:
+    for stage in times.stages:
+        low, mean, high = (np.maximum(one[stage], LOWEST_MS) for one in (times.lowest, times.mean, times.highest))
+        color = COLORS[stage]
+        axes.fill_between(times.frames, low, high, color=color, alpha=0.14, linewidth=0)
+        axes.plot(times.frames, mean, color=color, linewidth=1.1 if stage == SUM else 0.9, solid_capstyle="round")
+    axes.set_yscale("log")
+    axes.set_xlim(times.frames[0], max(times.frames[-1], times.frames[0] + 1))
+    lowest, highest = axes.get_ylim()
+    axes.set_ylim(lowest, max(highest, 1.25 * max(RATES)))
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.yaxis.set_major_locator(LogLocator())
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.tick_params(labelsize=SMALL_PT, width=0.4, length=2, pad=2, color=FAINT_INK, labelcolor=INK)
+    axes.tick_params(which="minor", width=0.3, length=1.2, color=FAINT_INK)
+    axes.grid(axis="y", color="#e6e8eb", linewidth=0.4)
+    axes.set_axisbelow(True)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.set_xlabel("frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
+    axes.set_ylabel("milliseconds a frame", fontsize=SMALL_PT, labelpad=1.5, color=INK)
+    for milliseconds, rate in RATES.items():
+        axes.axhline(milliseconds, color=FAINT_INK, linewidth=0.5, dashes=(1.5, 2))
+        halo = [withStroke(linewidth=1.2, foreground="white")]
+        place: dict[str, Any] = {"xycoords": axes.get_yaxis_transform(), "textcoords": "offset points"}
+        axes.annotate(rate, (0, milliseconds), (2, 1.2), fontsize=NOTE_PT, color=FAINT_INK, path_effects=halo, **place)
+    _draw_labels(axes, times)
+
+
+def _draw_labels(axes: Axes, times: MeanTimes) -> None:
+    """At the right ends of the lines: the stage, its median and its growth."""
+    low, high = np.log10(axes.get_ylim())
+    ends = [np.maximum(times.mean[stage][np.isfinite(times.mean[stage])][-1], LOWEST_MS) for stage in times.stages]
+    heights = [float((np.log10(end) - low) / (high - low)) for end in ends]  # as shares of the diagram
+    line_x, stage_x, median_x, growth_x = (1 + place / PLOT_WIDTH_MM for place in LABEL_PLACES_MM)
+    for stage, height, place in zip(times.stages, heights, spread(heights, LABEL_MM / PLOT_MM), strict=True):
+        color = COLORS[stage]
+        axes.plot([1, line_x], [height, place], color=color, linewidth=0.5, transform=axes.transAxes, clip_on=False)
+        beside: dict[str, Any] = {"va": "center", "transform": axes.transAxes}
+        axes.text(stage_x, place, stage, fontsize=SMALL_PT, color=color, weight="bold", **beside)
+        median, growth = float(np.nanmedian(times.mean[stage])), times.growth(stage)
+        axes.text(median_x, place, _short(median), fontsize=SMALL_PT, color=color, ha="right", **beside)
+        if np.isfinite(growth):
+            axes.text(growth_x, place, f"×{growth:.2f}", fontsize=NOTE_PT, color=FAINT_INK, ha="right", **beside)
+
+
+def _short(milliseconds: float) -> str:
+    return f"{milliseconds:.0f} ms" if milliseconds >= 9.95 else f"{milliseconds:.1f} ms"

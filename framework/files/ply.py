@@ -1,0 +1,161 @@
+"""Triangle meshes as PLY files: any of the format's three encodings is read, little-endian binary is written."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+
+from framework.data import Array, Float32, Int32, Int64
+from framework.errors import DataError
+from framework.files.atomic_files import written_whole
+from framework.files.ply_binary import BinaryBody
+from framework.files.ply_header import TYPES, parse_header
+from framework.files.ply_rows import Body, Rows
+from framework.files.ply_text import TextBody
+from framework.files.whole_files import read_bytes
+
+LARGEST_FILE = 2**32  # bytes; the mesh of a room has some 2^26
+AXES = ("x", "y", "z")
+INDICES = ("vertex_indices", "vertex_index")  # what writers call a face's list
+TYPE_NAMES = {code: name for name, code in reversed(TYPES.items())}  # the classic names: float, not float32
+
+
+@dataclass(frozen=True)
+class PlyMesh:
+    """What a PLY file holds of a mesh."""
+
+    vertices: Float32  # (V, 3) m
+    triangles: Int32  # (F, 3)
+    properties: Mapping[str, Array]  # per vertex, (V,), other scalar properties by name, in the file's type
+    comments: tuple[str, ...]  # of the header, in order
+
+
+def read_ply(path: Path) -> PlyMesh:
+    """The mesh in a PLY file; polygons become fans of triangles, other elements and lists of a vertex are left out.
+
+    Raises DataError, naming line or byte, for a file that is damaged, does not hold what its header announces, or has
+    vertices that are not finite or triangles of vertices that it does not have.
+    """
+    data = read_bytes(path, LARGEST_FILE)
+    header = parse_header(path, data)
+    body: Body = TextBody(path, data, header) if header.format == "ascii" else BinaryBody(path, data, header)
+    tables = {element.name: body.rows(element) for element in header.elements}
+    body.check_end()
+    if "vertex" not in tables:
+        raise DataError(f"{path}, line {header.lines}: the header has no element 'vertex'")
+    vertices = _vertices(path, tables["vertex"])
+    triangles = _triangles(path, tables["face"], len(vertices)) if "face" in tables else np.empty((0, 3), np.int32)
+    properties = {name: values for name, values in tables["vertex"].scalars.items() if name not in AXES}
+    return PlyMesh(vertices, triangles, properties, header.comments)
+
+
+def write_ply(
+    path: Path, vertices: Float32, triangles: Int32, properties: Mapping[str, Array], comments: Sequence[str] = ()
+) -> None:
+    """Writes vertices (V, 3) m, triangles (F, 3) and each vertex's properties (V,), whole or not at all.
+
+    Raises DataError when these do not make a mesh that `read_ply` would read, or the disk does not take the file.
+    """
+    _check_mesh(path, vertices, triangles)
+    row = _vertex_dtype(path, len(vertices), properties)
+    if any("\n" in comment or "\r" in comment for comment in comments):
+        raise DataError(f"{path}: a comment of a PLY file is one line")
+    rows = np.empty(len(vertices), row)
+    for axis, name in enumerate(AXES):
+        rows[name] = vertices[:, axis]
+    for name, values in properties.items():
+        rows[name] = values
+    faces = np.empty(len(triangles), [("count", "u1"), ("vertex_indices", "<i4", (3,))])
+    faces["count"] = 3
+    faces["vertex_indices"] = triangles
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *(f"comment {comment}" for comment in comments),
+        f"element vertex {len(vertices)}",
+        *(f"property {TYPE_NAMES[row[name].char]} {name}" for name in row.names or ()),
+        f"element face {len(faces)}",
+        "property list uchar int vertex_indices",
+        "end_header\n",
+    ]
+    with written_whole(path) as temporary, temporary.open("wb") as file:
+        file.write("\n".join(header).encode("ascii", "replace"))
+        rows.tofile(file)
+        faces.tofile(file)
+
+
+def _vertices(path: Path, rows: Rows) -> Float32:
+    missing = [axis for axis in AXES if axis not in rows.scalars]
+    if missing:
+        raise DataError(f"{path}: the header's element 'vertex' has no property {missing[0]!r} with one number")
+    with np.errstate(over="ignore"):  # too large for float32 is not finite, which is checked
+        vertices = np.stack([rows.scalars[axis].astype(np.float32) for axis in AXES], axis=1)
+    if not np.isfinite(vertices).all():
+        k = int(np.argmin(np.isfinite(vertices).all(axis=1)))
+        found = " ".join(f"{rows.scalars[axis][k]:g}" for axis in AXES)
+        raise DataError(f"{path}, {rows.place(k)}: vertex {k} is not finite: {found}")
+    return vertices
+
+
+def _triangles(path: Path, rows: Rows, vertices: int) -> Int32:
+    lists = next((rows.lists[name] for name in INDICES if name in rows.lists), None)
+    if lists is None:
+        raise DataError(f"{path}: the header's element 'face' has no list of one of the names {', '.join(INDICES)}")
+    if lists.values.dtype.kind == "f":
+        raise DataError(f"{path}: the indices of the faces must be integers, found {lists.values.dtype}")
+    indices = cast(npt.NDArray[np.signedinteger], lists.values)
+    few = np.flatnonzero(lists.lengths < 3)
+    if few.size:
+        k = int(few[0])
+        raise DataError(f"{path}, {rows.place(k)}: face {k} has {lists.lengths[k]} vertices, at least 3 are needed")
+    if indices.size and (indices.min() < 0 or indices.max() >= vertices):
+        wrong = int(np.argmax((indices < 0) | (indices >= vertices)))
+        k = int(np.searchsorted(np.cumsum(lists.lengths), wrong, side="right"))
+        raise DataError(f"{path}, {rows.place(k)}: face {k} has vertex {indices[wrong]}, but there are {vertices}")
+    return _fans(indices.astype(np.int32, copy=False), lists.lengths)
+
+
+def _fans(corners: Int32, lengths: Int64) -> Int32:
+    """Polygons with so many corners each as triangles (F, 3): corners 0 1 2, 0 2 3, ..."""
+    if (lengths == 3).all():
+        return corners.reshape(-1, 3)
+    triangles = lengths - 2  # of each polygon
+    corner_0 = np.repeat(_starts(lengths), triangles)
+    corner_1 = corner_0 + 1 + np.arange(len(corner_0)) - np.repeat(_starts(triangles), triangles)
+    return corners[np.stack([corner_0, corner_1, corner_1 + 1], axis=1)]
+
+
+def _starts(lengths: Int64) -> Int64:
+    return np.asarray(np.cumsum(lengths) - lengths)
+
+
+def _check_mesh(path: Path, vertices: Float32, triangles: Int32) -> None:
+    for name, array, dtype in (("vertices", vertices, np.float32), ("triangles", triangles, np.int32)):
+        if array.dtype != dtype or array.ndim != 2 or array.shape[1] != 3:
+            raise DataError(f"{path}: {name} must be (N, 3) of {np.dtype(dtype)}, found {array.shape} of {array.dtype}")
+    if not np.isfinite(vertices).all():
+        raise DataError(f"{path}: the vertices are not all finite")
+    if triangles.size and (triangles.min() < 0 or triangles.max() >= len(vertices)):
+        raise DataError(
+            f"{path}: triangles must be of vertices in [0, {len(vertices)}), found {triangles.min()} to "
+            f"{triangles.max()}"
+        )
+
+
+def _vertex_dtype(path: Path, vertices: int, properties: Mapping[str, Array]) -> np.dtype[np.void]:
+    fields = [(axis, "<f4") for axis in AXES]
+    for name, values in properties.items():
+        if name.split() != [name] or not name.isascii() or name in AXES:
+            raise DataError(f"{path}: {name!r} cannot be the name of a property beside x, y and z")
+        if values.shape != (vertices,) or values.dtype.char not in TYPE_NAMES:
+            raise DataError(
+                f"{path}: the property {name} must be ({vertices},) of a type that PLY has, "
+                f"found {values.shape} of {values.dtype}"
+            )
+        fields.append((name, values.dtype.newbyteorder("<").str))
+    return np.dtype(fields)

@@ -1,0 +1,15 @@
+"""Where a file that a parameter names is looked for, and where the configs are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+_PACKAGE = Path(__file__).resolve().parents[1]
+PROJECT_ROOT = _PACKAGE.parent  # in a checkout, what holds conf/
+CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "conf"
+"""The configs: inside the package where it was installed from a wheel, beside it in a checkout."""
+
+
+def candidates(path: Path) -> tuple[Path, ...]:
+    """The path; of a relative one, where it would be in the working, then in the project folder."""
+    return (path,) if path.is_absolute() else tuple(dict.fromkeys((Path.cwd() / path, PROJECT_ROOT / path)))

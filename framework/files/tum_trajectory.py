@@ -1,0 +1,96 @@
+"""Trajectories in the TUM format: a line a pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, metres, seconds."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from framework.data import Float64, check_rigid
+from framework.errors import DataError
+from framework.files.atomic_files import written_whole
+from framework.files.number_lines import numbers, read_lines
+
+COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is what Microsoft's C library prints for NaN
+COLUMNS = "timestamp tx ty tz qx qy qz qw"
+QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits and not another kind of number
+
+
+@dataclass(frozen=True)
+class TumLine:
+    """One line of a TUM file; whether its numbers are a pose is only told when that is asked for."""
+
+    path: Path
+    number: int  # of the line in the file, from 1
+    timestamp: float  # s
+    position: tuple[float, ...]  # (3,) m, may be NaN
+    quat_xyzw: tuple[float, ...]  # (4,), may be NaN
+
+    def pose(self) -> Float64:
+        """T_world_camera (4, 4), rigid. Raises DataError, naming file and line, when the numbers are none."""
+        norm = math.hypot(*self.quat_xyzw)
+        if not all(map(math.isfinite, (*self.position, norm))):
+            raise self.fault("the pose is not finite")
+        if abs(norm - 1) > QUATERNION_TOLERANCE:
+            raise self.fault(f"the quaternion qx qy qz qw has length {norm:.4g}, expected 1")
+        T_world_camera = np.eye(4)
+        T_world_camera[:3, :3] = Rotation.from_quat(self.quat_xyzw).as_matrix()
+        T_world_camera[:3, 3] = self.position
+        return T_world_camera
+
+    def fault(self, message: str) -> DataError:
+        return DataError(f"{self.path}, line {self.number}: {message}")
+
+
+def read_tum(path: Path) -> tuple[Float64, Float64]:
+    """Timestamps (F,) s and poses T_world_camera (F, 4, 4) of a TUM file, in the file's order.
+
+    Raises DataError, naming file and line, when a line does not hold eight finite numbers with a unit quaternion, or
+    when timestamps do not grow.
+    """
+    lines = read_tum_lines(path)
+    for before, line in pairwise(lines):
+        if line.timestamp <= before.timestamp:
+            raise line.fault(f"timestamps must grow, found {line.timestamp:.12g} after {before.timestamp:.12g}")
+    timestamps = np.array([line.timestamp for line in lines], np.float64)
+    return timestamps, np.array([line.pose() for line in lines], np.float64).reshape(-1, 4, 4)
+
+
+def read_tum_lines(path: Path) -> list[TumLine]:
+    """The lines of a TUM file; empty ones and what follows a `#` are skipped.
+
+    Raises DataError, naming file and line, when one does not hold eight numbers, the first of them finite.
+    """
+    lines = read_lines(path, missing="does not exist: expected a trajectory in TUM format")
+    words = [COMMENT.sub("", line).split() for line in lines]
+    return [_line(path, number, found) for number, found in enumerate(words, start=1) if found]
+
+
+def write_tum(path: Path, timestamps: Sequence[float] | Float64, poses: Sequence[Float64] | Float64) -> None:
+    """Writes T_world_camera (4, 4) of each timestamp, whole or not at all; `read_tum` gives them back to 1e-9.
+
+    Raises DataError when there are not equally many, a pose is not rigid, or the disk does not take the file.
+    """
+    if len(timestamps) != len(poses):
+        raise DataError(f"{path}: {len(timestamps)} timestamps for {len(poses)} poses; there must be equally many")
+    for k, T in enumerate(poses):
+        check_rigid(f"{path}: pose {k}", T)
+    T_all = np.array(poses, np.float64).reshape(-1, 4, 4)
+    quat_xyzw = Rotation.from_matrix(T_all[:, :3, :3]).as_quat(canonical=True) if len(T_all) else np.zeros((0, 4))
+    rows = np.column_stack([T_all[:, :3, 3], quat_xyzw])
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for timestamp, row in zip(timestamps, rows, strict=True):
+            file.write(f"{timestamp:.9f} " + " ".join(f"{value:.12g}" for value in row) + "\n")
+
+
+def _line(path: Path, number: int, words: list[str]) -> TumLine:
+    values = numbers(f"{path}, line {number}", words, len(COLUMNS.split()), COLUMNS)
+    if not math.isfinite(values[0]):
+        raise DataError(f"{path}, line {number}: the timestamp is not finite")
+    return TumLine(path, number, values[0], tuple(values[1:4]), tuple(values[4:]))

@@ -1,1 +1,0 @@
-"""The parts of a PLY file: its header, and its rows as bytes or as text."""

@@ -1,0 +1,56 @@
+"""The map's surface as a binary PLY file, written and read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Array, InstanceMesh
+from framework.errors import DataError
+from framework.files.ply import read_ply, write_ply
+
+CHANNELS = ("red", "green", "blue")
+TYPES = {**dict.fromkeys(CHANNELS, np.uint8), "instance": np.int32, "class": np.int32}
+"""The properties of a vertex beside its place."""
+
+CLASSES = "classes "  # begins the comment that names the classes
+
+
+def write_mesh(path: Path, mesh: InstanceMesh) -> None:
+    """Writes `mesh` as a binary little-endian PLY: vertex x y z [m], red green blue, instance (0 = none), class.
+
+    `class` is an index into the comment line `classes`, -1 = none.
+    """
+    properties: dict[str, Array] = {
+        **{channel: mesh.colors[:, k] for k, channel in enumerate(CHANNELS)},
+        "instance": mesh.instance_ids,
+        "class": mesh.class_ids,
+    }
+    comments = (
+        "InstanceMap; metres; instance 0 = none; class -1 = none, else an index into:",
+        f"{CLASSES}{','.join(mesh.classes)}",
+    )
+    write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
+
+
+def read_mesh(path: Path) -> InstanceMesh:
+    """The mesh that `write_mesh` wrote, exactly. Raises DataError, naming the file, for anything else."""
+    ply = read_ply(path)
+    for name, kind in TYPES.items():
+        if name not in ply.properties or ply.properties[name].dtype != kind:
+            raise DataError(f"{path} is not a run's mesh: its vertices have no property {name!r} of {np.dtype(kind)}")
+    class_lines = [comment for comment in ply.comments if f"{comment} ".startswith(CLASSES)]
+    if len(class_lines) != 1:
+        raise DataError(
+            f"{path} is not a run's mesh: expected one line 'comment {CLASSES}...', found {len(class_lines)}"
+        )
+    names = class_lines[0][len(CLASSES) :]
+    return InstanceMesh(
+        vertices=ply.vertices,
+        triangles=ply.triangles,
+        colors=np.stack([ply.properties[channel] for channel in CHANNELS], axis=1).astype(np.uint8),
+        instance_ids=ply.properties["instance"].astype(np.int32),
+        class_ids=ply.properties["class"].astype(np.int32),
+        classes=tuple(names.split(",")) if names else (),
+    )

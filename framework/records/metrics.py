@@ -1,0 +1,98 @@
+"""The figures of one run: the flat dictionary that becomes metrics.json."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
+from framework.evaluation import instances, trajectory
+from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.interfaces import RGBDSequence
+from framework.journal import RunResult
+
+Metrics = dict[str, float | int | str | bool | None]
+
+MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, given for both transfers
+TRUTH = "truth_sha256"  # the key that says which true instances the run was compared with
+STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
+
+
+def run_metrics(result: RunResult) -> Metrics:
+    """Counts, speed, time by stage and the size of the map."""
+    metrics: Metrics = {
+        "frames": result.frames,
+        "frames_lost": result.frames_lost,
+        "frames_skipped": result.frames_skipped,
+        "fps": result.fps,
+        "fps_median": result.fps_median,
+        "pose_source": pose_source(result),
+        "map.voxels": result.scene.voxel_count,
+        "map.bytes": result.scene.byte_count,
+        "map.evictions": result.scene.evictions,
+    }
+    for stage in STAGES_TIMED:
+        milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
+        metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
+        metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
+    return metrics
+
+
+def pose_source(result: RunResult) -> str:
+    """`ground_truth` where each pose is exactly the frame's true one, so that nothing was tracked; else `tracked`."""
+    exact = [
+        frame.T_world_camera_truth is not None and np.array_equal(frame.pose.T_world_camera, frame.T_world_camera_truth)
+        for frame in result.tracked
+    ]
+    return "ground_truth" if exact and all(exact) else "tracked"
+
+
+def trajectory_metrics(result: RunResult) -> Metrics:
+    """The error of the poses that were not lost; nothing where no true pose is known."""
+    reference: list[Float64 | None] = [None] * result.frames  # a step over a skipped frame is no step of one frame
+    estimated = [Pose(np.eye(4), lost=True)] * result.frames
+    for frame in result.tracked:
+        reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
+    return dict(trajectory.evaluate(reference, estimated).metrics())
+
+
+def instance_metrics(
+    sequence: RGBDSequence, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
+) -> Metrics:
+    """How many instances were found and, where the true ones are known, how well."""
+    count: Metrics = {"instances.count": len(found)}
+    truth = sequence.scene_truth()
+    if truth is None:
+        return count
+    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, sequence.annotation)
+
+
+def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:
+    """The figures of `InstanceEvaluation.metrics`, and the main ones of the other transfer as `instances.to_map.`...
+
+    `annotation_release` names the release of the truth, None = there is but one; `truth_sha256` tells it from others.
+    """
+    figures = instances.evaluate(predictions, truth).metrics()
+    to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
+    of_map = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
+    return {**figures, **of_map, "annotation_release": annotation or None, TRUTH: _sha256(truth)}
+
+
+def _sha256(truth: SceneTruth) -> str:
+    """Of all that predictions are compared with."""
+    digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
+    for array in (truth.points_world, truth.instance_ids):
+        digest.update(np.ascontiguousarray(array).data)
+    return digest.hexdigest()
+
+
+def is_evaluation(key: str) -> bool:
+    """Whether a key of metrics.json is one that `evaluation_metrics` writes."""
+    return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
+
+
+def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:
+    """The most probable class of an instance; None where the map knows no classes."""
+    return classes[int(np.argmax(instance.class_probabilities))] if classes else None

@@ -1,0 +1,187 @@
+"""The records that runs have left behind, read back: which are complete, and what became of the others."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+from yaml import YAMLError
+
+from framework.errors import DataError
+from framework.files.json_file import read_json
+from framework.records.provenance import code_version, config_hash
+
+CONFIG = "config.yaml"
+METRICS = "metrics.json"  # there exactly when the run completed
+PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
+LOG = "instancemap.log"
+EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
+
+_LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
+
+log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A completed run."""
+
+    directory: Path
+    metrics: Mapping[str, Any]  # flat; None = not defined
+    config: Mapping[str, Any]  # resolved
+    written: float  # s, when, as the file system tells
+
+    @property
+    def commit(self) -> str:
+        return commit_of(self.metrics)
+
+    @property
+    def code(self) -> str:
+        """What ran, and what evaluated it where that is other code."""
+        anew = {
+            key.removeprefix(EVALUATION): value for key, value in self.metrics.items() if key.startswith(EVALUATION)
+        }
+        evaluator = commit_of(anew) if anew else self.commit
+        return self.commit if evaluator == self.commit else f"{self.commit}, evaluated by {evaluator}"
+
+    @property
+    def annotation(self) -> str:
+        """Which release of the true instances the run was compared with; "" = the dataset does not say."""
+        return str(self.metrics.get("annotation_release") or "")
+
+
+@dataclass(frozen=True)
+class Incomplete:
+    """A run without a record that can be used, and why."""
+
+    directory: Path
+    reason: str
+
+
+WITH_CHANGES = " with changes"  # ends the name of code that is no commit
+
+
+def commit_of(metrics: Mapping[str, Any]) -> str:
+    """The code that ran, short: "7dcc5d0", "7dcc5d0 with changes" or "unknown"."""
+    changes = WITH_CHANGES if metrics.get("git_dirty") is True else ""
+    return f"{str(metrics.get('git_commit'))[:7]}{changes}"
+
+
+def read_record(directory: Path) -> Record:
+    """The record of the completed run in `directory`.
+
+    Raises DataError, naming the file, when one cannot be read or the two are not of the same run.
+    """
+    metrics, config = _read_flat(directory / METRICS), read_yaml(directory / CONFIG)
+    if metrics.get("config_hash") != config_hash(config):
+        raise DataError(f"{directory / METRICS} is not of the config beside it: config_hash differs; run it again")
+    try:
+        written = (directory / METRICS).stat().st_mtime
+    except OSError as error:  # the run has just begun again
+        raise DataError(f"{directory / METRICS} cannot be read: {error.strerror}") from error
+    return Record(directory, metrics, config, written)
+
+
+def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
+    """All runs at and below `root`, by path: those that completed, and the others."""
+    records: list[Record] = []
+    others: list[Incomplete] = []
+    for directory in _run_directories(root):
+        if not (directory / METRICS).exists():
+            others.append(Incomplete(directory, _why_incomplete(directory)))
+            continue
+        try:
+            records.append(read_record(directory))
+        except DataError as error:
+            others.append(Incomplete(directory, str(error)))
+    return records, others
+
+
+def is_recorded(directory: Path, config: DictConfig) -> bool:
+    """Whether `directory` holds the complete record of a run of this very config, and says so in the log.
+
+    The record may be of another commit: most commits change no result, and the tables name those of all their runs.
+    """
+    if not (directory / METRICS).exists():
+        return False
+    try:
+        record = read_record(directory)
+    except DataError as error:
+        log.warning("run again: %s", error)
+        return False
+    resolved = OmegaConf.to_container(config, resolve=True)
+    assert isinstance(resolved, dict)
+    if record.metrics["config_hash"] != config_hash({str(key): value for key, value in resolved.items()}):
+        log.info("run again: the record in %s is of another config", directory)
+        return False
+    now = commit_of(code_version())
+    if record.commit == now and not now.endswith(WITH_CHANGES):  # two trees with changes may differ
+        log.info("kept: the complete record in %s", directory)
+    else:
+        message = "kept: the complete record in %s, of commit %s; this is %s, and resume=false would run it again"
+        log.warning(message, directory, record.commit, now)
+    return True
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file with keys and values, interpolations unresolved. Raises DataError, naming the file."""
+    try:
+        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
+    except FileNotFoundError as error:
+        raise DataError(f"{path} is missing") from error
+    except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError) as error:
+        raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold keys and values, found a list")
+    return {str(key): _with_text_keys(value) for key, value in content.items()}
+
+
+def _with_text_keys(node: Any) -> Any:
+    """With text for every key, as in JSON: YAML takes 1 and true for something else, and such keys have no order."""
+    if isinstance(node, dict):
+        return {str(key): _with_text_keys(value) for key, value in node.items()}
+    return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
+
+
+def _read_flat(path: Path) -> dict[str, Any]:
+    content = read_json(path)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} must hold an object, found {type(content).__name__}")
+    if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
+        raise DataError(f"{path} must be flat, found more below {nested[0]!r}")
+    return content
+
+
+def _run_directories(root: Path) -> Iterator[Path]:
+    for path, folders, files in os.walk(root):
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        if not {METRICS, PARTIAL_METRICS, LOG}.isdisjoint(files):
+            yield Path(path)
+
+
+def _why_incomplete(directory: Path) -> str:
+    """In words. A job's fault is the last line of its log, but for a traceback."""
+    if (directory / PARTIAL_METRICS).exists():
+        try:
+            return f"partial: {_read_flat(directory / PARTIAL_METRICS).get('partial')}"
+        except DataError as error:
+            return str(error)
+    try:
+        lines = (directory / LOG).read_text(errors="replace").splitlines()
+    except OSError:
+        lines = []
+    matches = [match for match in map(_LOG_LINE.match, lines) if match]
+    if matches and matches[-1]["level"] in ("ERROR", "CRITICAL"):
+        return f"failed: {matches[-1]['message']}"
+    return "not complete: running, or killed"
+
+
+def _first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__

@@ -1,0 +1,1 @@
+"""Pictures of surfaces: a rasterizer, light, and the overview of a map."""

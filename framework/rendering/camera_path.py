@@ -1,0 +1,52 @@
+"""The way of the camera, as it is seen in the picture of a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from PIL import Image, ImageDraw
+
+from framework.data import Bool, Camera, Float64, UInt8
+from framework.geometry import inverse, project, transform
+from framework.rendering.palette import PAPER
+from framework.rendering.surface import Hits
+
+PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """Where a moving camera was, in the pixels of another one that looks at the scene."""
+
+    pixels: Float64  # (F, 2) u v
+    hidden: Bool  # (F,) behind the surface
+
+    @classmethod
+    def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> CameraPath:
+        """The positions of `poses` (F, 4, 4) that lie before `camera`, which sees the surface as `hits`."""
+        positions = poses[:, :3, 3]
+        points = transform(inverse(T_world_camera), positions)
+        points = points[points[:, 2] > 0.05]
+        pixels = project(camera, points)
+        u, v = np.rint(pixels).astype(int).T
+        inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
+        depth = np.zeros(len(points))
+        depth[inside] = hits.depth[v[inside], u[inside]]
+        return cls(np.asarray(pixels, np.float64), (depth > 0) & (depth < points[:, 2]))
+
+    def shades(self) -> UInt8:
+        """(F, 3) RGB: blue at the beginning, orange at the end."""
+        share = np.linspace(0, 1, max(2, len(self.pixels)))[: len(self.pixels), None]
+        mixed = (1 - share) * np.array(PATH_START) + share * np.array(PATH_END)
+        return np.asarray(np.rint(mixed), np.uint8)
+
+    def draw(self, image: Image.Image) -> None:
+        """A line with dots at its ends; thin where something stands before it."""
+        canvas = ImageDraw.Draw(image)
+        points = [tuple(pixel) for pixel in self.pixels.tolist()]
+        shades = [tuple(shade) for shade in self.shades().tolist()]
+        for k in range(len(points) - 1):  # segments of a line, not pixels
+            canvas.line((points[k], points[k + 1]), shades[k], width=1 if self.hidden[k] else 3)
+        for (u, v), color in zip(points[:1] + points[-1:], (PATH_START, PATH_END), strict=False):
+            canvas.ellipse((u - 6, v - 6, u + 6, v + 6), fill=color, outline=PAPER, width=2)

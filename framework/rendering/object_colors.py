@@ -1,0 +1,60 @@
+"""Which objects of a map are which of another one, so that the same object has the same colour in several pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from framework.data import Int32, SceneTruth, UInt8
+from framework.rendering.palette import DARK, instance_colors
+
+SAME_OBJECT_IOU = 0.25  # overlap, on what is mapped, from which two instances are one object
+UNKNOWN = (206, 184, 152)  # RGB of true instances whose class nobody knows: what is found there is not evaluated
+
+
+class ObjectColors:
+    """The objects of one scene in several maps of it, numbered from 1: the true ones, and what only a map has."""
+
+    def __init__(self, truth: SceneTruth) -> None:
+        ids = np.setdiff1d(truth.instance_ids, [0]).tolist()
+        self.true_objects = {key: k for k, key in enumerate(ids, start=1)}  # by true instance
+        self.name_of = {k: name for key, k in self.true_objects.items() if (name := truth.class_names.get(key))}
+        self.color_of: dict[int, UInt8] = dict.fromkeys(self.true_objects.values(), np.array(UNKNOWN, np.uint8))  # (3,)
+        named = [key for key in ids if self.true_objects[key] in self.name_of]
+        centroids = [truth.points_world[truth.instance_ids == key].mean(axis=0) for key in named]
+        colors = instance_colors(np.array(centroids, np.float64).reshape(-1, 3))
+        self.color_of |= {self.true_objects[key]: color for key, color in zip(named, colors, strict=True)}
+
+    def objects(self, ids: Int32, true_ids: Int32) -> dict[int, int]:
+        """The object that each of a map's instances is: a true one, or one of its own in a dark shade.
+
+        Both are labels (V,) of the same points, 0 = none.
+        """
+        same = {key: self.true_objects[true] for key, true in same_objects(ids, true_ids).items()}
+        others = np.setdiff1d(ids, [0, *same]).tolist()
+        own = {key: k for k, key in enumerate(others, start=1 + len(self.color_of))}
+        self.color_of |= dict(zip(own.values(), instance_colors(np.zeros((len(own), 3)), DARK), strict=True))
+        return same | own
+
+
+def same_objects(ids: Int32, true_ids: Int32) -> dict[int, int]:
+    """The true instance that each instance is; both are labels (V,) of the same points, 0 = none.
+
+    One to one, with the largest sum of IoU. Instances that overlap none by SAME_OBJECT_IOU are not in it.
+    """
+    found, mine = np.unique(ids, return_inverse=True)
+    true, theirs = np.unique(true_ids, return_inverse=True)
+    common = np.bincount(mine * len(true) + theirs, minlength=len(found) * len(true)).reshape(len(found), len(true))
+    iou = common / np.maximum(common.sum(axis=1)[:, None] + common.sum(axis=0)[None] - common, 1)
+    iou[found == 0] = 0
+    iou[:, true == 0] = 0
+    pairs = zip(*linear_sum_assignment(-iou), strict=True)
+    return {int(found[k]): int(true[t]) for k, t in pairs if iou[k, t] >= SAME_OBJECT_IOU}
+
+
+def relabeled(ids: Int32, object_of: Mapping[int, int]) -> Int32:
+    """`ids` (V,) as objects, 0 where none."""
+    values, inverse = np.unique(ids, return_inverse=True)
+    return np.array([object_of.get(key, 0) for key in values.tolist()], np.int32)[inverse]

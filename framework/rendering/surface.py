@@ -1,0 +1,169 @@
+"""Pictures of a triangle surface by rasterization: no window system, no OpenGL."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+from numba import njit
+
+from framework.data import Array, Bool, Camera, Float32, Float64, Int32
+from framework.rendering.rasterizer import NO_TRIANGLE, Rasterizer, VisibilityBuffer
+
+VOTES = 20000  # triangles that are asked which of their sides was seen
+VOTERS = 50  # cameras that are asked
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What each pixel of a camera sees of a surface."""
+
+    camera: Camera
+    buffer: VisibilityBuffer
+    vertices: Float32  # (V, 3) m, world
+    triangles: Int32  # (F, 3), those that `buffer` counts
+
+    @property
+    def depth(self) -> Float32:
+        """(H, W) m along z, 0 = nothing."""
+        return self.buffer.depth
+
+    @property
+    def seen(self) -> Bool:
+        """(H, W)."""
+        return np.asarray(self.buffer.triangle != NO_TRIANGLE)
+
+    @property
+    def points_world(self) -> Float32:
+        """(H, W, 3) m, 0 where nothing is seen."""
+        return self.interpolated(self.vertices)
+
+    def every(self, n: int) -> Hits:
+        """The picture of each n-th pixel."""
+        seen, c = self.buffer, self.camera
+        triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])
+        height, width = depth.shape
+        camera = Camera(width, height, c.fx / n, c.fy / n, c.cx / n, c.cy / n)
+        buffer = VisibilityBuffer(triangle, depth, np.ascontiguousarray(seen.uv[::n, ::n]))
+        return replace(self, camera=camera, buffer=buffer)
+
+    def interpolated(self, values: Float32) -> Float32:
+        """(H, W, C) of values (V, C) at the vertices, 0 where nothing is seen."""
+        image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
+        _interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
+        return image
+
+    def nearest(self, labels: Int32) -> Int32:
+        """(H, W) the label (V,) of the nearest corner, 0 where nothing is seen."""
+        return self.buffer.nearest(self.triangles, labels)
+
+
+class Surface:
+    """Triangles whose winding says which side is the front: the side that was seen."""
+
+    def __init__(self, vertices: Float32, triangles: Int32) -> None:
+        self.vertices = np.ascontiguousarray(vertices, np.float32)  # (V, 3) m
+        self.triangles = np.ascontiguousarray(triangles, np.int32)  # (F, 3)
+
+    @classmethod
+    def seen_from(cls, vertices: Float32, triangles: Int32, poses: Float64) -> Surface:
+        """The surface wound so that most of what lies before the cameras at `poses` (F, 4, 4) shows them its front.
+
+        Mesh extractors do not agree on the winding.
+        """
+        some = cls(vertices, triangles[:: max(1, len(triangles) // VOTES)])
+        centers = vertices[some.triangles].mean(axis=1)
+        votes = 0.0
+        for T_world_camera in poses[:: max(1, len(poses) // VOTERS)]:
+            rays = centers - T_world_camera[:3, 3]
+            distance = np.linalg.norm(rays, axis=1)
+            ahead = rays @ T_world_camera[:3, 2] > 0.8 * distance
+            towards = -(some.face_normals * rays).sum(axis=1)[ahead] / np.maximum(distance[ahead], 1e-6) ** 3
+            votes += float(towards.sum())
+        return cls(vertices, triangles if votes >= 0 else triangles[:, ::-1])
+
+    @cached_property
+    def face_normals(self) -> Float32:
+        """(F, 3), length = twice the area, so that sums of them weigh by area."""
+        normals = np.empty(self.triangles.shape, np.float32)
+        _face_normals(self.vertices, self.triangles, normals)
+        return normals
+
+    @cached_property
+    def vertex_normals(self) -> Float32:
+        """(V, 3) unit length, averaged over the triangles around each vertex by area."""
+        normals = np.empty(self.vertices.shape, np.float32)
+        _vertex_normals(self.face_normals, self.triangles, normals)
+        return normals
+
+
+class FrontSides:
+    """The triangles of a surface that face an eye: not the walls and ceilings between it and the room."""
+
+    def __init__(self, surface: Surface, eye_world: Float64) -> None:
+        self._eye_world = eye_world  # (3,) m
+        self._vertices = surface.vertices
+        facing = _facing(surface.vertices, surface.triangles, surface.face_normals, eye_world.astype(np.float32))
+        self._triangles = surface.triangles[facing]
+        self._rasterizer = Rasterizer(self._vertices, self._triangles)
+
+    def seen_by(self, camera: Camera, R_world_camera: Float64) -> Hits:
+        """What a camera at the eye sees along each pixel's ray."""
+        T_world_camera = np.eye(4)
+        T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, self._eye_world
+        return Hits(camera, self._rasterizer.draw(camera, T_world_camera), self._vertices, self._triangles)
+
+
+@njit(cache=True, nogil=True)
+def _interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32, image: Float32) -> None:
+    for v in range(triangle.shape[0]):
+        for u in range(triangle.shape[1]):
+            f = triangle[v, u]
+            if f == NO_TRIANGLE:
+                continue
+            a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+            wb, wc = uv[v, u, 0], uv[v, u, 1]
+            wa = np.float32(1) - wb - wc
+            for k in range(values.shape[1]):
+                image[v, u, k] = wa * values[a, k] + wb * values[b, k] + wc * values[c, k]
+
+
+@njit(cache=True, nogil=True)
+def _face_normals(vertices: Float32, triangles: Int32, normals: Float32) -> None:
+    for f in range(len(triangles)):
+        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
+        px, py, pz = _edge(vertices, a, b)
+        qx, qy, qz = _edge(vertices, a, c)
+        normals[f, 0], normals[f, 1], normals[f, 2] = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _edge(vertices, a, b):  # type: ignore[no-untyped-def]
+    return vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
+
+
+@njit(cache=True, nogil=True)
+def _vertex_normals(face_normals: Float32, triangles: Int32, normals: Float32) -> None:
+    sums = np.zeros(normals.shape)
+    for f in range(len(triangles)):
+        for corner in range(3):
+            for k in range(3):
+                sums[triangles[f, corner], k] += face_normals[f, k]
+    for i in range(len(normals)):
+        length = max(np.sqrt(sums[i, 0] ** 2 + sums[i, 1] ** 2 + sums[i, 2] ** 2), 1e-12)
+        for k in range(3):
+            normals[i, k] = sums[i, k] / length
+
+
+@njit(cache=True, nogil=True)
+def _facing(vertices: Float32, triangles: Int32, normals: Float32, eye: Float32) -> Array:
+    """(F,) whether a triangle turns its front to the eye."""
+    facing = np.empty(len(triangles), np.bool_)
+    for f in range(len(triangles)):
+        a = triangles[f, 0]
+        towards = np.float32(0)
+        for k in range(3):
+            towards += normals[f, k] * (vertices[a, k] - eye[k])
+        facing[f] = towards < 0
+    return facing

@@ -1,0 +1,152 @@
+"""From where to look at a map: obliquely from above, into the room, with as many objects in buffer as there can be."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from framework.data import Camera, Float32, Float64, Int32
+from framework.rendering.surface import Surface
+
+FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, so that far objects are not much smaller than near ones
+ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
+AZIMUTHS = 16  # candidates around the vertical
+MARGIN = 1.04  # of free space around what is shown
+TRIAL_WIDTH, TRIAL_HEIGHT = 96, 72  # px, of the small pictures that candidates are judged by
+TRIAL_POINTS = 60000  # vertices in those pictures
+LEVEL_CONE_RAD = np.deg2rad(30)  # floors and tables are looked for this near to the cameras' mean upward direction
+
+
+def upward(poses: Float64, surface: Surface) -> Float64:
+    """(3,) the direction up in the world: the mean of the cameras' -y axes, straightened by floors and table tops.
+
+    The world's axes say nothing: z-up, y-up and the first camera's frame all exist.
+    """
+    up = -poses[:, :3, 1].mean(axis=0)
+    up /= np.linalg.norm(up)
+    cone = LEVEL_CONE_RAD
+    for _ in range(5):  # mean shift with a narrowing cone
+        mean, share = _level(surface.face_normals, up, np.cos(cone))
+        if share < 0.02 or np.linalg.norm(mean) == 0:
+            return np.asarray(up)
+        up = mean / np.linalg.norm(mean)
+        cone = max(cone / 1.5, np.deg2rad(6))
+    return np.asarray(up)
+
+
+def best_view(surface: Surface, instance_ids: Int32, poses: Float64, width: int, height: int) -> tuple[Camera, Float64]:
+    """The camera of width x height px and its T_world_camera that show most.
+
+    Args:
+        instance_ids: (V,) of the surface's vertices, 0 = no instance.
+        poses: (F, 4, 4) of the cameras that saw the surface.
+    """
+    up = upward(poses, surface)
+    forward = poses[:, :3, 2].mean(axis=0)
+    forward -= (forward @ up) * up
+    if np.linalg.norm(forward) < 0.1:  # the cameras looked all around
+        forward = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    forward /= np.linalg.norm(forward)
+    side = np.cross(forward, up)
+
+    chosen = slice(None, None, max(1, len(surface.vertices) // TRIAL_POINTS))
+    points, normals = surface.vertices[chosen], surface.vertex_normals[chosen]
+    bulk = _without_strays(points)
+    best_score, shown = -np.inf, points
+    R = np.eye(3)
+    for elevation in ELEVATIONS_RAD:
+        for azimuth in 2 * np.pi * np.arange(AZIMUTHS) / AZIMUTHS:
+            level = np.cos(azimuth) * forward + np.sin(azimuth) * side
+            R_trial = looking(np.cos(elevation) * level - np.sin(elevation) * up, up)
+            visible = _visible(points, normals, *_framed(R_trial, bulk, TRIAL_WIDTH, TRIAL_HEIGHT))
+            score = _score(instance_ids[chosen][visible])
+            score *= 1 + 0.15 * np.cos(azimuth)  # between equals, the way that the cameras looked
+            if score > best_score:
+                best_score, R, shown = score, R_trial, points[visible]
+    # framed for what is seen: the ceiling and the near walls, which are looked through, need no room
+    return fitted(R, shown, width, height)
+
+
+def looking(forward: Float64, up: Float64) -> Float64:
+    """(3, 3) the rotation of a camera that looks along `forward` (3,) with `up` (3,) upwards in its picture."""
+    z = forward / np.linalg.norm(forward)
+    x = np.cross(z, up)
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z], axis=1)
+
+
+def fitted(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
+    """A camera with this rotation, as near as it can be with the points (P, 3) in its picture of width x height px."""
+    return _framed(R_world_camera, _without_strays(points_world), width, height)
+
+
+def _without_strays(points: Float32) -> Float32:
+    """Points (P, 3) less those at the border of a map that lie apart."""
+    low, high = np.percentile(points, [0.3, 99.7], axis=0)
+    kept = points[((points >= low) & (points <= high)).all(axis=1)]
+    return kept if len(kept) else points
+
+
+def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: int) -> tuple[Camera, Float64]:
+    """`fitted`, with all the points in the picture."""
+    focal = height / 2 / np.tan(FIELD_OF_VIEW_RAD / 2)
+    camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+    x, y, z = R_world_camera.T @ points_world.T
+    # |x - x0| <= tan_x (z - z0) for all points; the extreme lines of either side meet where the camera must be
+    tan_x, tan_y = width / 2 / focal / MARGIN, height / 2 / focal / MARGIN
+    right, left = (x - tan_x * z).max(), (x + tan_x * z).min()
+    below, above = (y - tan_y * z).max(), (y + tan_y * z).min()
+    nearest = min(-(right - left) / (2 * tan_x), -(below - above) / (2 * tan_y), z.min() - 0.1)
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = R_world_camera
+    T_world_camera[:3, 3] = R_world_camera @ [(right + left) / 2, (below + above) / 2, nearest]
+    return camera, T_world_camera
+
+
+def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
+    """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
+    nearest = np.full(camera.shape, -1, np.int32)
+    _draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
+    return np.asarray(nearest[nearest >= 0])
+
+
+def _score(instance_ids: Int32) -> float:
+    """How much a picture shows, given its pixels' ids. Square roots: ten objects are worth more than a large one."""
+    return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))
+
+
+@njit(cache=True, nogil=True)
+def _level(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
+    """The sum (3,) of the normals (F, 3) within a cone around `up` (3,), and their share of the area."""
+    total, inside, area = np.zeros(3), 0.0, 0.0
+    for f in range(len(normals)):
+        x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
+        size = np.sqrt(x * x + y * y + z * z)
+        area += size
+        if x * up[0] + y * up[1] + z * up[2] > cosine * size:
+            inside += size
+            total[0], total[1], total[2] = total[0] + x, total[1] + y, total[2] + z
+    return total, inside / max(area, 1e-12)
+
+
+@njit(cache=True, nogil=True)
+def _draw_fronts(
+    points: Float32,
+    normals: Float32,
+    T: Float64,
+    intrinsics: tuple[float, float, float, float],
+    nearest: Int32,
+) -> None:
+    """Writes which point (P, 3) is the nearest (H, W) of those that turn their front to the camera, T_world_camera."""
+    fx, fy, cx, cy = intrinsics
+    height, width = nearest.shape
+    depth = np.full(nearest.shape, np.inf)
+    for i in range(len(points)):
+        x, y, z = points[i, 0] - T[0, 3], points[i, 1] - T[1, 3], points[i, 2] - T[2, 3]
+        distance = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
+        if x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2] >= 0 or distance <= 0:
+            continue
+        u = int(np.rint(fx * (T[0, 0] * x + T[1, 0] * y + T[2, 0] * z) / distance + cx))
+        v = int(np.rint(fy * (T[0, 1] * x + T[1, 1] * y + T[2, 1] * z) / distance + cy))
+        if 0 <= u < width and 0 <= v < height and distance < depth[v, u]:
+            depth[v, u], nearest[v, u] = distance, i

@@ -1,0 +1,1 @@
+"""Maps of the systems that we are compared with, re-implemented or off the shelf."""

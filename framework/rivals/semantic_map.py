@@ -1,0 +1,137 @@
+"""A map that knows classes and no instances: these are found, when asked for, as connected surface of one class."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+from numba import njit, prange
+
+from framework.data import Camera, Float64, Instance, InstanceMesh, View
+from framework.mapping.instance_list import aligned_box, oriented_box, vertices_by_id, vertices_of_area
+from framework.mapping.map_file import read_map, write_map
+from framework.mapping.raycasting import render_surface, voxel_seen
+from framework.mapping.sensor import Sensor, pinhole
+from framework.mapping.tsdf_map import BLOCK_ARRAYS, TsdfMap, saved_sensor
+from framework.rivals.class_evidence import ClassEvidence, ClassRows, best_class
+from framework.rivals.connected_components import connected_components, opinions, vertex_classes
+
+FORMAT = "semantic 1"  # of the saved file; a change of meaning counts it up
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _label_view(grid, evidence, log_missed, view, depth, class_ids):
+    """Fills class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m."""
+    for v in prange(depth.shape[0]):
+        key = np.int64(-2)
+        region = np.int32(-1)
+        for u in range(depth.shape[1]):
+            class_ids[v, u] = -1
+            if depth[v, u] > 0:
+                block, n, key, region = voxel_seen(grid, view, u, v, depth[v, u], key, region)
+                if block >= 0:
+                    class_ids[v, u] = best_class(grid, evidence, log_missed, block, n)
+
+
+class SemanticMap(TsdfMap):
+    """A TSDF with a distribution over the classes and the background in its voxels.
+
+    `missed` is the probability that a surface of any class lies under no mask of a frame that sees it. An instance has
+    an id only in the mesh as it is now: more frames may give the same object another one.
+    """
+
+    def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int, missed: float, min_area: float) -> None:
+        super().__init__(voxel_size, sensor, max_blocks)
+        self.classes: tuple[str, ...] = ()
+        self.missed = missed
+        self.min_area = min_area
+        self.labels = ClassRows(self.voxels)
+
+    def begin(self, classes: tuple[str, ...]) -> None:
+        """Takes the first frame's label space for the map's."""
+        self.classes = classes
+        self.labels.begin(len(classes))
+
+    @property
+    def byte_count(self) -> int:
+        return self.voxels.byte_count + self.labels.byte_count
+
+    @property
+    def evictions(self) -> int:
+        return self.labels.evicted
+
+    @property
+    def instance_count(self) -> int:
+        """Without their boxes."""
+        return int(self.mesh().instance_ids.max(initial=0))
+
+    @property
+    def _log_missed(self) -> np.float32:
+        return np.float32(np.log(self.missed))
+
+    def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        """Surface and classes. Voxels know no instance, so that it shows none."""
+        surface = render_surface(self.voxels, self.sensor, camera, T_world_camera)
+        class_ids = np.empty(camera.shape, np.int32)
+        view = pinhole(camera, T_world_camera)
+        _label_view(self.voxels.grid, self.labels.evidence, self._log_missed, view, surface.depth, class_ids)
+        return View(**vars(surface), instance_ids=np.zeros(camera.shape, np.int32), class_ids=class_ids)
+
+    def labeled_mesh(self) -> InstanceMesh:
+        surface = self._surface.extract()
+        colors, class_ids = vertex_classes(self.voxels.grid, self.labels.evidence, self._log_missed, surface)
+        least = vertices_of_area(self.min_area, self.voxel_size)
+        instance_ids = connected_components(surface.triangles, class_ids, least)
+        class_ids[instance_ids == 0] = -1
+        return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
+
+    def instances(self) -> Mapping[int, Instance]:
+        """The components of the mesh.
+
+        A component's distribution is the mean of those of its vertices' nearest voxels, without the background; its
+        confidence is the mean probability of its class, background included: what share of its surface the map
+        believes to be of that class. Observations are the most frames in which one of these voxels was under a mask.
+        """
+        mesh = self.mesh()
+        surface = self._surface.extract()
+        said = opinions(
+            self.voxels.grid, self.labels.evidence, self._log_missed, surface, mesh.instance_ids, len(self.classes)
+        )
+        instances = {}
+        for k, vertices in vertices_by_id(mesh.instance_ids).items():
+            sums, points = said.probability_sums[k], mesh.vertices[vertices]
+            instances[k] = Instance(
+                id=k,
+                class_probabilities=(sums / sums.sum()).astype(np.float32),
+                confidence=float(sums[mesh.class_ids[vertices[0]]] / said.vertices[k]),
+                observations=int(said.masked[k]),
+                first_frame=int(said.first_frame[k]),
+                last_frame=int(said.last_frame[k]),
+                vertices=vertices,
+                aabb=aligned_box(points),
+                obb=oriented_box(points),
+            )
+        return instances
+
+    def save(self, path: Path) -> None:
+        header, arrays = self.saved_voxels()
+        header |= {
+            "format": FORMAT,
+            "missed": self.missed,
+            "min_area": self.min_area,
+            "classes": self.classes,
+            "evicted": self.labels.evicted,
+        }
+        write_map(path, header, arrays | self.labels.saved())
+
+    @classmethod
+    def load(cls, path: Path) -> SemanticMap:
+        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
+        sensor = saved_sensor(header["sensor"])
+        scene = cls(header["voxel_size"], sensor, header["max_blocks"], header["missed"], header["min_area"])
+        scene.begin(tuple(header["classes"]))
+        scene.fill_voxels(arrays)
+        scene.labels.fill(arrays)
+        scene.labels.evicted = header["evicted"]
+        return scene

@@ -1,0 +1,118 @@
+"""Tables, and books to lie on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from framework.synthetic import paints
+from framework.synthetic.furniture.piece import Furniture, Rng, corners
+from framework.synthetic.furniture.solids import Section, leg, loft, rounded_box
+from framework.synthetic.textures import Material, Texture
+
+
+def dining_table(rng: Rng) -> Furniture:
+    round_top = rng.uniform() < 0.3
+    top_material = paints.wood(rng)
+    if round_top:
+        piece = Furniture("round table", "dining table")
+        radius, height = rng.uniform(0.50, 0.58), rng.uniform(0.73, 0.76)
+        profile = (
+            (0.0, 0.27),
+            (0.025, 0.27),
+            (0.06, 0.07),
+            (0.30, 0.045),
+            (height - 0.08, 0.06),
+            (height - 0.035, 0.16),
+        )
+        piece.add(loft([Section(z, r, r) for z, r in profile], 28), top_material)
+        rim = [Section(height - 0.034, radius - 0.01, radius - 0.01), Section(height - 0.024, radius, radius)]
+        rim += [Section(height - 0.008, radius, radius), Section(height, radius - 0.008, radius - 0.008)]
+        piece.add(loft(rim, 44), top_material)
+        return piece
+    return _table(
+        "table", rng.uniform(1.25, 1.6), rng.uniform(0.78, 0.90), rng.uniform(0.73, 0.76), top_material, 0.065
+    )
+
+
+def desk(rng: Rng) -> Furniture:
+    return _table("desk", rng.uniform(1.2, 1.45), rng.uniform(0.62, 0.72), 0.73, paints.wood(rng), 0.05)
+
+
+def coffee_table(rng: Rng) -> Furniture:
+    """Low; COCO's annotators call it a dining table too."""
+    return _table(
+        "coffee table",
+        rng.uniform(0.85, 1.1),
+        rng.uniform(0.48, 0.58),
+        rng.uniform(0.38, 0.44),
+        paints.wood(rng),
+        0.05,
+    )
+
+
+def _table(kind: str, width: float, depth: float, height: float, material: Material, thickness: float) -> Furniture:
+    piece = Furniture(kind, "dining table")
+    piece.add(rounded_box(width, depth, 0.032, 0.008, 2).moved(z=height - 0.016), material)
+    inset = thickness / 2 + 0.04
+    for x, y in corners(width / 2 - inset, depth / 2 - inset):
+        piece.add(leg(thickness, height - 0.03, 0.65).moved(x, y), material)
+    apron = 0.09 if height > 0.5 else 0.05
+    for y in (-1, 1):
+        board = rounded_box(width - 2 * inset, 0.02, apron, 0.003)
+        piece.add(board.moved(0, y * (depth / 2 - inset), height - 0.031 - apron / 2), material)
+    for x in (-1, 1):
+        board = rounded_box(0.02, depth - 2 * inset, apron, 0.003)
+        piece.add(board.moved(x * (width / 2 - inset), 0, height - 0.031 - apron / 2), material)
+    return piece
+
+
+@dataclass(frozen=True)
+class Offset:
+    """Where a part lies within its piece."""
+
+    z: float = 0.0  # m
+    angle: float = 0.0  # rad
+    x: float = 0.0  # m
+
+
+def book(rng: Rng) -> Furniture:
+    """A closed book lying flat."""
+    piece = Furniture("book", "book")
+    _add_book(piece, rng, rng.uniform(0.17, 0.25), rng.uniform(0.24, 0.32), rng.uniform(0.025, 0.05), Offset())
+    return piece
+
+
+def book_pile(rng: Rng) -> Furniture:
+    """Three or four books on each other: one instance, as SceneNN's annotators label "books"."""
+    piece = Furniture("pile of books", "book")
+    z = 0.0
+    for k in range(int(rng.integers(3, 5))):
+        thickness, shrink = rng.uniform(0.025, 0.045), 1 - 0.07 * k
+        offset = Offset(z, rng.uniform(-0.25, 0.25), rng.uniform(-0.01, 0.01))
+        _add_book(piece, rng, 0.23 * shrink, 0.30 * shrink, thickness, offset)
+        z += thickness + 0.0005
+    return piece
+
+
+def _add_book(piece: Furniture, rng: Rng, width: float, height: float, thickness: float, at: Offset) -> None:
+    color = paints.vivid(rng)
+    ink = (0.95, 0.92, 0.82) if sum(color) < 1.6 else (0.12, 0.10, 0.10)
+    cover = Material(Texture.BOOK, color, ink, 0.1, (width, height), int(rng.integers(4096)))
+    pages = Material(Texture.PAGES, (0.93, 0.90, 0.82), (0.78, 0.74, 0.66), seed=int(rng.integers(4096)))
+    board = 0.003
+    parts = (
+        (rounded_box(width, height, board, 0.001).flat(0, 1).moved(z=thickness - board / 2), cover),
+        (rounded_box(width, height, board, 0.001).flat(0, 1).moved(z=board / 2), cover),
+        (
+            rounded_box(board, height, thickness - 0.0012, 0.001).moved(
+                -width / 2 + board / 2 - 0.0005, 0, thickness / 2
+            ),
+            paints.cloth(rng, color),
+        ),
+        (
+            rounded_box(width - 0.008, height - 0.010, thickness - 2 * board, 0.0005).moved(0.001, 0, thickness / 2),
+            pages,
+        ),
+    )
+    for solid, material in parts:
+        piece.add(solid.turned("z", at.angle).moved(at.x, 0, at.z), material)

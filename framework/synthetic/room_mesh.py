@@ -1,0 +1,132 @@
+"""The labelled mesh that belongs to a video: the exact surfaces in small triangles, as far as the camera saw them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
+from framework.synthetic.ray_caster import RayCaster
+from framework.synthetic.surfaces import Surfaces
+
+LONGEST_EDGE = 0.02  # m
+
+
+@dataclass(frozen=True)
+class LabeledMesh:
+    """Triangles whose vertices belong to one instance each."""
+
+    vertices: Float32  # (V, 3) m, world
+    triangles: Int32  # (F, 3), counter-clockwise seen from outside
+    instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
+
+    def only(self, kept: Bool) -> LabeledMesh:
+        """The vertices `kept` (V,), in their order, and the triangles between them."""
+        number = np.cumsum(kept, dtype=np.int32) - 1
+        triangles = self.triangles[kept[self.triangles].all(axis=1)]
+        return LabeledMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
+
+
+def visible_mesh(
+    surfaces: Surfaces,
+    caster: RayCaster,
+    camera: Camera,
+    poses: Iterable[Float64],
+    reach: tuple[float, float],
+    longest_edge: float = LONGEST_EDGE,
+) -> LabeledMesh:
+    """The surfaces, as far as they are seen from one of the poses T_world_camera at a depth within `reach` (m, m)."""
+    mesh = tessellate(surfaces, longest_edge)
+    return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach))
+
+
+def tessellate(surfaces: Surfaces, longest_edge: float) -> LabeledMesh:
+    """The surfaces in triangles whose edges are at most `longest_edge` m long.
+
+    A longer edge is halved until it is short enough, in all triangles that have it, so that no gaps come about.
+    """
+    instance_ids = np.zeros(len(surfaces.vertices), np.int32)
+    instance_ids[surfaces.triangles.ravel()] = np.repeat(surfaces.instance_ids, 3)
+    mesh = _welded(LabeledMesh(surfaces.vertices, surfaces.triangles, instance_ids))
+    vertices, instance_ids, open_triangles = mesh.vertices, mesh.instance_ids, mesh.triangles
+    done: list[Int32] = []
+    while len(open_triangles):
+        corners = vertices[open_triangles]
+        square = ((np.roll(corners, -1, axis=1) - corners) ** 2).sum(axis=2)  # (F, 3), of the edge from each corner
+        too_long = square.max(axis=1) > np.float32(longest_edge) ** 2
+        done.append(open_triangles[~too_long])
+        first = square[too_long].argmax(axis=1)[:, None]
+        a, b, c = (np.take_along_axis(open_triangles[too_long], (first + k) % 3, axis=1)[:, 0] for k in range(3))
+        edges, edge = np.unique(np.minimum(a, b) * np.int64(len(vertices)) + np.maximum(a, b), return_inverse=True)
+        low, high = np.divmod(edges, len(vertices))
+        middle = (edge + len(vertices)).astype(np.int32)
+        vertices = np.concatenate([vertices, (vertices[low] + vertices[high]) / 2])
+        instance_ids = np.concatenate([instance_ids, instance_ids[low]])
+        open_triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return _welded(LabeledMesh(vertices, np.concatenate(done), instance_ids))
+
+
+def _welded(mesh: LabeledMesh) -> LabeledMesh:
+    """With vertices of one instance at exactly the same place made one, and without triangles that have no area."""
+    rows = np.empty((len(mesh.vertices), 4), np.int32)
+    rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # -0 is at the same place as 0
+    rows[:, 3] = mesh.instance_ids
+    order = np.lexsort(rows.T)
+    new = np.ones(len(rows), np.bool_)
+    new[1:] = (rows[order[1:]] != rows[order[:-1]]).any(axis=1)
+    number = np.empty(len(rows), np.int32)
+    number[order] = np.cumsum(new, dtype=np.int32) - 1
+    triangles = number[mesh.triangles]
+    a, b, c = triangles.T
+    kept = order[new]
+    return LabeledMesh(
+        mesh.vertices[kept], triangles[(a != b) & (b != c) & (c != a)], np.ascontiguousarray(mesh.instance_ids[kept])
+    )
+
+
+def seen_from(
+    vertices: Float32, caster: RayCaster, camera: Camera, poses: Iterable[Float64], reach: tuple[float, float]
+) -> Bool:
+    """(V,) Which vertices lie in the picture of one of the poses, at a depth within `reach` and with nothing before."""
+    seen = np.zeros(len(vertices), np.bool_)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    for T_world_camera in poses:
+        candidates = _in_view(vertices, seen, T_world_camera, intrinsics, *camera.shape, *reach)
+        ends = vertices[candidates]
+        origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), ends.shape)
+        seen[candidates[~caster.occluded(origins, ends)]] = True
+    return seen
+
+
+@njit(cache=True, nogil=True)
+def _in_view(
+    vertices: Float32,
+    skip: Bool,
+    T_world_camera: Float64,
+    intrinsics: Float64,
+    height: int,
+    width: int,
+    near: float,
+    far: float,
+) -> Int64:
+    """The indices of the vertices, but for those to `skip`, that the picture would show if nothing stood before."""
+    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    found = np.empty(len(vertices), np.int64)
+    count = 0
+    for i in range(len(vertices)):
+        if skip[i]:
+            continue
+        dx, dy, dz = vertices[i, 0] - t[0], vertices[i, 1] - t[1], vertices[i, 2] - t[2]
+        z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
+        if z <= near or z > far:
+            continue
+        u = fx * (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / z + cx
+        v = fy * (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / z + cy
+        if -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
+            found[count] = i
+            count += 1
+    return found[:count]

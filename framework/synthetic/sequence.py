@@ -1,0 +1,112 @@
+"""A seeded, furnished room, rendered frame by frame in memory, with everything about it known."""
+
+from __future__ import annotations
+
+import math
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
+from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
+from framework.datasets.scene_truth import LabeledDepth, fuse_scene_truth
+from framework.errors import ConfigError
+from framework.interfaces import RGBDSequence
+from framework.synthetic.depth_camera import DepthSensor, noisy_color
+from framework.synthetic.renderer import Renderer, ids_met
+from framework.synthetic.room import RoomKind, furnish
+from framework.synthetic.walk import FRAME_RATE, plan_path
+
+FOCAL_LENGTH = 525.0 / 640  # image widths: a Kinect's colour camera
+TRUTH_VIEWS = 60  # frames whose exact depth makes up the true surface; neighbours show nearly the same
+
+
+@dataclass
+class Synthetic(RGBDSequence):
+    """A hand-held walk through a furnished room; `room.surfaces` is its exact geometry.
+
+    The same parameters give the same frames to the last bit, in whatever order and from whatever thread they are read.
+    """
+
+    seed: int = 0
+    scene: str = "room0"  # any name: each gives another room
+    kind: RoomKind = RoomKind.STUDIO  # what the room is for; a studio holds all nine classes
+    frames: int = 240  # length of the walk, at 30 Hz
+    width: int = 640  # px
+    height: int = 480  # px
+    noise: float = 1.0  # scales the sensor's noise: 0 = exact, 1 = a Kinect v1
+    max_depth: float = 6.0  # m, the sensor's range
+    start: int = 0  # first frame
+    stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
+    stride: int = 1  # take every stride-th frame
+    share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
+    truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
+
+    def __post_init__(self) -> None:
+        check_selection(self.start, self.stop, self.stride, self.share)
+        for name, value, lowest in (("frames", self.frames, 1), ("width", self.width, 16), ("height", self.height, 16)):
+            if value < lowest:
+                raise ConfigError(f"dataset.{name} must be at least {lowest}, found {value}")
+        if self.seed < 0:
+            raise ConfigError(f"seed must be 0 or positive, found {self.seed}")
+        if not (math.isfinite(self.noise) and self.noise >= 0):
+            raise ConfigError(f"dataset.noise must be 0 (exact) or positive, found {self.noise}")
+        if not self.max_depth > 0:
+            raise ConfigError(f"dataset.max_depth must be positive metres, found {self.max_depth}")
+        if not self.truth_voxel > 0:
+            raise ConfigError(f"dataset.truth_voxel must be positive metres, found {self.truth_voxel}")
+        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.share, self.seed)
+        self.name = self.scene
+        focal = FOCAL_LENGTH * self.width
+        self.camera = Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
+        self._stream = zlib.crc32(self.scene.encode())  # a scene is a random stream of its own
+        rng = np.random.default_rng([self.seed, self._stream])
+        self.room = furnish(self.kind, rng)
+        self.class_names = dict(self.room.surfaces.class_names)
+        self._renderer = Renderer(self.room.surfaces, list(self.room.lamps))
+        self._sensor = DepthSensor(self.noise, self.max_depth)
+        wanted = {i for i, name in self.class_names.items() if name is not None}
+        small = Camera(80, 60, FOCAL_LENGTH * 80, FOCAL_LENGTH * 80, 39.5, 29.5)
+        self.path = plan_path(
+            self.room.layout,
+            self.frames,
+            lambda T_world_camera: ids_met(self.room.surfaces, self._renderer.caster, small, T_world_camera),
+            wanted,
+            rng,
+        )
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __getitem__(self, k: int) -> Frame:
+        index = self._chosen[k]
+        T_world_camera = self.path.pose(index)
+        picture = self._renderer.render(self.camera, T_world_camera)
+        rng = np.random.default_rng([self.seed, self._stream, index])
+        depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng)
+        return Frame(
+            index=index,
+            timestamp=index / FRAME_RATE,
+            color=noisy_color(picture.color, self.noise, rng),
+            depth=depth,
+            camera=self.camera,
+            T_world_camera=T_world_camera,
+            truth=FrameTruth(picture.instance_ids, self.class_names),
+        )
+
+    def exact_view(self, T_world_camera: Float64) -> tuple[Float32, Int32]:
+        """Exact depth (H, W) m and instance ids (H, W) from any pose."""
+        return self._renderer.depth_and_ids(self.camera, T_world_camera)
+
+    def scene_truth(self) -> SceneTruth:
+        """The labelled surface within the sensor's range in the chosen frames, from their exact depth."""
+        every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
+        chosen = sorted({*self._chosen[::every], self._chosen[-1]})
+        return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.truth_voxel)
+
+    def _exact(self, index: int) -> LabeledDepth:
+        T_world_camera = self.path.pose(index)
+        depth, ids = self.exact_view(T_world_camera)
+        depth[depth > self.max_depth] = 0
+        return LabeledDepth(depth, ids, self.camera, T_world_camera)

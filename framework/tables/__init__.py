@@ -1,0 +1,1 @@
+"""Run records become tables: Markdown, LaTeX, CSV."""

@@ -1,0 +1,183 @@
+"""What a table compares: the records below a directory as rows, the row that the others are compared with, and what a
+table shows of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from framework.errors import ConfigError, DataError
+from framework.files.search_paths import CONF
+from framework.parameters import checked_block, checked_rows
+from framework.records.metrics import is_evaluation
+from framework.records.rows import Row, Run, natural, rows_of
+from framework.records.stored_runs import Incomplete, Record, find_records, read_yaml
+from framework.records.sweep_file import SWEEP, asked_runs
+from framework.tables.published import NOTHING_PUBLISHED, Published, read_published
+
+DEFAULT_CHOICE = CONF / "parts" / "experiment.yaml"
+
+
+@dataclass(frozen=True)
+class TableChoice:
+    """What a table shows: the block `table` of an experiment.
+
+    A line is a row and a column a figure, averaged over the runs that differ in `over` alone. With `across`, a column
+    is a value of that key, such as a sequence, and a line ends with their mean; with `by`, lines stand in groups, one
+    for each of its values.
+    """
+
+    # keys of the config, averaged over and paired by; runs that agree in the last of them are no independent evidence
+    over: list[str] = field(default_factory=lambda: ["seed"])
+    across: str | None = None  # key of the config with a column for each value; None = columns are figures
+    by: str | None = None  # key of the config with a group of lines for each value; None = a line is all of a row
+    base: str | None = None  # name of the row that the others are compared with; None = the first
+    columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `across`, just one
+    names: dict[str, str] = field(default_factory=dict)  # what rows are called in the table; others go by their name
+    published: str | None = None  # section of published.yaml, whose numbers stand below; None = none
+
+    def __post_init__(self) -> None:
+        for name in ("over", "columns"):
+            if not getattr(self, name):
+                raise ConfigError(f"table.{name} must name at least one key")
+        if self.across and self.by:
+            raise ConfigError(
+                f"table.across={self.across} and table.by={self.by} are two layouts: one of them must be null"
+            )
+        if self.apart in self.over:
+            raise ConfigError(f"table.over has {self.apart}, whose values table.{self.layout} shows one by one")
+        if self.across and len(self.columns) > 1:
+            raise ConfigError(
+                f"table.columns must name one figure, the one that stands across {self.across}, found "
+                f"{len(self.columns)}; table.by={self.across} shows several"
+            )
+        if self.published and read_published(self.published).layout != self.layout:
+            raise ConfigError(
+                f"table.published={self.published} has numbers for a table with another layout: "
+                f"{read_published(self.published).layout}, found {self.layout}"
+            )
+
+    @property
+    def layout(self) -> str:
+        """`across`, `by` or `rows`."""
+        return "across" if self.across else "by" if self.by else "rows"
+
+    @property
+    def apart(self) -> str | None:
+        """The key whose values are shown one by one, as columns or as groups of lines."""
+        return self.across or self.by
+
+    @classmethod
+    def of(cls, node: Any) -> TableChoice:
+        """The choice that a config's `table` describes. Raises ConfigError for keys and types that it does not have."""
+        return cls(**checked_block(cls, "table", node))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All that a table says, before it is written in one format or another."""
+
+    title: str
+    choice: TableChoice
+    rows: list[Row]  # in their order, each with a run or more
+    overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
+    asked: list[Run]  # what the sweep was last asked for, of every row; some may not have begun
+    incomplete: list[Incomplete]
+    superseded: int  # records of runs that have a later one
+    root: Path  # what the names of runs are relative to
+
+    @classmethod
+    def below(cls, directory: Path) -> Comparison:
+        """From the records at and below `directory`, as the experiment that ran there says, else as all do.
+
+        Raises DataError when there is no complete record, or when the experiment's config cannot be read.
+        """
+        if not directory.is_dir():
+            raise DataError(f"{directory} is not a folder with records of runs")
+        sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
+        choice = TableChoice.of(sweep.get("table") or read_yaml(DEFAULT_CHOICE)["table"])
+        overrides = checked_rows(sweep.get("rows"))
+        records, incomplete = find_records(directory)
+        if not records:
+            why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
+            raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
+        keys = [*choice.over, choice.apart] if choice.apart else choice.over
+        rows = rows_of(records, keys, overrides)
+        asked = asked_runs(sweep, keys)
+        superseded = len(records) - sum(len(row.records) for row in rows)
+        return cls(directory.resolve().name, choice, rows, overrides, asked, incomplete, superseded, directory)
+
+    @property
+    def judged(self) -> bool:
+        """Whether a figure depends on the true instances, of whose annotation there may be several releases."""
+        annotated = self.choice.apart or any(record.annotation for record in self.records)
+        return bool(annotated) and any(map(is_evaluation, self.choice.columns))
+
+    @property
+    def base_name(self) -> str:
+        return self.choice.base or next(iter(self.overrides), self.rows[0].name)
+
+    @property
+    def base_called(self) -> str:
+        return self.choice.names.get(self.base_name, self.base_name)
+
+    @property
+    def noun(self) -> str:
+        """What is shown one by one, in a word: `scene` for dataset.scene."""
+        return (self.choice.apart or "").rpartition(".")[2]
+
+    def base_of(self, row: Row) -> Row | None:
+        """The row that `row` is compared with, of the same poses and the like; None for that one, and without it."""
+        named = [other for other in self.rows if other.name == self.base_name]
+        bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
+        return bases[0] if bases and bases[0] is not row else None
+
+    @property
+    def has_base(self) -> bool:
+        return any(self.base_name in (row.name, row.system) for row in self.rows)
+
+    @property
+    def compared(self) -> list[tuple[Row, Row]]:
+        """The rows that have one to be compared with, and that one."""
+        pairs = ((row, self.base_of(row)) for row in self.rows)
+        return [(row, base) for row, base in pairs if base is not None]
+
+    @property
+    def records(self) -> list[Record]:
+        return [record for row in self.rows for record in row.records.values()]
+
+    @cached_property
+    def published(self) -> Published:
+        return read_published(self.choice.published) if self.choice.published else NOTHING_PUBLISHED
+
+    @cached_property
+    def sequences(self) -> list[str]:
+        """The values that are shown one by one: those of published tables first, and those of the runs."""
+        found = {run[-1] for run in self._runs} if self.choice.apart else set()
+        order = sorted(found, key=lambda value: natural((value,)))
+        return list(dict.fromkeys([*self.published.sequences, *order]))
+
+    def called(self, row: Row, without: str = "") -> str:
+        """What a row is called, without the part of its name that says which `without` it has."""
+        named = self.choice.names.get(row.system, row.system)
+        variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
+        return ", ".join([named, *variant] if named else variant) or row.name
+
+    def missing(self) -> Iterator[tuple[Row, list[Run]]]:
+        """The runs that a row should have: they were asked for, or other rows have their seeds and sequences."""
+        runs = self._runs
+        if self.choice.apart:
+            seeds, sequences = (dict.fromkeys(run[:-1] for run in runs), dict.fromkeys(run[-1] for run in runs))
+            runs = [(*seed, sequence) for seed in seeds for sequence in sequences]
+        for row in self.rows:
+            if missing := sorted(set(runs) - set(row.records), key=natural):
+                yield row, missing
+
+    @property
+    def _runs(self) -> list[Run]:
+        """All that a row has or that were asked for."""
+        return [*(run for row in self.rows for run in row.records), *self.asked]

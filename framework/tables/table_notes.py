@@ -1,0 +1,159 @@
+"""What the reader of a table must know to trust its figures, sentence by sentence."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterable, Iterator, Sequence
+
+from framework.evaluation.instances import MAX_DISTANCE
+from framework.records.rows import CHOICE, CONFIDENCE, Run, following
+from framework.records.stored_runs import Record
+from framework.registry import STAGES
+from framework.tables.comparison import Comparison
+from framework.tables.sequences import mean_by_sequence
+
+
+def notes(comparison: Comparison) -> Iterator[str]:
+    """Each of them one line."""
+    for note in _notes(comparison):
+        yield " ".join(note.split())
+
+
+def _notes(comparison: Comparison) -> Iterator[str]:
+    yield from _averaging(comparison)
+    yield from _winners(comparison)
+    if comparison.overrides:
+        changes = (f"{name}: {' '.join(changes) or 'nothing'}" for name, changes in comparison.overrides.items())
+        yield f"What each row changes: {'; '.join(changes)}."
+    if fixed := _same(comparison.records):
+        yield f"In all: {fixed}."
+    yield from _protocol(comparison)
+    yield from _published(comparison)
+    yield f"Code: {counted(record.code for record in comparison.records)}."
+    yield f"Machine: {counted(machine(record) for record in comparison.records)}."
+    yield f"Config: config.yaml beside each run; SHA-256 of all their hashes: {digest(comparison.records)}."
+    yield from _missing(comparison)
+
+
+def _averaging(comparison: Comparison) -> Iterator[str]:
+    """How figures come about, and how rows are compared."""
+    choice, over = comparison.choice, ", ".join(comparison.choice.over)
+    if others := following(comparison.records, choice.over):
+        yield f"Averaged over with {over}, whose value they have in every run: {', '.join(others)}."
+    if choice.apart:
+        yield (
+            f"Mean ± sample standard deviation over {over}, where there are several. The mean is over the sequences "
+            f"({choice.apart}), each of which counts as one; its deviation is over the runs that have all of them. "
+            "In bold: the highest of the same poses, among means of as many runs. missing: no complete run."
+        )
+    else:
+        yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
+    if not comparison.has_base:
+        yield f"No differences: {comparison.base_name} is no row with a complete run; table.base=ROW names another."
+    elif len(comparison.rows) > 1:
+        keys = [*choice.over, *filter(None, [choice.apart])]
+        error = "mean ± standard error"
+        if len(keys) > 1:
+            kinds = "the sequences" if choice.apart else f"the values of {keys[-1]}"
+            error += f" over {kinds}, of each of which the runs are averaged first"
+        yield (
+            f"Differences are paired by {', '.join(keys)}: {error}; "
+            f"* where the {CONFIDENCE:.0%} interval of Student's t is without 0."
+        )
+        bases = [base for _, base in comparison.compared]
+        if alone := [row.name for row in comparison.rows if not (comparison.base_of(row) or row in bases)]:
+            yield f"Without a row of {comparison.base_name} that they could be compared with: {'; '.join(alone)}."
+
+
+def _winners(comparison: Comparison) -> Iterator[str]:
+    """In which sequences the base is better than each of the others, and in which it loses."""
+    if not comparison.choice.across:
+        return
+    [key] = comparison.choice.columns
+    for row, base in comparison.compared:
+        less = mean_by_sequence(base.less(row, key))
+        lost = [sequence for sequence in comparison.sequences if sequence in less and less[sequence].value < 0]
+        won = sum(mean.value > 0 for mean in less.values())
+        yield (
+            f"{comparison.base_called} against {comparison.called(row, without='tracker')}, {row.poses}: "
+            f"higher in {won} of {len(less)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
+        )
+
+
+def _protocol(comparison: Comparison) -> Iterator[str]:
+    """What the instances were compared with, and how."""
+    kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if key.startswith("instances.")}
+    if not kinds:
+        return
+    near = f"within {MAX_DISTANCE * 100:.0f} cm"
+    if False in kinds:
+        yield f"Transfer: each true vertex takes the instance of the map's nearest vertex {near}. AP is in [0, 1]."
+    if True in kinds:
+        yield f"Transfer of to_map: each vertex of the map takes the instance of the nearest true vertex {near}."
+
+
+def _published(comparison: Comparison) -> Iterator[str]:
+    rows = comparison.published.rows
+    for row in rows:
+        if row.values is not None:
+            yield f"Published, {row.system}: {row.source}{f'; {row.remark}' if row.remark else ''}."
+    if unknown := [f"{row.system} ({row.source})" for row in rows if row.values is None]:
+        yield f"Published, but nobody has looked the numbers up: {'; '.join(unknown)}."
+
+
+def _missing(comparison: Comparison) -> Iterator[str]:
+    """The figures, rows, sequences and runs of which there is no record, and the runs that did not end well."""
+    keys_told = {key for record in comparison.records for key in record.metrics}
+    if absent := [key for key in comparison.choice.columns if key not in keys_told]:
+        yield f"No run has a figure of this name: {', '.join(absent)}."
+    begun = {row.system for row in comparison.rows}
+    if absent := [name for name in comparison.overrides if name not in begun]:
+        yield f"Without a complete run: {', '.join(absent)}."
+    run_of = {run[-1] for row in comparison.rows for run in row.records}
+    if absent := [sequence for sequence in comparison.sequences if sequence not in run_of]:
+        yield f"Without a complete run of any row: {comparison.choice.apart}={','.join(absent)}."
+    keys = [*comparison.choice.over, *filter(None, [comparison.choice.apart])]
+    for row, missing in comparison.missing():
+        yield f"Missing in {row.name}: {_runs_told(keys, missing)}."
+    if comparison.superseded:
+        yield f"Left out, older records of the same runs: {comparison.superseded}."
+    for one in comparison.incomplete:
+        yield f"Not complete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
+
+
+def _runs_told(keys: Sequence[str], runs: Sequence[Run]) -> str:
+    """As overrides that run them: seed=0 dataset.scene=011,030; seed=1 dataset.scene=011."""
+    last: dict[Run, list[str]] = {}
+    for run in runs:
+        last.setdefault(run[:-1], []).append(run[-1])
+    versions = [zip(keys, (*first, ",".join(values)), strict=True) for first, values in last.items()]
+    return "; ".join(" ".join(f"{key}={value}" for key, value in pairs) for pairs in versions)
+
+
+def _same(records: Sequence[Record]) -> str:
+    """What all runs have chosen, stage by stage."""
+    chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
+    agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
+    return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
+
+
+def machine(record: Record) -> str:
+    """The cores, and how many threads they were given."""
+    cores = f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
+    threads = record.config.get("threads")
+    return f"{cores}, threads={threads}" if threads else cores
+
+
+def counted(words: Iterable[str]) -> str:
+    """The words that there are, with their number where there are several."""
+    counts = Counter(words).most_common()
+    if len(counts) == 1:
+        return counts[0][0]
+    return ", ".join(f"{word} ({count} run{'s' * (count > 1)})" for word, count in counts)
+
+
+def digest(records: Sequence[Record]) -> str:
+    """One short hash of the configs of several runs, whatever their order."""
+    hashes = sorted(str(record.metrics["config_hash"]) for record in records)
+    return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

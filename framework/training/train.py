@@ -1,0 +1,115 @@
+"""One training from its config: render rooms, train, evaluate on rooms that were never learned from.
+
+Leaves in its folder: network.safetensors, for `detector=mask_rcnn detector.weights=...`; checkpoint.pt, from which a
+second call goes on; losses.csv and losses.png; average_precision.json.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import platformdirs
+import torch
+from omegaconf import DictConfig, OmegaConf
+from tqdm import tqdm
+
+from framework.data import Bool, Camera, Detections, Frame
+from framework.detection.device import torch_device
+from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
+from framework.detection.mask_rcnn.network_file import Fact, load_network, save_network
+from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
+from framework.evaluation.mask_ap import MaskAp, mask_ap
+from framework.files.atomic_files import written_whole
+from framework.interfaces import Detector
+from framework.label_spaces import COCO, SCENENN_TO_COCO
+from framework.parameters import require
+from framework.registry import build
+from framework.settings import Settings, available_cores
+from framework.training.augmentation import SMALLEST
+from framework.training.room_pictures import HEIGHT, WIDTH, RoomPictures, render_rooms
+from framework.training.trainer import Schedule, Trainer
+
+log = logging.getLogger(__name__)
+
+DETECTOR = "plugins.detectors.mask_rcnn.MaskRCNNDetector"
+HELD_OUT = 1_000_000  # the number of the first room that is never learned from
+NETWORK, PRECISION = "network.safetensors", "average_precision.json"
+
+
+def train(config: DictConfig, folder: Path) -> MaskAp:
+    """Renders the rooms that are missing, trains for the steps that are left, evaluates."""
+    Settings.of(config).apply()
+    torch.manual_seed(config.seed)
+    wanted = config.pictures
+    rooms = Path(wanted.folder or Path(platformdirs.user_cache_dir("instancemap")) / "rooms")
+    processes = wanted.processes or available_cores()
+    render_rooms(rooms, 0, wanted.rooms, wanted.views, processes)
+    render_rooms(rooms, HELD_OUT, wanted.held_out, wanted.held_out_views, processes)
+
+    network = MaskRCNN(architecture(config.network))
+    if config.network.start_from:
+        network.load_state_dict(load_network(Path(config.network.start_from)).state_dict(), strict=False)
+    schedule = Schedule(**dict(config.schedule), seed=config.seed)
+    device = str(torch_device(config.device, "device"))
+    pictures = RoomPictures(rooms, 0, wanted.rooms)
+    trainer = Trainer(network, pictures, schedule, folder, device)
+    log.info("%d pictures, step %d of %d, on %s", len(pictures), trainer.step, schedule.steps, device)
+    trainer.run()
+
+    card: dict[str, Fact] = {
+        "data": f"{len(pictures)} pictures of {wanted.rooms} rendered rooms",
+        "steps": trainer.step,
+        "batch": schedule.batch,
+        "seed": int(config.seed),
+        "bfloat16": schedule.bfloat16,
+        "limits": "trained on rendered rooms only, at 320x240; of photographs it knows nothing",
+    }
+    save_network(trainer.trained(), folder / NETWORK, card, half=True)
+    node = {"_target_": DETECTOR, "weights": str((folder / NETWORK).absolute()), "device": device}
+    detector = build(Detector, OmegaConf.create(node))
+    precision = mask_ap(_detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, SMALLEST)
+    card |= _known({"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
+    save_network(trainer.trained(), folder / NETWORK, card, half=True)
+    with written_whole(folder / PRECISION) as path:
+        path.write_text(json.dumps(_known(asdict(precision)), indent=1))
+    log.info("mask AP50 %.3f, AP %.3f on %d other rooms", precision.ap50, precision.ap, wanted.held_out)
+    return precision
+
+
+def architecture(network: DictConfig) -> Architecture:
+    """The network that the config describes, for the classes that rooms hold."""
+    require(network.backbone in DEPTHS, "network.backbone", network.backbone, ", ".join(DEPTHS))
+    return Architecture(
+        classes=tuple(name for name in COCO if name in SCENENN_TO_COCO.values()),
+        backbone=ResNetShape(network.backbone, network.width),
+        fpn_channels=network.fpn_channels,
+        head_features=network.head_features,
+        anchor_sides=tuple(float(side) for side in network.anchor_sides),
+        rounded_anchors=False,
+        half_pixel=True,
+        short_side=HEIGHT,
+        long_side=WIDTH,
+    )
+
+
+def _known(values: Mapping[str, Any]) -> dict[str, Any]:
+    """None for NaN, which JSON does not have."""
+    inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
+    return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
+
+
+def _detected(detector: Detector, pictures: RoomPictures) -> Iterator[tuple[Bool, Sequence[str], Detections]]:
+    """True masks, their classes, and what the detector finds, picture by picture."""
+    for k in tqdm(range(len(pictures)), desc="evaluating", unit="picture", disable=None):
+        example = pictures[k]
+        height, width = example.color.shape[:2]
+        camera = Camera(width, height, width, width, (width - 1) / 2, (height - 1) / 2)
+        frame = Frame(k, float(k), example.color, np.zeros((height, width), np.float32), camera)
+        yield example.masks, example.class_names, detector.detect(frame)

@@ -1,0 +1,51 @@
+"""Names of a sweep's directories, and how commands end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from framework.commands.command_line import directory_name, print_for_directories
+from framework.errors import DataError
+
+
+def test_overrides_become_one_directory() -> None:
+    assert directory_name("dataset.root=../a/b,seed=1") == "dataset.root=.._a_b,seed=1"
+    assert directory_name("") == "defaults"
+
+
+def test_long_overrides_stay_distinct_and_short() -> None:
+    names = [directory_name("dataset.root=" + 300 * "x" + f",seed={seed}") for seed in range(2)]
+    assert names[0] != names[1]
+    assert all(len(name) <= 200 for name in names)
+
+
+def test_a_directory_that_is_refused_does_not_stop_the_others(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def write(directory: Path) -> str:
+        if directory.name == "empty":
+            raise DataError("there is nothing")
+        return directory.name
+
+    monkeypatch.setattr(sys, "argv", ["command", *(str(tmp_path / name) for name in ("a", "empty", "b"))])
+    with pytest.raises(SystemExit) as ended:
+        print_for_directories("", "", write)
+    assert ended.value.code == 1
+    assert capsys.readouterr() == ("a\nb\n", "error: there is nothing\n")
+
+
+@pytest.mark.parametrize("command", ["tables", "figures", "evaluate", "plugins"])
+def test_a_command_whose_reader_has_gone_ends_without_a_word(command: str) -> None:
+    """As in `python -m framework tables DIR | head -1`."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    arguments = [sys.executable, "-m", "framework", command, "--help"]
+    ended = subprocess.run(arguments, stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (ended.returncode, ended.stderr) == (-signal.SIGPIPE, b"")

@@ -1,0 +1,179 @@
+"""ScanNet's labelled mesh: exact instances from segments and objects, and what each kind of name becomes."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.datasets.labeled_mesh import LabeledMesh
+from framework.datasets.scannet.scannet_annotation import (
+    LARGEST_FILE,
+    read_aggregation,
+    read_label_table,
+    read_labeled_mesh,
+)
+from framework.errors import DataError
+from framework.files.ply import write_ply
+
+SEGMENTS = [3, 3, 70, 70, 5, 5, 9, 9, 11, 12]  # of ten vertices in a row
+TABLE = """id\traw_category\tcategory\tnyu40class
+1\tRecliner chair \trecliner\tchair
+2\tgizmo\tgizmo\totherprop
+3\tlaptop\tlaptop\tbox
+"""
+
+
+def group(object_id: int, label: str, *segments: int) -> dict[str, Any]:
+    return {"id": object_id, "objectId": object_id, "label": label, "segments": list(segments)}
+
+
+def read(folder: Path, groups: list[dict[str, Any]], segments: list[int] | None = None, table: str = "") -> LabeledMesh:
+    vertices = np.zeros((10, 3), np.float32)
+    vertices[:, 0] = np.arange(10)
+    write_ply(folder / "s.ply", vertices, np.array([[0, 1, 2]], np.int32), {"red": np.zeros(10, np.uint8)})
+    content = {"params": {"kThresh": "0.01"}, "sceneId": "s", "segIndices": SEGMENTS if segments is None else segments}
+    (folder / "s.segs.json").write_text(json.dumps(content))
+    (folder / "s.aggregation.json").write_text(json.dumps({"sceneId": "scannet.s", "segGroups": groups}))
+    (folder / "labels.tsv").write_text(table)
+    nyu40 = read_label_table(folder / "labels.tsv") if table else {}
+    return read_labeled_mesh(folder / "s.ply", folder / "s.segs.json", folder / "s.aggregation.json", nyu40)
+
+
+def test_segments_become_the_instances_of_objects(tmp_path: Path) -> None:
+    mesh = read(tmp_path, [group(0, "office chair", 70, 9), group(4, "couch", 5), group(1, "wall", 3)])
+    # the wall is known to be no instance; what nobody labelled is one more, of no known class
+    np.testing.assert_array_equal(mesh.instance_ids, [0, 0, 1, 1, 5, 5, 1, 1, 6, 6])
+    assert mesh.class_names == {1: "chair", 5: "couch", 6: None}
+    assert mesh.instance_ids.dtype == np.int32
+    np.testing.assert_array_equal(mesh.vertices[:, 0], np.arange(10))
+    np.testing.assert_array_equal(mesh.triangles, [[0, 1, 2]])
+
+
+def test_where_all_is_labelled_there_is_no_further_instance(tmp_path: Path) -> None:
+    mesh = read(tmp_path, [group(0, "bed", 3, 70, 5, 9, 11), group(1, "floor", 12)])
+    np.testing.assert_array_equal(mesh.instance_ids, [1] * 9 + [0])
+    assert mesh.class_names == {1: "bed"}
+
+
+def test_without_objects_nothing_is_known(tmp_path: Path) -> None:
+    mesh = read(tmp_path, [])
+    np.testing.assert_array_equal(mesh.instance_ids, [1] * 10)
+    assert mesh.class_names == {1: None}
+
+
+@pytest.mark.parametrize(
+    ("label", "instance", "name"),
+    [
+        ("tv", 1, "tv"),
+        ("Monitor ", 1, "tv"),
+        ("books", 1, "book"),
+        ("trash can", 0, None),
+        ("ceiling", 0, None),
+        ("object", 1, None),
+        ("otherfurniture", 1, None),
+        ("gizmo", 1, None),
+        ("recliner chair", 1, None),
+        ("", 1, None),
+    ],
+)
+def test_what_a_name_becomes(tmp_path: Path, label: str, instance: int, name: str | None) -> None:
+    mesh = read(tmp_path, [group(0, label, *SEGMENTS)])
+    assert set(mesh.instance_ids.tolist()) == {instance}
+    assert mesh.class_names == ({instance: name} if instance else {})
+
+
+@pytest.mark.parametrize(("label", "name"), [("recliner chair", "chair"), ("gizmo", None), ("laptop", "laptop")])
+def test_the_label_table_tells_rare_names(tmp_path: Path, label: str, name: str | None) -> None:
+    assert read(tmp_path, [group(0, label, *SEGMENTS)], table=TABLE).class_names == {1: name}
+
+
+def test_the_later_of_two_objects_has_a_segment(tmp_path: Path) -> None:
+    mesh = read(tmp_path, [group(0, "bed", 3, 70), group(1, "pillow", 70), group(2, "chair", 3)])
+    np.testing.assert_array_equal(mesh.instance_ids[:4], [3, 3, 0, 0])
+
+
+def test_an_object_that_is_there_twice_is_one(tmp_path: Path) -> None:
+    mesh = read(tmp_path, [group(0, "bed", 3), group(0, "bed", 3, 70)])
+    np.testing.assert_array_equal(mesh.instance_ids[:4], 1)
+    with pytest.raises(DataError, match=r"s\.aggregation\.json: object 0 is 'bed' and 'sofa'"):
+        read(tmp_path, [group(0, "bed", 3), group(0, "sofa", 70)])
+
+
+@pytest.mark.parametrize(
+    ("groups", "message"),
+    [
+        ([group(0, "bed", 4)], "object 0 has segment 4, which no vertex is in"),
+        ([group(0, "bed", 3), 5], r"segGroups\[1\] must be an object, found int"),
+        ([group(-1, "bed", 3)], r"segGroups\[0\]: objectId must be a whole number"),
+        ([group(2**31, "bed", 3)], "objectId must be a whole number"),
+        ([group(0, "bed", 3) | {"objectId": True}], "objectId must be a whole number"),
+        ([group(0, "bed", 3) | {"label": None}], "expected a label and a list of segments"),
+        ([group(0, "bed", 3) | {"segments": "3"}], "expected a label and a list of segments"),
+        ([group(0, "bed", 3) | {"segments": [3, 3.5]}], "segments: expected whole numbers, found float"),
+        ([group(0, "bed", 3) | {"segments": [10**30]}], "segments: expected whole numbers of 64 bits"),
+        ({}, "expected a list 'segGroups', found dict"),
+    ],
+)
+def test_a_wrong_object_is_named(tmp_path: Path, groups: Any, message: str) -> None:
+    with pytest.raises(DataError, match=r"s\.aggregation\.json: .*" + message) as caught:
+        read(tmp_path, groups)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("segments", "message"),
+    [
+        (SEGMENTS[:-1], r"has 9 segIndices, but s\.ply 10 vertices"),
+        ([*SEGMENTS[:-1], None], "segIndices: expected whole numbers, found NoneType"),
+        ([SEGMENTS], "segIndices: expected whole numbers, found list"),
+        ("3", "expected a list 'segIndices', found str"),
+    ],
+)
+def test_wrong_segments_are_named(tmp_path: Path, segments: Any, message: str) -> None:
+    with pytest.raises(DataError, match=r"s\.segs\.json.*" + message):
+        read(tmp_path, [], segments)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is not valid JSON"),
+        (b"[" * 100000, "is not valid JSON"),
+        (b'{"segGroups": [' + b"9" * 5000 + b"]}", "is not valid JSON"),
+        (b"\xff\xfe", "is not valid JSON"),
+        (b"[]", "must hold a JSON object"),
+    ],
+)
+def test_what_is_no_json_is_refused_in_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "s.aggregation.json"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        read_aggregation(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_huge_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "s.aggregation.json"
+    with path.open("wb") as file:
+        file.truncate(LARGEST_FILE + 1)
+    with pytest.raises(DataError, match=f"has {LARGEST_FILE + 1} bytes, more than"):
+        read_aggregation(path)
+
+
+def test_a_wrong_line_of_the_label_table_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "scannetv2-labels.combined.tsv"
+    path.write_text("id\traw_category\tnyu40class\r\n1\tArm chair\tchair\r\n2\tdesk\tdesk\r\n")
+    assert read_label_table(path) == {"arm chair": "chair", "desk": "desk"}
+    path.write_text("id\traw_category\tnyu40class\n1\tarm chair\tchair\n2\tdesk\n")
+    with pytest.raises(DataError, match="line 3: expected 3 columns, found 2"):
+        read_label_table(path)
+    path.write_text("raw\tnyu40class\n")
+    with pytest.raises(DataError, match="line 1: expected columns raw_category and nyu40class"):
+        read_label_table(path)
+    path.write_bytes(b"\xff\xfe")
+    with pytest.raises(DataError, match="could not be read as text"):
+        read_label_table(path)

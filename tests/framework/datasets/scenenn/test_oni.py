@@ -1,0 +1,167 @@
+"""The frames of .oni recordings: pairing on its own, and real play-back where OpenNI 2 is installed."""
+
+import ctypes
+import signal
+
+import numpy as np
+import pytest
+
+from framework.datasets.scenenn import oni, openni
+from framework.datasets.scenenn.oni import LARGEST_TIME_DIFFERENCE, WAITING, pair, read_frames
+from framework.datasets.scenenn.oni_records import Images, Stream, read_contents
+from framework.datasets.scenenn.openni import LIBRARIES, OniImage
+from framework.errors import ConfigError, DataError
+from tests.oni_file import COLOR, DEPTH, YUV422, Node, OniFile, crash
+
+TIMES = [33_333, 66_666, 100_000, 133_333]
+
+
+def is_installed():
+    try:
+        ctypes.CDLL(LIBRARIES[0])
+    except OSError:
+        return False
+    return True
+
+
+played = pytest.mark.skipif(not is_installed(), reason="OpenNI 2 is not installed: apt-get install libopenni2-0")
+
+
+def depths(shape=(6, 8), dtype=np.uint16):
+    return [np.random.default_rng(k).integers(0, 10_000, shape).astype(dtype) for k in range(len(TIMES))]
+
+
+def colors(shape=(6, 8)):
+    return [np.full((*shape, 3), (10 * k, 200 - k, 50), np.uint8) for k in range(len(TIMES))]
+
+
+def recording(**of_depth):
+    return [Node(DEPTH, depths(), TIMES, **of_depth), Node(COLOR, colors(), [time + 5 for time in TIMES])]
+
+
+def frames_of(path):
+    return list(read_frames(read_contents(path), path.parent))
+
+
+@played
+@pytest.mark.parametrize("wide", [True, False])
+def test_openni_plays_all_frames_of_an_uncompressed_recording(tmp_path, wide):
+    frames = frames_of(OniFile(recording(), wide).write(tmp_path / "a.oni"))
+    assert [(frame.color_time, frame.depth_time) for frame in frames] == [(time + 5, time) for time in TIMES]
+    np.testing.assert_array_equal([frame.depth_mm for frame in frames], depths())
+    np.testing.assert_array_equal([frame.color for frame in frames], colors())
+    assert frames[0].depth_mm.dtype == np.uint16
+
+
+@played
+def test_openni_unpacks_its_codecs(tmp_path):
+    nodes = recording(codec=b"16zT")
+    nodes[1].codec = b"JPEG"
+    frames = frames_of(OniFile(nodes).write(tmp_path / "a.oni"))
+    np.testing.assert_array_equal([frame.depth_mm for frame in frames], depths())
+    np.testing.assert_allclose([frame.color for frame in frames], colors(), atol=3)
+
+
+@played
+def test_depth_in_tenths_of_a_millimetre_is_rounded_to_millimetres(tmp_path):
+    frames = frames_of(OniFile(recording(pixel_format=openni.DEPTH_100_UM)).write(tmp_path / "a.oni"))
+    expected = np.floor(np.array(depths()) / 10 + 0.5)
+    np.testing.assert_array_equal([frame.depth_mm for frame in frames], expected)
+
+
+@played
+def test_a_recording_that_was_cut_off_is_played_as_far_as_it_goes(tmp_path):
+    path = OniFile(recording()).write(tmp_path / "a.oni")
+    second = OniFile(recording())
+    second.write(tmp_path / "b.oni")
+    path.write_bytes(path.read_bytes()[: second.nodes[1].positions[2] + 50])
+    frames = frames_of(path)
+    np.testing.assert_array_equal([frame.depth_mm for frame in frames], depths()[:2])
+    assert sorted(tmp_path.iterdir()) == [path, tmp_path / "b.oni"]
+
+
+@played
+def test_other_pixels_than_depth_and_rgb_are_refused(tmp_path):
+    nodes = recording()
+    nodes[1].pixel_format = YUV422
+    with pytest.raises(DataError, match=r"a\.oni: OpenNI 2 gives color in its pixel format 201; expected 200"):
+        frames_of(OniFile(nodes).write(tmp_path / "a.oni"))
+
+
+@played
+def test_a_player_that_is_stuck_is_not_waited_for(tmp_path, monkeypatch):
+    monkeypatch.setattr(openni, "PATIENCE", 200)
+    path = OniFile(recording()).write(tmp_path / "a.oni")
+    streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
+    with pytest.raises(DataError, match="OpenNI 2 plays no further than depth 4 of 9, color 4 of 9"):
+        list(openni.play(path, streams))
+
+
+def test_a_player_that_crashes_is_an_error_of_one_line(tmp_path, monkeypatch):
+    monkeypatch.setattr(oni, "_deliver", crash)
+    path = OniFile(recording()).write(tmp_path / "a.oni")
+    with pytest.raises(DataError) as caught:
+        frames_of(path)
+    assert str(caught.value) == f"{path}: it is damaged, OpenNI 2 crashed on it with status {-signal.SIGKILL}"
+
+
+def test_without_openni_the_package_is_named(tmp_path, monkeypatch):
+    monkeypatch.setattr(openni, "LIBRARIES", ("libNotThere.so",))
+    with pytest.raises(ConfigError, match="OpenNI 2 is not installed: apt-get install libopenni2-0"):
+        next(openni.play(tmp_path / "a.oni", {}))
+
+
+@played
+def test_a_path_that_openni_would_cut_is_refused(tmp_path):
+    with pytest.raises(DataError, match="paths of at most 255 bytes"):
+        next(openni.play(tmp_path / ("a" * 250 + ".oni"), {}))
+
+
+def image(stream, time, shape=(2, 3)):
+    return OniImage(stream, 1, time, np.zeros(shape))
+
+
+def times_of(frames):
+    return [(frame.color_time, frame.depth_time) for frame in frames]
+
+
+def play_back(color_times, depth_times):
+    """SceneNN's PlaybackSync: reads one of each, then of the earlier one until both are close."""
+    paired, color_reader, depth_reader = [], iter(color_times), iter(depth_times)
+    try:
+        while True:
+            depth, color = next(depth_reader), next(color_reader)
+            while abs(color - depth) > LARGEST_TIME_DIFFERENCE:
+                if color > depth:
+                    depth = next(depth_reader)
+                else:
+                    color = next(color_reader)
+            paired.append((color, depth))
+    except StopIteration:
+        return paired
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_frames_are_paired_as_the_play_back_of_scenenn_does(seed):
+    rng = np.random.default_rng(seed)
+    times = {stream: 33_333 * np.flatnonzero(rng.random(60) < 0.8) + rng.integers(0, 30_000) for stream in Stream}
+    images = sorted((image(stream, int(time)) for stream in Stream for time in times[stream]), key=lambda one: one.time)
+    expected = play_back(times[Stream.COLOR], times[Stream.DEPTH])
+    assert len(expected) > 20
+    assert times_of(pair(images)) == expected
+
+
+def test_images_just_close_enough_are_a_frame():
+    at_limit = [image(Stream.DEPTH, 0), image(Stream.COLOR, LARGEST_TIME_DIFFERENCE)]
+    assert times_of(pair(at_limit)) == [(LARGEST_TIME_DIFFERENCE, 0)]
+    assert times_of(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, LARGEST_TIME_DIFFERENCE + 1)])) == []
+
+
+def test_a_stream_that_stays_alone_does_not_fill_the_memory():
+    alone = [image(Stream.DEPTH, time) for time in range(WAITING + 1)]
+    assert times_of(pair([*alone, image(Stream.COLOR, 0)])) == [(0, 1)]
+
+
+def test_colour_and_depth_of_different_sizes_are_refused():
+    with pytest.raises(DataError, match="color is 6x4 and depth 3x2; they must have the same size"):
+        list(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, 0, (4, 6, 3))]))

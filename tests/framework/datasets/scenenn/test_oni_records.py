@@ -1,0 +1,103 @@
+"""What the records of an .oni say, also where it ends too early."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from framework.datasets.scenenn.oni_records import Stream, playable, read_contents
+from framework.errors import DataError
+from tests.oni_file import COLOR, DEPTH, Node, OniFile
+
+TIMES = [33_000, 66_000, 99_000]
+
+
+def recording(wide=True):
+    depths = [np.full((2, 4), k, np.uint16) for k in range(3)]
+    colors = [np.full((2, 4, 3), k, np.uint8) for k in range(3)]
+    return OniFile([Node(DEPTH, depths, TIMES), Node(COLOR, colors[:2], TIMES[:2])], wide)
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_the_images_of_both_streams_are_counted(tmp_path, wide):
+    path = recording(wide).write(tmp_path / "a.oni")
+    contents = read_contents(path)
+    counted = {stream: (images.node, images.count, images.last) for stream, images in contents.streams.items()}
+    assert counted == {Stream.DEPTH: (1, 3, 3), Stream.COLOR: (2, 2, 2)}
+    assert not contents.cut_off
+    assert contents.end == path.stat().st_size
+    with playable(contents, tmp_path) as played:
+        assert played == path
+
+
+def test_what_a_recorder_left_behind_the_end_does_not_matter(tmp_path):
+    path = recording().write(tmp_path / "a.oni")
+    size = path.stat().st_size
+    with path.open("ab") as file:
+        file.write(b"rest of an older file")
+    contents = read_contents(path)
+    assert not contents.cut_off
+    assert contents.end == size
+
+
+@pytest.mark.parametrize("wide", [True, False])
+def test_a_recording_that_was_cut_off_anywhere_is_mended_to_its_whole_records(tmp_path, wide):
+    content = recording(wide).write(tmp_path / "a.oni").read_bytes()
+    path, scratch = tmp_path / "cut.oni", tmp_path / "scratch"
+    scratch.mkdir()
+    counts = set()
+    for size in range(0, len(content), 11):
+        path.write_bytes(content[:size])
+        try:
+            contents = read_contents(path)
+        except DataError as error:
+            assert "\n" not in str(error)
+            continue
+        assert contents.cut_off
+        counts.add(sum(images.count for images in contents.streams.values()))
+        with playable(contents, scratch) as played:
+            mended = read_contents(played)
+            assert not mended.cut_off
+            assert mended.streams == contents.streams
+            positions = [struct.unpack_from("<Q", played.read_bytes(), at)[0] for at in mended.table_notes]
+            assert positions == [0, 0] if wide else positions == []
+        assert not any(scratch.iterdir())
+    assert counts == {2, 3, 4, 5}
+    assert path.read_bytes() == content[:size]  # the recording itself is not touched
+
+
+def test_the_largest_node_that_a_killed_recorder_did_not_note_is_mended(tmp_path):
+    content = bytearray(recording().write(tmp_path / "a.oni").read_bytes()[:-28])
+    content[20:24] = bytes(4)
+    (tmp_path / "a.oni").write_bytes(content)
+    with playable(read_contents(tmp_path / "a.oni"), tmp_path) as played:
+        assert struct.unpack_from("<I", played.read_bytes(), 20) == (2,)
+
+
+@pytest.mark.parametrize(
+    ("content", "fault"),
+    [
+        (b"", "is no OpenNI recording: it begins with b'', expected b'NI10'"),
+        (b"NI10" + bytes(8), "is no OpenNI recording"),
+        (b"RIFF" + bytes(40), "is no OpenNI recording: it begins with b'RIFF'"),
+        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 2, 0, 0, 2), "version 1.0.2.0; OpenNI 2 plays 1.0.0.4 to 1.0.1.0"),
+        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2**32 - 1), "is damaged: it says to have 4294967295 nodes"),
+        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2), "has no depth image before byte 24, where it is cut off"),
+        (None, "could not be read: No such file"),
+    ],
+)
+def test_what_is_no_recording_is_refused_in_one_line(tmp_path, content, fault):
+    path = tmp_path / "a.oni"
+    if content is not None:
+        path.write_bytes(content)
+    with pytest.raises(DataError) as caught:
+        read_contents(path)
+    assert str(path) in str(caught.value)
+    assert fault in str(caught.value)
+
+
+@pytest.mark.parametrize(("kept", "missing"), [(0, "color"), (1, "depth")])
+def test_a_recording_without_one_of_the_streams_is_refused(tmp_path, kept, missing):
+    path = OniFile([recording().nodes[kept]]).write(tmp_path / "a.oni")
+    with pytest.raises(DataError, match=f"has no {missing} image; it needs depth and color"):
+        read_contents(path)

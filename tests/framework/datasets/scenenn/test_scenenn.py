@@ -1,0 +1,222 @@
+"""SceneNN's folders written in the exact layout, sound and with what real copies lack."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.datasets.scenenn.intrinsics import write_intrinsics
+from framework.datasets.scenenn.scenenn import SceneNN, Sensor
+from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
+from framework.datasets.scenenn.timestamps import write_timestamps
+from framework.datasets.scenenn.trajectory_log import write_trajectory_log
+from framework.errors import DataError, FrameError
+from framework.files.ply import write_ply
+
+CAMERA = Camera(32, 24, 30.0, 30.0, 15.0, 11.0)
+FRAMES = 4
+CHAIR, NAMELESS, CABINET, UNLISTED, SOFA = 934338, 12, 7, 55, 3
+WALL = 2.0  # m, where the mesh lies in front of the first camera
+
+
+def labels() -> list[Annotated]:
+    """In no order, as in the data set."""
+    named = ((CHAIR, "chair1", "chair"), (NAMELESS, "thing", ""), (CABINET, "cabinet", "cabinet"), (SOFA, "s", "Sofa"))
+    return [Annotated(i, text, nyu, (10, 20, 30), None, None) for i, text, nyu in named]
+
+
+def striped_wall() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A wall of vertical stripes 0.25 m wide from x = -1 to 1, each of one label; vertices every 5 cm."""
+    x, y = np.meshgrid(np.arange(-20, 21) * 0.05, np.arange(-20, 21) * 0.05)
+    vertices = np.stack([x, y, np.full_like(x, WALL)], axis=-1).reshape(-1, 3).astype(np.float32)
+    corner = (np.arange(40)[:, None] * 41 + np.arange(40)).ravel()
+    triangles = np.concatenate(
+        [np.stack([corner, corner + 1, corner + 41], 1), np.stack([corner + 1, corner + 42, corner + 41], 1)]
+    )
+    stripes = np.array([0, CHAIR, 0, NAMELESS, CABINET, UNLISTED, SOFA, CHAIR])
+    index = np.clip(((vertices[:, 0] + 1) / 0.25).astype(int), 0, 7)
+    return vertices, triangles.astype(np.int32), stripes[index].astype(np.int32)
+
+
+def color(k: int) -> np.ndarray:
+    return np.random.default_rng(k).integers(0, 255, (*CAMERA.shape, 3)).astype(np.uint8)
+
+
+def pose(k: int) -> np.ndarray:
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = 0.1 * k
+    return T_world_camera
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    scene = tmp_path / "016"
+    for name in ("image", "depth"):
+        (scene / name).mkdir(parents=True)
+    (tmp_path / "intrinsic").mkdir()
+    for k in range(FRAMES):
+        cv2.imwrite(str(scene / f"image/image{k + 1:05d}.png"), color(k)[..., ::-1])
+        cv2.imwrite(str(scene / f"depth/depth{k + 1:05d}.png"), np.full(CAMERA.shape, 2000 + k, np.uint16))
+    write_intrinsics(tmp_path / "intrinsic" / "asus.ini", CAMERA)
+    write_trajectory_log(scene / "trajectory.log", {k: pose(k) for k in range(FRAMES)})
+    write_timestamps(scene / "timestamp.txt", {k + 1: k / 10 for k in range(FRAMES)})
+    vertices, triangles, vertex_labels = striped_wall()
+    write_ply(scene / "016.ply", vertices, triangles, {"label": vertex_labels})
+    write_annotation(scene / "016.xml", labels())
+    (tmp_path / "release.txt").write_text("of a test\n")
+    return tmp_path
+
+
+def test_a_frame_holds_what_the_files_hold(root: Path) -> None:
+    sequence = SceneNN(root, "016")
+    assert (len(sequence), sequence.name, sequence.camera) == (FRAMES, "016", CAMERA)
+    frame = sequence[2]
+    assert (frame.index, frame.timestamp) == (2, 0.2)
+    np.testing.assert_array_equal(frame.color, color(2))
+    assert (frame.depth == np.float32(2.002)).all()
+    assert frame.T_world_camera is not None
+    np.testing.assert_allclose(frame.T_world_camera, pose(2), atol=1e-9)
+    assert frame.truth is None, "it costs time, and only some detectors need it"
+
+
+def test_labels_become_instances_of_the_nine_classes(root: Path) -> None:
+    truth = SceneNN(root, "016").scene_truth()
+    assert truth is not None
+    _, _, vertex_labels = striped_wall()
+    assert truth.class_names == {CHAIR: "chair", SOFA: "couch", NAMELESS: None, UNLISTED: None}
+    expected = np.where(vertex_labels == CABINET, 0, vertex_labels)
+    np.testing.assert_array_equal(truth.instance_ids, expected)
+
+
+def test_only_the_nine_classes_were_looked_for(root: Path) -> None:
+    truth = SceneNN(root, "016").scene_truth()
+    assert truth is not None
+    assert len(truth.classes or ()) == 9
+    assert "toilet" in (truth.classes or ())
+
+
+def test_labels_that_the_annotation_does_not_have_are_counted(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    SceneNN(root, "016")
+    assert caplog.text.count("016.ply: 016.xml does not have 1 of its labels, like 55") == 1
+    write_annotation(root / "016" / "016.xml", [*labels(), Annotated(UNLISTED, "x", "chair")])
+    caplog.clear()
+    SceneNN(root, "016")
+    assert not caplog.records
+
+
+def test_an_annotation_without_labels_is_named(root: Path) -> None:
+    (root / "016" / "016.xml").write_text("<annotation/>")
+    with pytest.raises(DataError, match=r"016\.xml holds no <label>"):
+        SceneNN(root, "016")
+
+
+def test_a_label_without_a_text_or_of_an_unknown_class_is_not_evaluated(root: Path) -> None:
+    changed = [
+        Annotated(CHAIR, "", "chair", (0, 0, 0), None, None),
+        Annotated(SOFA, "sofa", "unknown", (0, 0, 0), None, None),
+    ]
+    write_annotation(root / "016" / "016.xml", changed)
+    truth = SceneNN(root, "016").scene_truth()
+    assert truth is not None
+    assert set(truth.class_names.values()) == {None}
+
+
+def test_true_masks_are_those_of_the_mesh_seen_from_the_true_pose(root: Path) -> None:
+    frame = SceneNN(root, "016", frame_truth=True)[1]
+    assert frame.truth is not None
+    u = np.arange(CAMERA.width)
+    x = (u - CAMERA.cx) / CAMERA.fx * WALL + 0.1  # in the world, on the wall
+    nearest = np.round(x / 0.05).astype(int) + 20  # column of the nearest vertex
+    _, _, vertex_labels = striped_wall()
+    row = vertex_labels.reshape(41, 41)[0]
+    expected = np.where(np.abs(x) <= 1, row[np.clip(nearest, 0, 40)], 0)
+    expected[expected == CABINET] = 0
+    sure = np.abs(x / 0.05 - np.floor(x / 0.05) - 0.5) > 0.01  # amid two vertices it is a matter of rounding
+    np.testing.assert_array_equal(frame.truth.instance_ids[11, sure], expected[sure])
+
+
+def test_frames_without_a_usable_pose_are_named_when_they_are_read(root: Path) -> None:
+    path = root / "016" / "trajectory.log"
+    write_trajectory_log(path, {k: pose(k) for k in range(FRAMES - 1)})
+    text = path.read_text().replace("0.1", "nan", 1)
+    path.write_text(text)
+    sequence = SceneNN(root, "016")
+    assert sequence[0].index == 0
+    assert sequence[2].index == 2
+    with pytest.raises(FrameError, match=r"frame 1: .*image00002\.png: .*finite"):
+        sequence[1]
+    with pytest.raises(FrameError, match=r"image00004\.png: trajectory\.log has no pose for it"):
+        sequence[3]
+
+
+def test_without_a_trajectory_poses_are_not_known(root: Path) -> None:
+    (root / "016" / "trajectory.log").unlink()
+    assert SceneNN(root, "016")[1].T_world_camera is None
+
+
+@pytest.mark.parametrize("name", ["image/image00003.png", "depth/depth00003.png"])
+def test_a_missing_image_is_the_fault_of_its_frame(root: Path, name: str) -> None:
+    (root / "016" / name).unlink()
+    sequence = SceneNN(root, "016")
+    assert len(sequence) == FRAMES
+    assert sequence[3].index == 3
+    with pytest.raises(FrameError, match="00003"):
+        sequence[2]
+
+
+def test_without_timestamps_frames_come_at_30_hz(root: Path) -> None:
+    (root / "016" / "timestamp.txt").unlink()
+    assert SceneNN(root, "016")[3].timestamp == pytest.approx(0.1)
+
+
+def test_where_times_do_not_grow_frames_come_at_30_hz(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_timestamps(root / "016" / "timestamp.txt", dict.fromkeys(range(1, FRAMES + 1), 0))
+    assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
+    assert caplog.text.count("the times do not grow") == 1
+
+
+def test_timestamps_that_lack_an_image_are_left_out(root: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_timestamps(root / "016" / "timestamp.txt", {k: 7 + k / 10 for k in (1, 2, 4)})
+    assert [frame.timestamp for frame in SceneNN(root, "016")] == [k / 30 for k in range(FRAMES)]
+    assert caplog.text.count("timestamp.txt has no time for 1 of 4 images, the first being 3: it is ignored") == 1
+
+
+@pytest.mark.parametrize("line", ["2 x 5", "2 5", "1 0 0", "2 0 nan"])
+def test_a_bad_line_of_timestamps_is_named(root: Path, line: str) -> None:
+    (root / "016" / "timestamp.txt").write_text(f"1 0 0\n{line}\n")
+    with pytest.raises(DataError, match=r"timestamp\.txt, line 2"):
+        SceneNN(root, "016")
+
+
+def test_without_a_labelled_mesh_there_is_no_truth(root: Path) -> None:
+    (root / "016" / "016.xml").unlink()
+    sequence = SceneNN(root, "016")
+    assert sequence.scene_truth() is None
+    assert sequence.annotation == ""
+    with pytest.raises(DataError, match=r"frame_truth needs .*016\.ply and \.xml"):
+        SceneNN(root, "016", frame_truth=True)
+
+
+def test_a_mesh_without_labels_is_named(root: Path) -> None:
+    vertices, triangles, _ = striped_wall()
+    write_ply(root / "016" / "016.ply", vertices, triangles, {"red": np.zeros(len(vertices), np.uint8)})
+    with pytest.raises(DataError, match=r"016\.ply: expected a vertex property `label`"):
+        SceneNN(root, "016")
+
+
+def test_tables_learn_the_release_of_the_annotation(root: Path) -> None:
+    assert SceneNN(root, "016").annotation == "of a test"
+    assert SceneNN(root, "016", release="2016").annotation == "2016"
+    (root / "release.txt").unlink()
+    assert SceneNN(root, "016").annotation == "not named"
+
+
+def test_the_sensor_names_the_file_of_intrinsics(root: Path) -> None:
+    with pytest.raises(DataError, match=r"kinect2\.ini"):
+        SceneNN(root, "016", sensor=Sensor.KINECT2)
+    write_intrinsics(root / "intrinsic" / "kinect2.ini", Camera(32, 24, 29.0, 28.0, 16.0, 12.0))
+    assert SceneNN(root, "016", sensor=Sensor.KINECT2).camera.fx == 29.0

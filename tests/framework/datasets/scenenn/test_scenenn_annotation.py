@@ -1,0 +1,203 @@
+"""NNN.xml: the published attributes, what is missing or odd, and what is an attack."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Box
+from framework.datasets.scenenn import scenenn_annotation
+from framework.datasets.scenenn.scenenn_annotation import NO_COLOR, Annotated, read_annotation, write_annotation
+from framework.errors import DataError
+
+TURN = Rotation.from_euler("xyz", (0.1, 0.5, -2)).as_matrix()
+BOX = Box(np.array([0.5, 0.25, -1.5]), np.array([1.0, 0.5, 2.0]), np.eye(3))
+GOLDEN = """<?xml version="1.0" encoding="utf-8"?>
+<annotation>
+  <label id="934338" color="255 0 7" text="chair" nyu_class="chair" aabbox="0.0 0.0 -2.5 1.0 0.5 -0.5" obbox="0.5 0.25 \
+-1.5 1.0 0.5 2.0 0.0 0.0 0.0 1.0"/>
+  <label id="0" color="0 0 0" text="" nyu_class=""/>
+</annotation>
+"""
+OBJECTS = (
+    Annotated(934338, "chair", "chair", (255, 0, 7), np.array([[0, 0, -2.5], [1, 0.5, -0.5]]), BOX),
+    Annotated(0, "", ""),
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "011.xml"
+
+
+def read_label(path, attributes):
+    path.write_text(f"<annotation><label {attributes}/></annotation>")
+    (label,) = read_annotation(path)
+    return label
+
+
+def assert_same(a, b):
+    assert (a.id, a.text, a.nyu_class, a.color) == (b.id, b.text, b.nyu_class, b.color)
+    np.testing.assert_array_equal(a.aabb, b.aabb)
+    assert (a.obb is None) == (b.obb is None)
+    if a.obb is not None:
+        np.testing.assert_array_equal(a.obb.center, b.obb.center)
+        np.testing.assert_array_equal(a.obb.extent, b.obb.extent)
+        np.testing.assert_allclose(a.obb.rotation, b.obb.rotation, atol=1e-15)
+
+
+def test_the_golden_text(path):
+    write_annotation(path, OBJECTS)
+    assert path.read_text() == GOLDEN
+
+
+def test_what_is_written_is_read_back(path):
+    odd = Annotated(3, 'a <b> & "c\'s"\n\tKüche', "sofa", (1, 2, 3), None, dataclasses.replace(BOX, rotation=TURN))
+    write_annotation(path, (*OBJECTS, odd))
+    for read, written in zip(read_annotation(path), (*OBJECTS, odd), strict=True):
+        assert_same(read, written)
+
+
+def test_an_oriented_box_is_turned_by_its_quaternion(path):
+    """A quarter turn about z: the box's x axis is the world's y."""
+    half = np.sqrt(0.5)
+    box = read_label(path, f'id="1" obbox="1 2 3 4 5 6 0 0 {half} {half}"').obb
+    np.testing.assert_allclose(box.rotation @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    assert (box.center.tolist(), box.extent.tolist()) == ([1, 2, 3], [4, 5, 6])
+
+
+def test_what_is_not_known_is_left_out(path):
+    path.write_text('<scene v="2"><!-- x --><camera id="x"/>text<label id=" 7 " z="1"><part id="8"/></label></scene>')
+    (label,) = read_annotation(path)
+    assert_same(label, Annotated(7, "", "", NO_COLOR, None, None))
+
+
+def test_a_namespace_is_left_out(path):
+    path.write_text('<annotation xmlns="http://a.b/c"><label id="7" text="chair"/></annotation>')
+    assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
+    path.write_text('<n:annotation xmlns:n="http://a.b/c"><n:label id="7" text="chair"/></n:annotation>')
+    assert [(label.id, label.text) for label in read_annotation(path)] == [(7, "chair")]
+
+
+def test_a_label_that_is_there_twice_counts_once_when_both_say_the_same(path):
+    path.write_text('<a><label id="5" text="chair"/><label id="6"/><label id="5" text="chair"/></a>')
+    assert [label.id for label in read_annotation(path)] == [5, 6]
+
+
+@pytest.mark.parametrize("text", ["<annotation/>", "<annotation><labels/></annotation>", "<a><b id='1'/></a>"])
+def test_a_file_without_labels_is_no_annotation(path, text):
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"011.xml holds no <label>"):
+        read_annotation(path)
+
+
+@pytest.mark.parametrize("text", ["", "1 2", "1 2 3 4", "1 2 256", "1 2 -1", "1 2 x", "1 2 nan", "1 2 2.5"])
+def test_a_color_that_is_none(path, text):
+    assert read_label(path, f'id="1" color="{text}"').color == NO_COLOR
+
+
+@pytest.mark.parametrize("text", ["", "0 0 0 1 1", "0 0 0 1 1 1 1", "0 0 0 1 1 inf", "0 0 0 1 1 x", "0 0 2 1 1 1"])
+def test_an_axis_aligned_box_that_is_none(path, text):
+    assert read_label(path, f'id="1" aabbox="{text}"').aabb is None
+
+
+@pytest.mark.parametrize("text", ["0 0 0 1 1 1", "0 0 0 1 1 -1 0 0 0 1", "0 0 0 1 1 1 0 0 0 0", "0 0 0 1 1 1 0 0 0 9"])
+def test_an_oriented_box_that_is_none(path, text):
+    assert read_label(path, f'id="1" obbox="{text}"').obb is None
+
+
+@pytest.mark.parametrize(
+    ("label", "message"),
+    [
+        ("<label/>", "line 3: a label needs an id from 0 to 2147483647, found none"),
+        ('<label id=""/>', "line 3: a label needs an id .* found ''"),
+        ('<label id="chair"/>', "line 3: .* found 'chair'"),
+        ('<label id="-1"/>', "line 3: .* found '-1'"),
+        ('<label id="1.0"/>', "line 3: .* found '1.0'"),
+        ('<label id="2147483648"/>', "line 3: .* found '2147483648'"),
+        ('<label id="5" text="a"/>', "line 3: the label 5 is there already in line 2, with other attributes"),
+        ("<label id=5/>", r"line 3: this is not XML: not well-formed \(invalid token\)"),
+        ('<label id="6">', "line 4: this is not XML: mismatched tag"),
+        ('<label id="&a;"/>', "line 3: this is not XML: undefined entity"),
+    ],
+)
+def test_faults_name_file_and_line(path, label, message):
+    path.write_text(f'<annotation>\n<label id="5"/>\n{label}\n</annotation>')
+    with pytest.raises(DataError, match=f"011.xml, {message}"):
+        read_annotation(path)
+
+
+BOMB = "".join(f'<!ENTITY a{k} "{f"&a{k - 1};" * 10 if k else "ha"}">' for k in range(12))
+
+
+@pytest.mark.parametrize(
+    "prologue",
+    [
+        f"<!DOCTYPE l [{BOMB}]>",
+        '<!DOCTYPE l [<!ENTITY a11 SYSTEM "file:///etc/passwd">]>',
+        '<!DOCTYPE l [<!ENTITY % a11 SYSTEM "http://127.0.0.1/a.dtd"> %a11;]>',
+        '<!DOCTYPE l SYSTEM "file:///etc/passwd">',
+        f'<!DOCTYPE l [<!ATTLIST label text CDATA "{"x" * 100000}">]>',  # each label would hold it
+    ],
+)
+def test_entities_and_document_types_are_refused(path, prologue):
+    path.write_text(f'<?xml version="1.0"?>\n{prologue}\n<l><label id="1" text="&a11;"/></l>')
+    began = time.perf_counter()
+    with pytest.raises(DataError, match=r"011.xml, line 2: document types and entities are refused") as caught:
+        read_annotation(path)
+    assert time.perf_counter() - began < 1
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("encoding", ["rot13", "hex", "shift_jis", "idna", "x" * 1000])
+def test_an_unknown_encoding(path, encoding):
+    path.write_text(f'<?xml version="1.0" encoding="{encoding}"?><l/>')
+    with pytest.raises(DataError, match=r"011.xml, line 1: its encoding is not known, expected UTF-8$"):
+        read_annotation(path)
+
+
+def test_other_encodings_are_read(path):
+    path.write_text('<?xml version="1.0" encoding="latin-1"?><l><label id="1" text="Küche"/></l>', encoding="latin-1")
+    assert read_annotation(path)[0].text == "Küche"
+    path.write_bytes('<?xml version="1.0" encoding="utf-16"?><l><label id="1" text="Küche"/></l>'.encode("utf-16"))
+    assert read_annotation(path)[0].text == "Küche"
+
+
+def test_deep_nesting_is_no_recursion(path):
+    path.write_text("<a>" * 50000 + '<label id="1"/>' + "</a>" * 50000)
+    assert [label.id for label in read_annotation(path)] == [1]
+
+
+def test_a_file_that_is_too_large_or_not_there(path, monkeypatch):
+    with pytest.raises(DataError, match=r"011.xml could not be read: No such file"):
+        read_annotation(path)
+    monkeypatch.setattr(scenenn_annotation, "LARGEST_FILE", 100)
+    path.write_text("<a><label id='1'/>" + " " * 78 + "</a>")
+    assert len(read_annotation(path)) == 1
+    path.write_text("<a><label id='1'/>" + " " * 79 + "</a>")
+    with pytest.raises(DataError, match=r"011.xml has 101 bytes, more than the 100"):
+        read_annotation(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"id": -1}, "the id of a label is from 0 .* found -1"),
+        ({"id": 0}, "the id of a label is from 0 .* and its own, found 0"),
+        ({"color": (0, 0, 256)}, "the color of label 5"),
+        ({"text": "a\0b"}, r"label 5 is called 'a\\x00b', and XML cannot hold that"),
+        ({"nyu_class": "\ud800"}, "label 5"),
+        ({"aabb": np.full((2, 3), np.nan)}, "a box of label 5"),
+        ({"obb": dataclasses.replace(BOX, extent=np.array([1, 1, -1.0]))}, "a box of label 5"),
+    ],
+)
+def test_what_could_not_be_read_back_is_not_written(path, change, message):
+    with pytest.raises(DataError, match=message):
+        write_annotation(path, (OBJECTS[1], dataclasses.replace(Annotated(5, "chair", "chair"), **change)))
+    with pytest.raises(DataError, match="at least one label"):
+        write_annotation(path, ())
+    assert list(path.parent.iterdir()) == []

@@ -1,0 +1,146 @@
+"""Networks as files: what is written comes back, and what was damaged does not."""
+
+import json
+import re
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from framework.detection.mask_rcnn.network_file import describe_network, filled, load_network, save_network
+from framework.errors import DataError
+from tests.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
+
+
+def rewritten(path, tensors=None, **metadata):
+    """The file with other tensors or metadata, written as by somebody else."""
+    from safetensors import safe_open
+
+    with safe_open(path, framework="pt") as file:
+        before = file.metadata()
+    save_file(load_file(path) if tensors is None else tensors, path, before | metadata)
+    return path
+
+
+def weights(network):
+    return {name: tensor for name, tensor in network.state_dict().items() if "num_batches" not in name}
+
+
+def assert_one_line(path, *parts):
+    with pytest.raises(DataError) as caught:
+        load_network(path)
+    message = str(caught.value)
+    assert str(path) in message
+    assert "\n" not in message
+    for part in parts:
+        assert part in message
+
+
+def test_a_network_comes_back_as_it_was(tmp_path):
+    network, path = tiny_network(), tmp_path / "network.safetensors"
+    save_network(network, path, {"steps": 300, "mask_ap50": 0.51, "data": "rooms"})
+    loaded = load_network(path)
+    assert loaded.architecture == TINY
+    assert not loaded.training
+    for name, tensor in weights(network).items():
+        assert torch.equal(weights(loaded)[name], tensor), name
+    assert describe_network(path).card == {"steps": 300, "mask_ap50": 0.51, "data": "rooms"}
+    assert describe_network(path).architecture == TINY
+    assert [file.name for file in tmp_path.iterdir()] == ["network.safetensors"]
+
+
+def test_half_precision_rounds_the_kernels_and_keeps_the_statistics(tmp_path):
+    network, path = tiny_network(), tmp_path / "half.safetensors"
+    network.backbone.body.bn1.running_var.fill_(1e6)  # float16 ends at 65504
+    save_network(network, path, {}, half=True)
+    loaded = weights(load_network(path))
+    assert loaded["backbone.body.bn1.running_var"][0] == 1e6
+    for name, tensor in weights(network).items():
+        expected = tensor.half().float() if tensor.ndim >= 2 else tensor
+        assert torch.equal(loaded[name], expected), name
+        assert loaded[name].dtype == torch.float32
+    whole = tiny_network_file(tmp_path)
+    assert path.stat().st_size < 0.8 * whole.stat().st_size
+
+
+def test_a_network_that_is_not_finite_is_not_written(tmp_path):
+    network = tiny_network()
+    network.rpn.head.cls_logits.bias.data[0] = torch.nan
+    with pytest.raises(DataError, match=r"cls_logits\.bias are not finite"):
+        save_network(network, tmp_path / "network.safetensors", {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_absent_file(tmp_path):
+    assert_one_line(tmp_path / "absent.safetensors", "there is no network")
+
+
+def test_a_cut_file(tmp_path):
+    path = tiny_network_file(tmp_path)
+    path.write_bytes(path.read_bytes()[:-100])
+    assert_one_line(path, "damaged")
+    path.write_bytes(b"<html>not found</html>")
+    assert_one_line(path, "damaged")
+
+
+def test_a_single_flipped_bit(tmp_path):
+    path = tiny_network_file(tmp_path)
+    content = bytearray(path.read_bytes())
+    content[-1000] ^= 1
+    path.write_bytes(content)
+    assert_one_line(path, "damaged")
+
+
+def test_a_file_without_an_architecture(tmp_path):
+    path = tmp_path / "other.safetensors"
+    save_file({"a": torch.zeros(1)}, path)
+    assert_one_line(path, "no architecture")
+
+
+@pytest.mark.parametrize(
+    ("change", "fault"),
+    [
+        (lambda fields: fields | {"color_space": "BGR"}, "architecture has the unknown field color_space"),
+        (lambda fields: {k: v for k, v in fields.items() if k != "classes"}, "'classes'"),
+        (lambda fields: fields | {"fpn_channels": "8"}, "architecture.fpn_channels must be int, found '8'"),
+        (lambda fields: fields | {"sampling_ratio": True}, "architecture.sampling_ratio must be int, found True"),
+        (lambda fields: fields | {"pixel_mean": [1.0, 2.0]}, "architecture.pixel_mean must have 3 values, found 2"),
+        (lambda fields: fields | {"classes": "chair"}, "architecture.classes must be a list"),
+        (lambda fields: fields | {"backbone": "resnet18"}, "architecture.backbone must have fields"),
+        (lambda fields: fields | {"backbone": fields["backbone"] | {"name": "vgg"}}, "no such architecture: 'vgg'"),
+        (lambda fields: fields | {"head_features": 17}, "fc6.bias must be 17, found 16"),
+    ],
+)
+def test_an_architecture_that_is_none(tmp_path, change, fault):
+    path = tiny_network_file(tmp_path)
+    fields = json.loads(json.dumps(vars(TINY) | {"backbone": vars(TINY.backbone)}))
+    rewritten(path, architecture=json.dumps(change(fields)))
+    assert_one_line(path, fault)
+
+
+def test_an_architecture_that_is_no_json(tmp_path):
+    assert_one_line(rewritten(tiny_network_file(tmp_path), architecture="{"))
+
+
+def test_a_field_that_older_files_lack_has_its_default(tmp_path):
+    fields = json.loads(json.dumps(vars(TINY) | {"backbone": vars(TINY.backbone)}))
+    del fields["truncated_strides"]
+    path = rewritten(tiny_network_file(tmp_path), architecture=json.dumps(fields))
+    assert load_network(path).architecture == TINY
+
+
+def test_weights_that_are_not_the_networks():
+    tensors = weights(tiny_network())
+    with pytest.raises(DataError, match=r"^here lacks weights backbone\.body\.bn1\.bias and 1 more"):
+        filled(
+            TINY, {k: v for k, v in tensors.items() if "backbone.body.bn1.b" not in k and "fc7.bias" not in k}, "here"
+        )
+    with pytest.raises(DataError, match=r"^here has the unknown weights extra: "):
+        filled(TINY, tensors | {"extra": torch.zeros(1)}, "here")
+    wrong = tensors | {"rpn.head.cls_logits.weight": torch.zeros(3, 9, 1, 1)}
+    with pytest.raises(
+        DataError, match=re.escape("here: rpn.head.cls_logits.weight must be 3 x 8 x 1 x 1, found 3 x 9")
+    ):
+        filled(TINY, wrong, "here")
+    with pytest.raises(DataError, match=r"^here: the weights rpn.head.cls_logits.bias are not finite"):
+        filled(TINY, tensors | {"rpn.head.cls_logits.bias": torch.full((3,), torch.inf)}, "here")

@@ -1,0 +1,146 @@
+"""What a refiner did to clusters, on frames small enough to count by hand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, FrameTruth, PointClusters
+from framework.evaluation.refined_points import Refinement, true_fit
+from framework.interfaces import ClusterRefiner
+from tests.scenes.corner_room import CornerRoom, SphereDetector
+
+SIZE = 10  # px
+
+
+def frame(instance_ids: np.ndarray | None = None, names: dict[int, str | None] | None = None) -> Frame:
+    """A wall 2 m away; without names, every object is a chair."""
+    truth = None
+    if instance_ids is not None:
+        truth = FrameTruth(instance_ids, names or {int(i): "chair" for i in np.unique(instance_ids) if i})
+    depth = np.full((SIZE, SIZE), 2.0, np.float32)
+    color = np.full((SIZE, SIZE, 3), 100, np.uint8)
+    return Frame(0, 0.0, color, depth, Camera(SIZE, SIZE, 10.0, 10.0, 4.5, 4.5), truth=truth)
+
+
+def clusters(*masks: np.ndarray) -> PointClusters:
+    """One cluster a mask (SIZE, SIZE)."""
+    places = [np.argwhere(mask)[:, ::-1] for mask in masks]
+    pixels = np.concatenate([np.zeros((0, 2), np.int64), *places]).astype(np.int32)
+    n = len(masks)
+    return PointClusters(
+        points_world=np.zeros((len(pixels), 3), np.float32),
+        pixels=pixels,
+        cluster=np.repeat(np.arange(n), [len(place) for place in places]).astype(np.int32),
+        class_probabilities=np.ones((n, 1), np.float32),
+        scores=np.ones(n, np.float32),
+        classes=("chair",),
+    )
+
+
+def rows(first: int, last: int) -> np.ndarray:
+    """Some rows of the image."""
+    mask = np.zeros((SIZE, SIZE), np.bool_)
+    mask[first:last] = True
+    return mask
+
+
+def ids(*objects: np.ndarray) -> np.ndarray:
+    image = np.zeros((SIZE, SIZE), np.int32)
+    for k, mask in enumerate(objects, start=1):
+        image[mask] = 10 * k
+    return image
+
+
+def test_the_fit_is_that_with_the_best_object() -> None:
+    # rows 2 to 7 cover 2 of 4 rows of the first object and 4 of 4 of the second: 20/80 and 40/60
+    seen = frame(ids(rows(0, 4), rows(4, 8)))
+    fit = true_fit(clusters(rows(2, 8), rows(9, 10), rows(0, 0)), seen, seen.truth)  # type: ignore[arg-type]
+    np.testing.assert_allclose(fit.iou, [40 / 60, 0, 0])
+    np.testing.assert_array_equal(fit.points_inside, [40, 0, 0])
+    assert not fit.unknown.any()
+
+
+def test_pixels_without_a_reading_do_not_count() -> None:
+    seen = frame(ids(rows(0, 4)))
+    seen.depth[:2] = 0
+    fit = true_fit(clusters(rows(2, 4)), seen, seen.truth)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(fit.iou, [1.0])
+
+
+def test_clusters_on_objects_of_unknown_class_do_not_count() -> None:
+    seen = frame(ids(rows(0, 4), rows(4, 8)), {10: None, 20: "chair"})
+    before = clusters(rows(0, 5), rows(3, 8))
+    refined = Refinement(seen, before, clusters(rows(4, 5), rows(4, 8)), 1.0)
+    assert refined.fit_before is not None
+    np.testing.assert_array_equal(refined.fit_before.unknown, [True, False])
+    np.testing.assert_allclose(refined.fit_before.iou, [10 / 80, 40 / 50])  # with the chair
+    np.testing.assert_array_equal(refined.judged_before, [False, True])
+    np.testing.assert_array_equal(refined.judged_after, [False, True])  # the first still does not, though on the chair
+
+
+def test_nothing_is_judged_without_truth_or_objects() -> None:
+    blind = Refinement(frame(), clusters(rows(0, 3)), clusters(rows(0, 2)), 1.0)
+    assert blind.fit_before is None
+    assert blind.fit_after is None
+    assert not blind.judged_before.any()
+    assert not blind.judged_after.any()
+    empty = frame(np.zeros((SIZE, SIZE), np.int32))
+    fit = true_fit(clusters(rows(0, 3)), empty, empty.truth)  # type: ignore[arg-type]
+    np.testing.assert_array_equal(fit.iou, [0.0])
+
+
+def test_clusters_keep_their_index_where_their_number_is_kept() -> None:
+    refined = Refinement(frame(), clusters(rows(0, 5), rows(5, 9)), clusters(rows(5, 9), rows(0, 0)), 1.0)
+    np.testing.assert_array_equal(refined.origin, [0, 1])
+    np.testing.assert_array_equal(refined.points_before, [50, 40])
+    np.testing.assert_array_equal(refined.points_after, [40, 0])
+
+
+def test_parts_are_of_the_cluster_that_they_share_most_with() -> None:
+    before = clusters(rows(0, 6), rows(6, 9), rows(1, 1))
+    after = clusters(rows(0, 2), rows(2, 6), rows(9, 10), rows(5, 9))
+    refined = Refinement(frame(), before, after, 1.0)
+    np.testing.assert_array_equal(refined.origin, [0, 0, -1, 1])
+    np.testing.assert_array_equal(refined.main_part, [1, 3, -1])
+    np.testing.assert_array_equal(refined.points_after, [60, 40, 0])
+    from_nothing = Refinement(frame(), clusters(), after, 1.0)
+    np.testing.assert_array_equal(from_nothing.origin, [-1] * 4)
+    to_nothing = Refinement(frame(), before, clusters(), 1.0)
+    np.testing.assert_array_equal(to_nothing.points_after, [0, 0, 0])
+
+
+@dataclass
+class Counting(ClusterRefiner):
+    """Takes every second point away, and counts how often it is asked."""
+
+    def __post_init__(self) -> None:
+        self.calls = 0
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        self.calls += 1
+        return replace(
+            clusters,
+            points_world=clusters.points_world[::2],
+            pixels=clusters.pixels[::2],
+            cluster=clusters.cluster[::2],
+        )
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_a_refiner_is_timed_and_sees_the_lifted_detections(truth: bool) -> None:
+    seen = CornerRoom()[2]
+    found: Detections = SphereDetector().detect(seen)
+    if not truth:
+        seen = replace(seen, truth=None, T_world_camera=None)
+    refiner = Counting()
+    refined = Refinement.of(refiner, found, seen)
+    assert refiner.calls > 1
+    assert refined.milliseconds > 0
+    np.testing.assert_array_equal(refined.points_before, found.masks.sum(axis=(1, 2)))
+    assert len(refined.after.cluster) == -(-len(refined.before.cluster) // 2)
+    depth = refined.before.points_world[:, 2]
+    read = seen.depth[refined.before.pixels[:, 1], refined.before.pixels[:, 0]]
+    assert np.array_equal(depth, read) is not truth  # without a pose the camera's own frame

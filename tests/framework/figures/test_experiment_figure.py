@@ -1,0 +1,230 @@
+"""The pictures of experiments: which runs are in them, what is said of the others, and the two files."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from PIL import Image
+
+from framework.commands import figures
+from framework.commands.sweep import sweep_in
+from framework.errors import ConfigError, DataError, InstanceMapError
+from framework.figures import map_figure
+from framework.figures.experiment_figure import DRAWN, Pictured, write_figure
+from framework.figures.figure_choice import FigureChoice
+from framework.files.tum_trajectory import write_tum
+from framework.records.mesh_file import write_mesh
+from framework.records.provenance import config_hash
+from tests.scenes.boxes_room import furnished, walk
+
+ROWS = {"part": ["dataset.stop=8"], "whole": []}
+
+
+@pytest.fixture(autouse=True)
+def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Panels of few pixels, which are drawn quickly."""
+    monkeypatch.setattr(map_figure, "PDF_DPI", 40)
+
+
+def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
+    """The record of a run that found both boxes."""
+    directory = root / f"dataset.scene={scene},row={row},seed=0"
+    directory.mkdir(parents=True)
+    room = {"_target_": "tests.scenes.boxes_room.BoxesRoom", "scene": scene}
+    config = {"row": row, "seed": 0, "dataset": room}
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    mesh, poses = furnished(), walk()[:frames]
+    write_mesh(directory / "mesh.ply", mesh)
+    entries = [{"id": k, "class": "chair", "confidence": 0.9, "vertices": 98} for k in (1, 2)]
+    (directory / "instances.json").write_text(json.dumps(entries))
+    write_tum(directory / "trajectory.txt", np.arange(len(poses)) / 30, poses)
+    times = [f"{k},{stage},{ms}" for k in range(frames) for stage, ms in (("track", 20), ("refine", 10), ("fuse", 30))]
+    (directory / "timings.csv").write_text("\n".join(["frame,stage,milliseconds", *times]) + "\n")
+    metrics: dict[str, Any] = {
+        **{"frames": frames, "instances.count": 2, "instances.ap50": 0.5, "annotation_release": "made up"},
+        **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
+        **{"environment.cpus": 2, "environment.processor": "Z80"},
+    }
+    (directory / "metrics.json").write_text(json.dumps(metrics))
+    return directory
+
+
+def experiment(root: Path, **figure: Any) -> Path:
+    root.mkdir()
+    config = {"rows": ROWS, "figure": figure, "table": {"columns": ["fps"]}}
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    return root
+
+
+def texts(root: Path) -> list[str]:
+    """All that is written on the page, diagrams included."""
+    pictured = Pictured.below(root)
+    page = DRAWN[pictured.choice.kind](pictured)
+    found = [*page.figure.texts, *(text for axes in page.figure.axes for text in axes.texts)]
+    return [text.get_text() for text in found]
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """Two sequences, of the second of which the first row's run has failed."""
+    root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
+    run(root, "part", "011", frames=8)
+    run(root, "whole", "011")
+    run(root, "whole", "206")
+    failed = root / "dataset.scene=206,row=part,seed=0"
+    failed.mkdir()
+    (failed / "instancemap.log").write_text("12:00:00 ERROR   the map is full\n")
+    return root
+
+
+def test_both_files_are_written_whole_and_the_same_each_time(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    paths = write_figure(maps)
+    assert [path.name for path in paths] == ["figure.png", "figure.pdf"]
+    assert sorted(path.name for path in maps.iterdir() if path.is_file()) == [
+        "figure.pdf",
+        "figure.png",
+        "multirun.yaml",
+    ]
+    first = [path.read_bytes() for path in paths]
+    width, height = Image.open(paths[0]).size
+    assert width == pytest.approx(181 / 25.4 * 200, abs=1)  # 181 mm at 200 dpi
+    assert height > 400
+    assert first[1].startswith(b"%PDF")
+    [said] = [record.getMessage() for record in caplog.records]
+    assert "dataset.scene=206,row=part,seed=0: failed: the map is full" in said
+    assert "in progress without 206" in said
+    assert "\n" not in said
+    write_figure(maps)
+    assert [path.read_bytes() for path in paths] == first
+
+
+def test_a_line_is_a_sequence_and_a_column_a_row(maps: Path) -> None:
+    found = texts(maps)
+    for text in ("in progress", "whole", "ground truth", "011", "206", "8 frames, 2 instances, AP50 0.50"):
+        assert found.count(text) == 1
+    assert found.count("20 frames, 2 instances, AP50 0.50") == 2
+    assert found.count("2 instances") == 2
+    assert found.count("not complete") == 1
+    [note] = [text for text in found if text.startswith("An object")]
+    for said in ("Annotation: made up.", "2 cores of Z80", "code 1234567."):
+        assert said in " ".join(note.split())
+
+
+def test_a_map_that_is_damaged_or_without_truth_is_left_out(maps: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (maps / "dataset.scene=011,row=part,seed=0" / "mesh.ply").write_bytes(b"ply\n")
+    run(maps, "whole", "gone")
+    found = texts(maps)
+    assert (found.count("not complete"), found.count("no true instances")) == (3, 1)
+    said = [record.getMessage() for record in caplog.records]
+    assert len(said) == 2
+    assert "mesh.ply" in said[0]
+    assert said[1].endswith("the scene is gone")
+
+
+def test_several_seeds_are_lines_of_their_own(tmp_path: Path) -> None:
+    root = experiment(tmp_path / "figure4", kind="maps", sequences="seed")
+    run(root, "whole", "011")
+    assert "0" in texts(root)
+    root = experiment(tmp_path / "again", kind="maps")
+    for seed in (0, 1):
+        directory = run(root / str(seed), "whole", "011")
+        config = OmegaConf.to_container(OmegaConf.load(directory / "config.yaml"))
+        assert isinstance(config, dict)
+        config["seed"] = seed
+        (directory / "config.yaml").write_text(OmegaConf.to_yaml(config))
+        metrics = json.loads((directory / "metrics.json").read_text())
+        metrics["config_hash"] = config_hash({str(key): value for key, value in config.items()})
+        (directory / "metrics.json").write_text(json.dumps(metrics))
+    assert {"011, seed 0", "011, seed 1"} <= set(texts(root))
+
+
+def test_the_zoomed_line_is_below(tmp_path: Path) -> None:
+    root = experiment(tmp_path / "figure5", kind="maps", zoom=True)
+    directory = run(root, "part", "011")
+    (directory / "instances.json").write_text('[{"id": 1, "class": "chair", "confidence": 0.9, "vertices": 98}]')
+    run(root, "whole", "011")
+    pictured = Pictured.below(root)
+    page = DRAWN["maps"](pictured)
+    assert len(page.figure.axes) == 6
+    assert [len(axes.patches) for axes in page.figure.axes] == [1, 1, 1, 0, 0, 0]  # where it is
+    names = [[text.get_text() for text in axes.texts] for axes in page.figure.axes[3:]]
+    assert all("chair" in one for one in names[1:])
+
+
+def test_stage_times_are_averaged_over_the_sequences(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    root = experiment(tmp_path / "figure3", kind="stage_times", names={"whole": "ours"})
+    run(root, "whole", "011")
+    run(root, "whole", "206", frames=12)
+    (run(root, "whole", "300") / "timings.csv").write_text("frame,stage,milliseconds\n0,fuse,x\n")
+    paths = write_figure(root)
+    assert Image.open(paths[0]).size[0] == pytest.approx(88 / 25.4 * 200, abs=1)
+    assert [record.getMessage() for record in caplog.records][1].endswith("found '0,fuse,x'")
+    found = texts(root)
+    assert {"track", "refine", "fuse", "30 ms", "not complete"} <= set(found)
+    note = " ".join(found[0].split())
+    assert note.startswith("Mean of 2 sequences (011, 206), ")
+    assert "Lines end where the shortest sequence does." in note
+
+
+@pytest.mark.parametrize(
+    ("figure", "said"),
+    [
+        ({"kind": "pie"}, "figure.kind must be one of stage_times, maps, found 'pie'"),
+        ({"kind": "stage_times", "zoom": True}, "figure.zoom=true needs figure.kind=maps"),
+        ({"colour": "red"}, "figure: Key 'colour'"),
+        ("maps", "figure must have keys and values"),
+    ],
+)
+def test_a_choice_that_is_nonsense_is_one_line(figure: Any, said: str) -> None:
+    with pytest.raises(ConfigError, match=said) as caught:
+        FigureChoice.of(figure)
+    assert "\n" not in str(caught.value)
+
+
+def test_nothing_to_draw_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="is not a folder"):
+        write_figure(tmp_path / "nowhere")
+    with pytest.raises(DataError, match=r"has no multirun.yaml: pictures are of experiments"):
+        write_figure(tmp_path)
+    root = experiment(tmp_path / "none")
+    with pytest.raises(DataError, match="has no block `figure:`"):
+        write_figure(root)
+    for kind, name in (("maps", "mesh.ply"), ("stage_times", "timings.csv")):
+        root = experiment(tmp_path / kind, kind=kind)
+        with pytest.raises(DataError, match="there is no complete run below"):
+            write_figure(root)
+        (run(root, "whole", "011") / name).write_text("")
+        with pytest.raises(DataError, match="can be read; the log says why"):
+            write_figure(root)
+        assert not list(root.glob("figure.*"))
+
+
+def test_the_command(maps: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(sys, "argv", ["figures", str(maps), str(maps / "nowhere")])
+    with pytest.raises(SystemExit) as ended:
+        figures.main()
+    said = capsys.readouterr()
+    assert ended.value.code == 1
+    assert said.out.splitlines() == [str(maps / "figure.png"), str(maps / "figure.pdf")]
+    assert said.err.splitlines()[-1] == f"error: {maps / 'nowhere'} is not a folder with records of runs"
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError("a worker died"), KeyboardInterrupt()])
+def test_a_sweep_ends_with_the_picture_but_for_ctrl_c(
+    maps: Path, error: BaseException | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("signal.signal", lambda *_: None)  # what a sweep changes for its process
+    monkeypatch.setenv("PYTHONWARNINGS", "")
+    with suppress(InstanceMapError, KeyboardInterrupt), sweep_in(maps, with_table=False, with_figure=True):
+        if error is not None:
+            raise error
+    assert len(list(maps.glob("figure.*"))) == (0 if isinstance(error, KeyboardInterrupt) else 2)

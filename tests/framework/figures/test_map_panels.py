@@ -1,0 +1,135 @@
+"""Maps side by side: the same object in the same colour at the same place."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, SceneTruth
+from framework.figures.map_panels import Panel, PanelLine, Window, panel_line
+from framework.geometry import project
+from framework.records.stored_map import StoredMap
+from framework.records.stored_runs import Record
+from tests.scenes.boxes_room import BoxesRoom, furnished, walk
+
+SIZE = (160, 120)
+
+
+def stored(ids: Mapping[int, int]) -> StoredMap:
+    """The room's map with the ids (0 room, 1 red box, 2 blue box) named anew."""
+    mesh = furnished()
+    labels = np.array([ids.get(k, 0) for k in range(3)], np.int32)[mesh.instance_ids]
+    names = {key: f"thing {key}" for key in ids.values() if key}
+    return StoredMap(replace(mesh, instance_ids=labels), labels, names, walk(), Record(Path(), {}, {}, 0.0))
+
+
+def hue(color: np.ndarray) -> np.ndarray:
+    """Without brightness, which is the light's."""
+    direction = color - color.min()
+    return direction / np.linalg.norm(direction)
+
+
+@pytest.fixture(scope="module")
+def truth() -> SceneTruth:
+    return BoxesRoom().scene_truth()
+
+
+@pytest.fixture(scope="module")
+def line(truth: SceneTruth) -> PanelLine:
+    """Swapped ids and a missed box; the same length, so no paths."""
+    return panel_line([stored({1: 7, 2: 3}), None, stored({1: 5}), stored({1: 2, 2: 1})], truth, SIZE, zoom=True)
+
+
+def test_an_object_has_the_same_color_in_all_columns(line: PanelLine) -> None:
+    assert line.truth is not None
+    assert line.true_count == 2
+    saturation = np.ptp(line.truth.image.astype(int), axis=2)
+    red, blue = (place_of(line.truth, text) for text in ("chair", "couch"))
+    assert saturation[red] > 60 < saturation[blue]
+    first, missing, second, third = line.maps
+    assert missing is None
+    for panel in (first, third):
+        assert panel is not None
+        for place in (red, blue):
+            np.testing.assert_allclose(panel.image[place], line.truth.image[place], atol=2)
+    assert second is not None
+    np.testing.assert_allclose(second.image[red], line.truth.image[red], atol=2)
+    assert np.ptp(second.image[blue].astype(int)) < 12, "what is not found there is background"
+    assert (np.abs(hue(line.truth.image[red].astype(float)) - hue(line.truth.image[blue].astype(float)))).max() > 0.3
+
+
+def place_of(panel: Panel, text: str) -> tuple[int, int]:
+    [name] = [name for name in panel.names if name.text == text]
+    return round(name.v), round(name.u)
+
+
+def test_the_window_holds_the_box_that_only_some_columns_have(line: PanelLine) -> None:
+    window = line.window
+    assert window is not None
+    assert (window.width, window.height) == (64, 48)
+    assert line.truth is not None
+    v, u = place_of(line.truth, "couch")
+    assert window.left <= u < window.left + window.width
+    assert window.top <= v < window.top + window.height
+    assert [panel is None for panel in line.zoomed] == [False, True, False, False, False]
+    larger = line.zoomed[-1]
+    assert larger is not None
+    # the same point of the scene, 2.5 times as far from the window's corner
+    at = round((v + 0.5 - window.top) * 2.5 - 0.5), round((u + 0.5 - window.left) * 2.5 - 0.5)
+    np.testing.assert_allclose(larger.image[at], line.truth.image[v, u], atol=12)
+    assert {name.text for name in larger.names} >= {"couch"}
+
+
+def test_equal_maps_have_no_window_and_no_paths(truth: SceneTruth) -> None:
+    line = panel_line([stored({1: 7, 2: 3}), stored({1: 1, 2: 2})], truth, SIZE, zoom=True)
+    assert (line.window, line.zoomed) == (None, ())
+    assert [panel.path for panel in line.maps if panel] == [None, None]
+
+
+def test_what_only_a_map_has_does_not_draw_the_window(truth: SceneTruth) -> None:
+    line = panel_line([stored({0: 9, 1: 7}), stored({1: 1, 2: 2})], truth, SIZE, zoom=True)
+    assert line.truth is not None
+    assert line.window is not None
+    v, u = place_of(line.truth, "couch")
+    assert 0 < u - line.window.left < line.window.width
+    assert 0 < v - line.window.top < line.window.height
+
+
+def test_maps_of_different_lengths_show_the_path_inside_of_the_picture(truth: SceneTruth) -> None:
+    poses = walk()
+    poses[10:, 2, 3] = 9  # far above the room
+    maps = [stored({1: 7}), stored({1: 1, 2: 2})]
+    line = panel_line([replace(maps[0], poses=poses[:8]), replace(maps[1], poses=poses)], truth, SIZE, zoom=False)
+    first, second = (panel.path for panel in line.maps if panel)
+    assert first is not None
+    assert second is not None
+    assert (len(first.pixels), len(second.pixels)) == (8, 20)
+    np.testing.assert_array_equal(first.pixels, second.pixels[:8])
+    assert (second.pixels >= 0).all()
+    assert (second.pixels <= np.array(SIZE) - 1).all()
+    assert line.truth is not None
+    assert line.truth.path is None
+
+
+def test_without_truth_the_last_map_says_which_object_is_which() -> None:
+    line = panel_line([stored({1: 7, 2: 3}), stored({1: 2, 2: 1})], None, SIZE, zoom=False)
+    assert line.truth is None
+    first, last = line.maps
+    assert first is not None
+    assert last is not None
+    np.testing.assert_array_equal(first.image, last.image)
+    assert {name.text for name in last.names} == {"thing 1", "thing 2"}
+
+
+def test_a_windows_camera_sees_what_is_in_it() -> None:
+    camera, window = Camera(160, 120, 150.0, 140.0, 80.0, 59.0), Window(32, 24, 64, 48)
+    larger = window.seen_by(camera)
+    points = np.array([[0.1, -0.2, 2.0], [-0.4, 0.3, 1.5]])
+    corner = np.array([window.left, window.top]) - 0.5
+    expected = (project(camera, points) - corner) * 2.5 - 0.5
+    np.testing.assert_allclose(project(larger, points), expected, atol=1e-9)
+    assert larger.shape == camera.shape

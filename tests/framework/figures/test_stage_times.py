@@ -1,0 +1,89 @@
+"""Stage times: the mathematics of the curves and of their labels."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.figures.stage_times import COLORS, SUM, MeanTimes, running_median, spread, stage_times_figure
+from framework.records.timings_file import StageTimes
+
+STAGES = [stage for stage in COLORS if stage != SUM]
+
+
+def run(frames: list[int], **milliseconds: list[float]) -> StageTimes:
+    return StageTimes(np.array(frames), {stage: np.array(values, float) for stage, values in milliseconds.items()})
+
+
+@settings(derandomize=True, deadline=None, max_examples=50)
+@given(
+    st.lists(st.one_of(st.floats(0, 1e4), st.just(np.nan)), min_size=1, max_size=30),
+    st.sampled_from([1, 3, 9]),
+)
+def test_the_running_median_is_that_of_the_neighbors_that_there_are(values: list[float], window: int) -> None:
+    slow = []
+    for k, value in enumerate(values):
+        around = [one for one in values[max(0, k - window // 2) : k + window // 2 + 1] if not np.isnan(one)]
+        slow.append(np.nan if np.isnan(value) else float(np.median(around)))
+    np.testing.assert_array_equal(running_median(np.array(values), window), slow)
+
+
+@settings(derandomize=True, deadline=None, max_examples=100)
+@given(st.lists(st.floats(-5, 5), max_size=8), st.floats(0.01, 1))
+def test_labels_keep_their_order_and_their_distance_and_their_mean(places: list[float], gap: float) -> None:
+    found = spread(places, gap)
+    order = np.argsort(places, kind="stable")
+    assert (np.diff(np.array(found)[order]) >= gap - 1e-9).all()
+    if places:
+        assert np.mean(found) == pytest.approx(np.mean(places), abs=1e-9)  # least squares moves all by 0 in sum
+    assert np.abs(np.array(spread(found, gap)) - found).max(initial=0) < 1e-9, "what is apart stays"
+
+
+def test_two_labels_that_touch_move_by_the_same() -> None:
+    assert spread([1.0, 5.0, 1.2], 1.0) == pytest.approx([0.6, 5.0, 1.6])
+
+
+def test_the_mean_over_sequences_ends_with_the_shortest() -> None:
+    short = run([0, 2, 4], track=[1, 1, 1], fuse=[10, 10, 10])
+    long = run([0, 2, 4, 6, 8], track=[3, 3, 3, 99, 99], fuse=[20, 20, 20, 99, 99])
+    times = MeanTimes.of([short, long])
+    np.testing.assert_array_equal(times.frames, [0, 2, 4])
+    np.testing.assert_array_equal(times.mean["fuse"], [15, 15, 15])
+    np.testing.assert_array_equal(times.lowest["fuse"], [10, 10, 10])
+    np.testing.assert_array_equal(times.highest["fuse"], [20, 20, 20])
+    assert (times.count, times.longest, times.stages) == (2, 8, ["track", "fuse"])
+
+
+def test_a_frame_that_one_sequence_lost_is_the_mean_of_the_others() -> None:
+    full = {stage: [10.0, 10.0, 10.0] for stage in STAGES}
+    lost = run([0, 1, 2], **(full | {"fuse": [10, np.nan, 10]}))
+    double = run([0, 2], **{stage: [20.0, 20.0] for stage in STAGES})  # frame 1 could not be read
+    times = MeanTimes.of([lost, double])
+    np.testing.assert_array_equal(times.frames, [0, 1, 2])
+    np.testing.assert_array_equal(times.mean["detect"], [15, 10, 15])
+    np.testing.assert_array_equal(times.mean["fuse"], [15, np.nan, 15])
+    np.testing.assert_array_equal(times.mean[SUM], [75, np.nan, 75])
+
+
+def test_single_slow_frames_are_no_trend_and_growth_is_last_by_first() -> None:
+    frames = list(range(90))
+    slow = [10.0] * 90
+    slow[0], slow[50] = 4000.0, 900.0
+    growing = list(np.linspace(10, 40, 90))
+    times = MeanTimes.of([run(frames, refine=slow, fuse=growing)])
+    assert times.mean["refine"].max() == 10
+    assert times.growth("refine") == 1
+    assert times.growth("fuse") == pytest.approx((10 + 30 * 74.5 / 89) / (10 + 30 * 14.5 / 89))
+    assert np.isnan(times.growth("track"))
+
+
+def test_a_row_without_runs_leaves_an_empty_diagram_that_says_so() -> None:
+    times = MeanTimes.of([run([0], refine=[1.0])])
+    page = stage_times_figure({"ours": times, "rival": None}, "a note")
+    first, second = page.figure.axes
+    assert [text.get_text() for text in second.texts] == ["not complete"]
+    assert (len(second.lines), second.get_title(loc="left")) == (0, "rival")
+    assert {"refine", "1.0 ms", "×1.00"} <= {text.get_text() for text in first.texts}
+    assert "fuse" not in {text.get_text() for text in first.texts}

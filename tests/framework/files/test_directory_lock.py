@@ -1,0 +1,58 @@
+"""A locked directory keeps others out, as long as its holder lives."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import threading
+from pathlib import Path
+
+import pytest
+
+from framework.errors import DataError
+from framework.files.directory_lock import locked
+
+
+def test_the_second_is_told_who_has_it(tmp_path: Path) -> None:
+    place = tmp_path / "new" / "sweep"
+    with locked(place), pytest.raises(DataError, match=rf"sweep is in use by process {os.getpid()} on "), locked(place):
+        pytest.fail("two are in one place")
+    with locked(place):
+        pass
+
+
+def test_an_error_gives_it_back(tmp_path: Path) -> None:
+    with pytest.raises(ZeroDivisionError), locked(tmp_path):
+        raise ZeroDivisionError
+    with locked(tmp_path):
+        pass
+
+
+def test_who_waits_gets_it_afterwards(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    order: list[str] = []
+
+    def second() -> None:
+        with locked(tmp_path, wait=True):
+            order.append("second")
+
+    with locked(tmp_path):
+        waiting = threading.Thread(target=second)
+        waiting.start()
+        waiting.join(0.2)
+        order.append("first")
+    waiting.join(10)
+    assert order == ["first", "second"]
+    assert f"waiting for process {os.getpid()}" in caplog.text
+
+
+def test_a_file_system_without_locks_gives_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    with locked(tmp_path):
+        pass
+    assert "cannot be locked (No locks available)" in caplog.text

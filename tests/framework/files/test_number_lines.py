@@ -1,0 +1,51 @@
+"""Lines of numbers: what is wrong with one is said in one line, however long the file's is."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.errors import DataError
+from framework.files.number_lines import numbers, read_lines
+
+
+def test_numbers_are_read_as_python_writes_them() -> None:
+    np.testing.assert_array_equal(numbers("here", ["1", "-2.5", "1e-3", "nan"], 4), [1, -2.5, 1e-3, np.nan])
+
+
+@pytest.mark.parametrize(
+    "word", ["-1.#IND", "1.#IND00", "1.#QNAN", "-1.#QNAN0", "1.#INF", "-1.#INF000000", "-nan(ind)", "nan(snan)", "-nan"]
+)
+def test_what_microsofts_library_prints_where_there_is_no_number_is_nan(word: str) -> None:
+    assert np.isnan(numbers("here", [word], 1)).all()
+
+
+@pytest.mark.parametrize("word", ["1.#", "1#IND", "2.#IND", "nan(", "nan()", "nan(a b)", "1.#IND-"])
+def test_what_only_looks_like_it_is_no_number(word: str) -> None:
+    with pytest.raises(DataError, match="expected 1 numbers"):
+        numbers("here", [word], 1)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["1", "2"], r"here: expected 3 numbers \(x y z\), found 2"),
+        (["1", "two", "3"], r"here: expected 3 numbers \(x y z\), found 'two'"),
+        (["1", "2", "3x" * 5000], r"here: expected 3 numbers \(x y z\), found '(3x){30}'"),
+        (["1", "2", "\x9b3\u2028"], r"found '\\x9b3\\u2028'"),
+    ],
+)
+def test_what_is_no_number_is_shown_in_one_line(words: list[str], message: str) -> None:
+    with pytest.raises(DataError, match=f"{message}$") as caught:
+        numbers("here", words, 3, "x y z")
+    assert str(caught.value).isprintable()
+
+
+def test_a_file_that_is_no_text_or_not_there(tmp_path: Path) -> None:
+    (tmp_path / "binary.txt").write_bytes(b"\xff\xfe")
+    with pytest.raises(DataError, match=r"binary.txt could not be read as text"):
+        read_lines(tmp_path / "binary.txt")
+    with pytest.raises(DataError, match=r"none.txt is missing: make one$"):
+        read_lines(tmp_path / "none.txt", missing="is missing: make one")

@@ -1,0 +1,98 @@
+"""What instances.json keeps of the objects."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Instance
+from framework.errors import DataError
+from framework.evaluation.instances import PredictedInstances
+from framework.pipeline import Pipeline
+from framework.records.instances_file import StoredInstance, read_instances, write_instances
+from tests.scenes.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
+
+ENTRY = {"id": 3, "class": "chair", "confidence": 0.5, "vertices": 12}
+
+
+def mapped() -> GridMap:
+    fuser = GridFuser()
+    Pipeline(SphereDetector(), GivenPose(), KeepAll(), fuser).run(CornerRoom(frames=1))
+    return fuser.scene
+
+
+def nearly_equal(found: dict[int, Instance]) -> dict[int, Instance]:
+    """Confidences and probabilities that six digits would make equal."""
+    confidences = {1: 1 / 3, 2: np.nextafter(1 / 3, 1)}
+    even = np.float32(0.5)
+    likely = np.array([np.nextafter(even, np.float32(0)), np.nextafter(even, np.float32(1))], np.float32)
+    return {
+        key: replace(instance, confidence=float(confidences[key]), class_probabilities=likely)
+        for key, instance in found.items()
+    }
+
+
+def test_what_is_evaluated_reads_back_exactly(tmp_path: Path) -> None:
+    scene = mapped()
+    mesh, found = scene.mesh(), nearly_equal(dict(scene.instances()))
+    write_instances(tmp_path / "instances.json", mesh, found, CLASSES)
+    stored = read_instances(tmp_path / "instances.json")
+    assert stored == [
+        StoredInstance(key, "couch", instance.confidence, len(instance.vertices)) for key, instance in found.items()
+    ]
+    again = PredictedInstances.on_mesh(
+        mesh, [one.id for one in stored], [one.confidence for one in stored], [one.class_name for one in stored]
+    )
+    direct = PredictedInstances.of_map(mesh, found, CLASSES)
+    for name in ("points_world", "instance_ids", "ids", "confidences", "class_names"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(direct, name))
+
+
+def test_probabilities_are_written_with_the_digits_of_float32(tmp_path: Path) -> None:
+    scene = mapped()
+    found = nearly_equal(dict(scene.instances()))
+    write_instances(tmp_path / "instances.json", scene.mesh(), found, CLASSES)
+    [first, _] = json.loads((tmp_path / "instances.json").read_text())
+    read = np.array(list(first["class_probabilities"].values()), np.float32)
+    np.testing.assert_array_equal(read, found[1].class_probabilities)
+    assert max(len(str(value)) for value in first["class_probabilities"].values()) <= 10
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "cannot be read"),
+        ("[", "cannot be read"),
+        ("[" * 100_000, "cannot be read"),
+        ("{}", "must hold a list of instances, found dict"),
+        ("[7]", "entry 1: expected an object"),
+        ([ENTRY, ENTRY | {"id": 0}], "entry 2: id must be a whole number from 1 to 2147483647, found 0"),
+        ([ENTRY | {"id": 2**31}], "entry 1: id"),
+        ([ENTRY | {"id": True}], "entry 1: id"),
+        ([ENTRY | {"id": 3.0}], "entry 1: id"),
+        ([ENTRY | {"vertices": -1}], "entry 1: vertices"),
+        ([ENTRY | {"class": None}], "entry 1: class must be a name, found None"),
+        ([ENTRY | {"confidence": 1.5}], r"entry 1: confidence must be a number in \[0, 1\], found 1.5"),
+        ([ENTRY | {"confidence": float("nan")}], "entry 1: confidence"),
+        ([ENTRY | {"confidence": 10**400}], "entry 1: confidence"),
+        ([ENTRY | {"confidence": "high"}], "entry 1: confidence"),
+        ([{"id": 3}], "entry 1: class must be a name, found None"),
+        ([ENTRY, ENTRY], "lists 2 instances with 1 different ids"),
+    ],
+)
+def test_anything_else_is_refused_in_one_line(tmp_path: Path, content: object, said: str) -> None:
+    path = tmp_path / "instances.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(DataError, match=said) as caught:
+        read_instances(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:
+    write_instances(tmp_path / "instances.json", GridMap().mesh(), {}, CLASSES)
+    assert read_instances(tmp_path / "instances.json") == []

@@ -1,0 +1,143 @@
+"""Records read back: whole, broken, missing."""
+
+from __future__ import annotations
+
+import json
+import logging
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.errors import DataError
+from framework.records import stored_runs
+from framework.records.provenance import config_hash
+from framework.records.stored_runs import find_records, is_recorded, read_record
+
+CONFIG = {"seed": 3, "fuser": {"voxel_size": 0.02, "far": 1e-9, "storage": "EXACT", "none": None}, "on": [1, "2", True]}
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    """A complete record."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(CONFIG)))
+    write(directory, config_hash=config_hash(CONFIG))
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_runs, "code_version", lambda: {"git_commit": "abcdef0123", "git_dirty": False})
+
+
+def write(directory: Path, **metrics: object) -> None:
+    told = {"instances.ap50": 0.5, "git_commit": "abcdef0123", "git_dirty": False}
+    (directory / "metrics.json").write_text(json.dumps(told | metrics))
+
+
+def test_the_config_comes_back_with_the_hash_that_it_was_written_with(directory: Path) -> None:
+    record = read_record(directory)
+    assert record.config == CONFIG
+    assert record.metrics["instances.ap50"] == 0.5
+    assert record.commit == "abcdef0"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("metrics.json", "", "metrics.json cannot be read"),
+        ("metrics.json", '{"seed": 0', "metrics.json cannot be read"),
+        ("metrics.json", "[" * 100_000, "metrics.json cannot be read"),
+        ("metrics.json", "\xff", "metrics.json cannot be read"),
+        ("metrics.json", "[1, 2]", "metrics.json must hold an object, found list"),
+        ("metrics.json", '{"fps": [1]}', "metrics.json must be flat, found more below 'fps'"),
+        ("metrics.json", "{}", "is not of the config beside it"),
+        ("config.yaml", "seed: 4", "is not of the config beside it"),
+        ("config.yaml", "", "is not of the config beside it"),
+        ("config.yaml", "seed: [", "config.yaml cannot be read"),
+        ("config.yaml", "word", "is not of the config beside it"),
+        ("config.yaml", "- 1", "config.yaml must hold keys and values"),
+        ("config.yaml", "fuser: {true: 1, voxel_size: 2}", "is not of the config beside it"),
+    ],
+)
+def test_a_broken_record_is_one_line(directory: Path, name: str, content: str, said: str) -> None:
+    (directory / name).write_text(content, encoding="latin-1")
+    with pytest.raises(DataError, match=said) as caught:
+        read_record(directory)
+    assert "\n" not in str(caught.value)
+    found, others = find_records(directory.parent)
+    assert found == []
+    assert [(one.directory, one.reason) for one in others] == [(directory, str(caught.value))]
+    assert not is_recorded(directory, OmegaConf.create(CONFIG))
+
+
+def test_a_record_without_config_is_told(directory: Path) -> None:
+    (directory / "config.yaml").unlink()
+    with pytest.raises(DataError, match=r"config.yaml is missing"):
+        read_record(directory)
+
+
+@pytest.mark.parametrize(
+    ("files", "reason"),
+    [
+        ({}, "not complete: running, or killed"),
+        ({"instancemap.log": "12:00:00 INFO    mapping\n"}, "not complete: running, or killed"),
+        (
+            {"instancemap.log": "12:00:00 INFO    mapping\n12:00:01 ERROR   fuser: bad\nTraceback\n  x\n"},
+            "failed: fuser: bad",
+        ),
+        (
+            {"instancemap.log": "12:00:01 ERROR   fuser: bad\n12:00:02 INFO    mapping again\n"},
+            "not complete: running, or killed",
+        ),
+        ({"metrics.partial.json": '{"partial": "interrupted by Ctrl-C"}'}, "partial: interrupted by Ctrl-C"),
+        ({"metrics.partial.json": "{"}, r"cannot be read"),
+    ],
+)
+def test_why_a_run_is_not_complete(directory: Path, files: dict[str, str], reason: str) -> None:
+    (directory / "metrics.json").unlink()
+    (directory / "instancemap.log").write_text("")
+    for name, content in files.items():
+        (directory / name).write_text(content)
+    found, [other] = find_records(directory.parent)
+    assert found == []
+    assert reason in other.reason
+
+
+def test_what_is_no_run_is_not_looked_at(directory: Path) -> None:
+    (directory.parent / "table.md").write_text("")
+    (directory.parent / ".hydra").mkdir()
+    (directory.parent / ".hydra" / "metrics.json").write_text("{}")
+    found, others = find_records(directory.parent)
+    assert [record.directory for record in found] == [directory]
+    assert others == []
+
+
+def test_a_record_of_the_same_config_is_kept(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    assert is_recorded(directory, OmegaConf.create(CONFIG | {"debug": True}))
+    assert caplog.messages == [f"kept: the complete record in {directory}"]
+
+
+def test_a_record_of_another_config_is_not(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    assert not is_recorded(directory, OmegaConf.create(CONFIG | {"seed": 4}))
+    assert caplog.messages == [f"run again: the record in {directory} is of another config"]
+
+
+@pytest.mark.parametrize("theirs", [{"git_commit": "1234567890"}, {"git_dirty": True}])
+def test_a_record_of_other_code_is_kept_with_a_warning(
+    directory: Path, caplog: pytest.LogCaptureFixture, theirs: dict[str, object]
+) -> None:
+    write(directory, config_hash=config_hash(CONFIG), **theirs)
+    assert is_recorded(directory, OmegaConf.create(CONFIG))
+    [told] = caplog.records
+    assert told.levelno == logging.WARNING
+    assert "this is abcdef0" in told.getMessage()
+
+
+def test_no_record_is_none(tmp_path: Path) -> None:
+    assert not is_recorded(tmp_path, OmegaConf.create(CONFIG))
+    assert find_records(tmp_path) == ([], [])

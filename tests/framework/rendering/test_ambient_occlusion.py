@@ -1,0 +1,58 @@
+"""The light that reaches what a picture shows, where planes say how much that is."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.rendering.ambient_occlusion import DEPTH, RANGE_M, THICKNESS_M, TILE, openness
+
+CAMERA = Camera(160, 120, 300.0, 310.0, 79.5, 59.5)
+X, Y = np.meshgrid(
+    (np.arange(CAMERA.width) - CAMERA.cx) / CAMERA.fx, (np.arange(CAMERA.height) - CAMERA.cy) / CAMERA.fy
+)
+RAYS = np.stack([X, Y, np.ones_like(X)], axis=-1)
+
+
+def plane(normal: np.ndarray, distance: float) -> tuple[np.ndarray, np.ndarray]:
+    """The depth and the normals of the plane of points p with normal @ p = -distance."""
+    return np.float32(-distance / (RAYS @ normal)), np.tile(normal.astype(np.float32), (*CAMERA.shape, 1))
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.6, -0.9])
+def test_a_plane_takes_no_light_from_itself(angle: float) -> None:
+    depth, normals = plane(np.array([0.2, np.sin(angle), -np.cos(angle)]) / np.hypot(1, 0.2), 1.5)
+    assert (depth > 0).all()
+    np.testing.assert_array_equal(openness(CAMERA, depth, normals), 1)
+
+
+def test_a_corner_takes_what_rays_say() -> None:
+    """Two planes at right angles that meet 2 m before the camera: a ray meets the other one or nothing."""
+    depth = np.float32(2 / (1 + np.abs(Y)))
+    normals = np.stack([np.zeros_like(Y), -np.sign(Y), -np.ones_like(Y)], axis=-1).astype(np.float32) / np.sqrt(2)
+    found = openness(CAMERA, depth, normals)
+    rng = np.random.default_rng(0)
+    height, turn = np.sqrt(rng.uniform(0, 1, 20000)), rng.uniform(0, 2 * np.pi, 20000)  # Lambert's law
+    towards = np.sqrt(1 - height**2) * np.cos(turn)  # the other plane
+    for row in range(TILE, CAMERA.height - TILE, 7):
+        distance = np.abs(Y[row, 0]) * depth[row, 0] * np.sqrt(2)  # from the edge
+        blocked = (distance < RANGE_M * towards).mean()
+        assert found[row, TILE:-TILE].mean() == pytest.approx(1 - DEPTH * blocked, abs=0.03)
+    assert found.min() < 0.75
+    np.testing.assert_array_equal(found, openness(CAMERA, depth, normals))
+
+
+@pytest.mark.parametrize(("gap", "darkens"), [(0.6 * THICKNESS_M, True), (2 * RANGE_M, False)])
+def test_a_pole_darkens_only_what_is_near_behind_it(gap: float, darkens: bool) -> None:
+    depth, normals = plane(np.array([0, 0, -1.0]), 3.0)
+    pole = np.abs(X) < 0.02
+    depth = np.where(pole, np.float32(3 - gap), depth)
+    assert (openness(CAMERA, depth, normals)[~pole].min() < 0.9) == darkens
+    assert (openness(CAMERA, depth, normals)[:, TILE + 1 : 40] == 1).all()
+
+
+def test_where_nothing_is_nothing_shades() -> None:
+    depth, normals = plane(np.array([0, 0, -1.0]), 3.0)
+    depth[40:80, 50:90] = 0
+    np.testing.assert_array_equal(openness(CAMERA, depth, normals), 1)

@@ -1,0 +1,161 @@
+"""The picture of a map: what is drawn where, on surfaces that are known exactly."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from framework.data import Camera, InstanceMesh
+from framework.geometry import inverse, project, transform
+from framework.rendering import overview
+from framework.rendering.ambient_occlusion import openness
+from framework.rendering.palette import instance_colors
+from framework.rendering.surface import FrontSides, Surface
+from framework.rendering.viewpoint import _visible, best_view, fitted, looking, upward
+from tests.scenes.boxes_room import Z_UP, furnished, walk
+
+RNG = np.random.default_rng(0)
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+Y_DOWN = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
+
+
+@pytest.mark.parametrize("R", [Z_UP, Y_UP, Y_DOWN], ids=["z-up", "y-up", "y-down"])
+@pytest.mark.parametrize("flipped", [False, True])
+def test_up_is_found_whatever_the_world(R: np.ndarray, flipped: bool) -> None:
+    mesh, poses = furnished(R), walk(R)
+    triangles = mesh.triangles[:, ::-1] if flipped else mesh.triangles
+    surface = Surface.seen_from(mesh.vertices, triangles, poses)
+    np.testing.assert_allclose(upward(poses, surface), R @ [0, 0, 1], atol=1e-3)
+    np.testing.assert_array_equal(surface.face_normals, Surface(mesh.vertices, mesh.triangles).face_normals)
+
+
+def test_up_of_a_camera_that_only_looks_down_is_straightened_by_the_floor() -> None:
+    mesh, poses = furnished(), walk()
+    surface = Surface(mesh.vertices, mesh.triangles)
+    one_way = np.repeat(poses[:1], 5, axis=0)  # tilted by 22 degrees
+    assert -one_way[0, :3, 1] @ [0, 0, 1] < 0.95
+    np.testing.assert_allclose(upward(one_way, surface), [0, 0, 1], atol=1e-3)
+
+
+def test_a_ray_sees_the_nearest_front_at_its_exact_depth() -> None:
+    mesh = furnished()
+    camera, R = Camera(33, 25, 30.0, 30.0, 16.0, 12.0), looking(np.array([-1.0, 0, 0]), np.array([0.0, 0, 1]))
+    eye = np.array([0.5, 0.0, 0.4])
+    hits = FrontSides(Surface(mesh.vertices, mesh.triangles), eye).seen_by(camera, R)
+    assert hits.depth[12, 16] == pytest.approx(0.5 - -0.6, abs=1e-5)  # the red box's side
+    assert hits.nearest(mesh.instance_ids)[12, 16] == 1
+    assert hits.depth[12, 0] == pytest.approx(2.5, abs=1e-4)  # past it, the wall: depth is along z, not the ray
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, eye
+    pixels = project(camera, transform(inverse(T), hits.points_world.astype(np.float64)))
+    u, v = np.meshgrid(np.arange(33), np.arange(25))
+    np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), atol=1e-3)
+
+
+def test_walls_and_ceiling_between_the_eye_and_the_room_are_looked_through() -> None:
+    mesh = furnished()
+    camera, R = Camera(9, 9, 60.0, 60.0, 4.0, 4.0), looking(np.array([0.0, 0.1, -1.0]), np.array([0.0, 0, 1]))
+    hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([0.0, -0.5, 5.0])).seen_by(camera, R)
+    np.testing.assert_allclose(hits.points_world[..., 2], 0, atol=1e-4)  # the floor, through the ceiling at 2.5 m
+
+
+def test_corners_are_darker_than_open_floor() -> None:
+    mesh = furnished()
+    camera, R = Camera(128, 128, 80.0, 80.0, 63.5, 63.5), looking(np.array([-1.0, 0, -1.0]), np.array([0.0, 0, 1]))
+    hits = FrontSides(Surface(mesh.vertices, mesh.triangles), np.array([2.5, 0.0, 3.0])).seen_by(camera, R)
+    normals = np.tile(np.float32(R[2]), (128, 128, 1))  # up, in the camera's coordinates
+    light = openness(camera, hits.depth, normals)
+    x, y, z = np.moveaxis(hits.points_world, -1, 0)
+    floor = hits.seen & (np.abs(z) < 1e-3)
+    near_box = floor & (np.abs(x + 0.55) < 0.05) & (np.abs(y) < 0.3)
+    free = floor & (np.abs(x) < 0.1) & (y < -0.3) & (y > -0.8)
+    assert light[free].mean() > 0.98
+    assert light[near_box].mean() < 0.85
+
+
+def test_fitted_is_as_near_as_it_can_be() -> None:
+    points = RNG.uniform(-1, 1, (4000, 3)).astype(np.float32) * [2, 1, 0.5]
+    R = looking(np.array([1.0, 2.0, -1.0]), np.array([0.0, 0, 1]))
+    camera, T = fitted(R, points.astype(np.float32), 400, 300)
+    pixels = project(camera, transform(inverse(T), points.astype(np.float64)))
+    inside = (pixels >= -0.5).all(axis=1) & (pixels[:, 0] < 399.5) & (pixels[:, 1] < 299.5)
+    assert inside.mean() > 0.98
+    spread = np.ptp(pixels[inside], axis=0) / [400, 300]
+    assert spread.max() > 0.9
+
+
+def test_small_pictures_show_the_nearest_fronts() -> None:
+    camera, T = Camera(30, 20, 25.0, 25.0, 14.5, 9.5), np.eye(4)
+    T[:3, :3], T[:3, 3] = looking(np.array([1.0, 0.5, -0.2]), np.array([0.0, 0, 1])), [-3, -1.5, 0.5]
+    points, normals = RNG.uniform(-2, 2, (3000, 3)).astype(np.float32), RNG.normal(0, 1, (3000, 3)).astype(np.float32)
+    local = transform(inverse(T), points.astype(np.float64))
+    expected: dict[tuple[int, int], int] = {}
+    for i in np.argsort(-local[:, 2]):  # the farthest first
+        u, v = np.rint(project(camera, local[i]))
+        front = (points[i] - T[:3, 3]) @ normals[i] < 0
+        if front and local[i, 2] > 0 and 0 <= u < camera.width and 0 <= v < camera.height:
+            expected[int(v), int(u)] = int(i)
+    assert len(expected) > 300
+    shown = _visible(points, normals, camera, T)
+    assert shown.tolist() == [expected[pixel] for pixel in sorted(expected)]
+
+
+def test_the_best_view_looks_down_into_the_room_and_sees_the_objects() -> None:
+    mesh, poses = furnished(), walk()
+    surface = Surface(mesh.vertices, mesh.triangles)
+    camera, T = best_view(surface, mesh.instance_ids, poses, 200, 150)
+    assert -0.9 < T[2, 2] < -0.5  # down, obliquely
+    assert T[2, 3] > 2.5  # from above the ceiling
+    ids = FrontSides(surface, T[:3, 3]).seen_by(camera, T[:3, :3]).nearest(mesh.instance_ids)
+    assert (ids == 1).sum() > 200
+    assert (ids == 2).sum() > 200
+
+
+def test_the_picture_shows_the_colors_left_and_the_instances_right(tmp_path: Path) -> None:
+    mesh, instances = furnished(), {1: ("chair", 0.9), 2: ("couch", 0.6)}
+    overview.write_overview(tmp_path / "overview.png", mesh, instances, walk(), "two boxes")
+    assert [path.name for path in tmp_path.iterdir()] == ["overview.png"]
+    image = np.asarray(Image.open(tmp_path / "overview.png")).astype(int)
+    assert image.shape[1] == 2 * overview.PANEL_WIDTH
+    panels = image[overview.TITLE_HEIGHT :][: overview.PANEL_HEIGHT]
+    left, right = panels[:, : overview.PANEL_WIDTH], panels[:, overview.PANEL_WIDTH :]
+    red = (left[..., 0] > 3 * left[..., 1]) & (left[..., 0] > 3 * left[..., 2])
+    blue = (left[..., 2] > 3 * left[..., 1]) & (left[..., 2] > 3 * left[..., 0])
+    assert red.sum() > 5000
+    assert blue.sum() > 5000
+    colors = instance_colors(np.array([[-1, 0, 0.4], [1, 0.3, 0.4]])).astype(float)
+    for where, color in ((red, colors[0]), (blue, colors[1])):
+        shown = np.median(right[where], axis=0)
+        hue = shown / np.linalg.norm(shown) @ (color / np.linalg.norm(color))
+        assert hue > 0.98
+    assert np.ptp(np.median(right[~red & ~blue], axis=0)) < 12, "the background is gray"
+
+
+def test_ids_that_are_no_instances_are_background() -> None:
+    image = overview.overview(furnished(), {1: ("chair", 0.9)}, walk(), "one of them").astype(int)
+    right = image[overview.TITLE_HEIGHT :][: overview.PANEL_HEIGHT, overview.PANEL_WIDTH :]
+    colorful = np.ptp(right, axis=2) > 60
+    assert 5000 < colorful.sum() < 0.2 * colorful.size
+
+
+def test_an_empty_map_gets_a_picture_that_says_so() -> None:
+    nothing = InstanceMesh(
+        *(np.zeros((0, 3), dtype) for dtype in (np.float32, np.int32, np.uint8)),
+        np.zeros(0, np.int32),
+        np.zeros(0, np.int32),
+        (),
+    )
+    image = overview.overview(nothing, {}, np.zeros((0, 4, 4)), "nothing")
+    assert (image != overview.PAPER).any()
+
+
+def test_neighbors_have_colors_that_can_be_told_apart() -> None:
+    centroids = RNG.uniform(0, 6, (40, 3))
+    colors = instance_colors(centroids).astype(float)
+    np.testing.assert_array_equal(colors, instance_colors(centroids))
+    distance = np.linalg.norm(centroids[:, None] - centroids[None], axis=2) + 99 * np.eye(40)
+    nearest = distance.argmin(axis=1)
+    assert np.linalg.norm(colors - colors[nearest], axis=1).min() > 60

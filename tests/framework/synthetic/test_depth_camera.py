@@ -1,0 +1,160 @@
+"""The readings have the published statistics."""
+
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.synthetic.depth_camera import (
+    DepthSensor,
+    axial_sigma,
+    depth_step,
+    noisy_color,
+    normal_quantiles,
+    random_bits,
+)
+
+CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
+FRONT = np.ones(CAMERA.shape, np.float32)
+
+
+def measure(depth, incidence=FRONT, noise=1.0, seed=0, max_range=8.0):
+    sensor = DepthSensor(noise, max_range)
+    return sensor.measure(np.asarray(depth, np.float32), incidence, CAMERA, np.random.default_rng([seed]))
+
+
+@pytest.mark.parametrize("z", [0.8, 1.5, 2.5, 4.0])
+def test_the_deviation_on_a_wall_is_that_of_nguyen_et_al(z):
+    # Spread over two depth steps, so that the wall's place among the steps does not matter.
+    depth = z + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * float(depth_step(np.float32(z)))
+    error = (measure(depth) - depth)[measure(depth) > 0]
+    expected = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    assert error.std() == pytest.approx(expected, rel=0.05)
+    assert abs(error.mean()) < 0.05 * expected
+
+
+def test_grazing_surfaces_are_noisier():
+    wall = np.full(FRONT.shape, 2.0)
+    slanted = measure(wall, np.full(FRONT.shape, np.cos(np.deg2rad(72)), np.float32))
+    theta = np.float32(np.deg2rad(72))
+    assert axial_sigma(np.float32(2), theta) > 1.05 * axial_sigma(np.float32(2), np.float32(0))
+    assert slanted[slanted > 0].std() > 1.05 * measure(wall).std()
+
+
+def test_depth_comes_in_steps_of_an_eighth_of_a_disparity():
+    reading = measure(np.full(FRONT.shape, 3.0))
+    inverse = np.unique(1 / reading[reading > 0].astype(np.float64))
+    np.testing.assert_allclose(np.diff(inverse) * 8 * 580 * 0.075, np.rint(np.diff(inverse) * 348), atol=0.02)
+    assert depth_step(np.float32(3.0)) == pytest.approx(9 / 348)
+
+
+def test_a_box_casts_the_projectors_shadow_to_its_left():
+    depth = np.full(FRONT.shape, 3.0)
+    depth[:, 150:200] = 1.0
+    missing = np.mean([measure(depth, seed=s) == 0 for s in range(20)], axis=(0, 1))
+    shadow = 262.5 * 0.075 * (1 / 1.0 - 1 / 3.0)  # px, 13.1
+    assert (missing[150 - int(shadow) + 2 : 149] > 0.99).all()
+    assert (missing[: 150 - int(shadow) - 3] < 0.01).all()
+    assert (missing[203:] < 0.01).all()
+    assert 0.2 < missing[199:201].mean() < 0.8  # the right edge drops readings by chance
+
+
+def test_what_is_seen_edge_on_is_not_read():
+    assert not measure(np.full(FRONT.shape, 2.0), np.full(FRONT.shape, 0.01, np.float32)).any()
+
+
+def test_range():
+    assert not measure(np.full(FRONT.shape, 0.3)).any()
+    assert not measure(np.full(FRONT.shape, 5.0), max_range=4.5).any()
+    assert not measure(np.full(FRONT.shape, 5.0), noise=0.0, max_range=4.5).any()
+
+
+def test_no_noise_is_exact():
+    depth = np.random.default_rng(0).uniform(0.1, 4, FRONT.shape).astype(np.float32)
+    np.testing.assert_array_equal(measure(depth, noise=0.0), depth)
+
+
+def test_half_the_noise_has_about_half_the_deviation():
+    wall = 3.0 + np.linspace(-1, 1, FRONT.size).reshape(FRONT.shape) * 0.05
+    half, full = ((measure(wall, noise=n) - wall).std() for n in (0.6, 1.0))
+    assert half == pytest.approx(0.6 * full, rel=0.2)
+
+
+def test_quantiles_are_normal_and_bits_are_even():
+    quantiles = normal_quantiles().astype(float)
+    assert quantiles.mean() == pytest.approx(0, abs=1e-6)
+    assert quantiles.std() == pytest.approx(1, abs=1e-6)
+    assert (quantiles**4).mean() == pytest.approx(3, abs=0.02)
+    for sigmas, share in ((1, 0.6827), (2, 0.9545), (3, 0.9973)):
+        assert (np.abs(quantiles) < sigmas).mean() == pytest.approx(share, abs=5e-4)
+    bits = random_bits((100, 101, 3), np.random.default_rng(0))
+    assert bits.shape == (100, 101, 3)
+    for k in range(16):
+        assert np.mean(bits >> k & 1) == pytest.approx(0.5, abs=0.01)
+    np.testing.assert_array_equal(bits, random_bits((100, 101, 3), np.random.default_rng(0)))
+
+
+# The kernels against the same arithmetic on whole images
+
+
+def jagged(seed):
+    """Depth (H, W) m with steps, slants and holes, and cosines (H, W) from 0 to a little over 1, as rounding has it."""
+    rng = np.random.default_rng(seed)
+    blocks = rng.uniform(0.2, 7, (CAMERA.height // 8, CAMERA.width // 8)).astype(np.float32)
+    depth = np.kron(blocks, np.ones((8, 8), np.float32))
+    depth *= rng.uniform(0.97, 1.03, depth.shape).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.05] = 0
+    cosine = rng.uniform(0, 1.0001, depth.shape).astype(np.float32)
+    cosine[depth == 0] = 0
+    return depth, cosine
+
+
+def slow_measure(depth, incidence, noise, max_range, rng):
+    """The readings, one operation on the whole image after the other."""
+    exact = np.where(depth <= max_range, depth, np.float32(0))
+    disparity = np.where(depth > 0, np.float32(CAMERA.fx * 0.075) / np.maximum(depth, np.float32(0.1)), 0)
+    place = np.arange(CAMERA.width, dtype=np.float32)[None, :] - disparity
+    hidden = place > np.minimum.accumulate(place[:, ::-1], axis=1)[:, ::-1] + np.float32(1)
+    beside = np.zeros(depth.shape, np.bool_)
+    for a, b in ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1], np.s_[1:])):
+        step = np.abs(depth[a] - depth[b]) > np.float32(0.05) * np.minimum(depth[a], depth[b])
+        beside[a] |= step
+        beside[b] |= step
+    theta = np.arccos(np.minimum(incidence, np.float32(1)))
+    bits = random_bits((*depth.shape, 4), rng)
+    chance = bits[..., 0] / np.float32(65536)
+    lateral_v, lateral_u, axial = (normal_quantiles()[bits[..., k] >> 4] for k in (1, 2, 3))
+    start, end = np.deg2rad(80.0), np.deg2rad(88.0)
+    grazing = (theta - np.float32(start)) / np.float32(end - start)
+    lost = chance < min(noise, 1.0) * np.maximum(np.where(beside, np.float32(0.5), np.float32(0)), grazing)
+    pixel = np.float32(noise * 0.8 * CAMERA.width / 640)
+    v = np.clip(np.arange(CAMERA.height)[:, None] + np.rint(pixel * lateral_v).astype(int), 0, CAMERA.height - 1)
+    u = np.clip(np.arange(CAMERA.width)[None, :] + np.rint(pixel * lateral_u).astype(int), 0, CAMERA.width - 1)
+    neighbour = depth[v, u]
+    z = np.where((np.abs(neighbour - depth) > np.float32(0.05) * depth) & (neighbour > 0), neighbour, depth)
+    t = np.minimum(theta, np.float32(np.deg2rad(80)))
+    sigma = 0.0012 + 0.0019 * (z - 0.4) ** 2 + 0.0001 / np.sqrt(np.maximum(z, 0.1)) * t**2 / (np.pi / 2 - t) ** 2
+    scale = np.float32(8 * 580 * 0.075)
+    variance = (noise * sigma) ** 2 - (z * z / scale) ** 2 / 12
+    noisy = z + np.sqrt(np.maximum(variance, 0)) * axial
+    reading = scale / np.maximum(np.rint(scale / np.maximum(noisy, np.float32(0.1))), 1)
+    assert reading.dtype == np.float32
+    valid = (exact > 0.4) & ~hidden & ~lost & (reading > 0.4) & (reading <= max_range)
+    return np.where(valid, reading, np.float32(0))
+
+
+@pytest.mark.parametrize("noise", [0.3, 1.0, 1.7])
+def test_readings_are_those_of_the_arithmetic_on_whole_images_to_the_bit(noise):
+    for seed in range(3):
+        depth, cosine = jagged(seed)
+        expected = slow_measure(depth, cosine, noise, 6.0, np.random.default_rng([seed]))
+        assert 0.1 < np.mean(expected > 0) < 0.9
+        np.testing.assert_array_equal(measure(depth, cosine, noise, seed, 6.0), expected)
+
+
+def test_the_grain_of_colour_is_rounded_and_clipped():
+    color = np.random.default_rng(0).integers(0, 256, (24, 32, 3)).astype(np.uint8)
+    grain = normal_quantiles()[random_bits(color.shape, np.random.default_rng(1)) >> 4]
+    for noise in (1.0, 40.0):  # grey levels beyond both ends
+        expected = np.clip(np.rint(color + np.float32(noise * 1.5) * grain), 0, 255).astype(np.uint8)
+        np.testing.assert_array_equal(noisy_color(color, noise, np.random.default_rng(1)), expected)
+    assert noisy_color(color, 0.0, np.random.default_rng(1)) is color

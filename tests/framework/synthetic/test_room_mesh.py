@@ -1,0 +1,121 @@
+"""Small triangles of the same surface, and of these what is seen."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.synthetic.furniture.piece import Furniture
+from framework.synthetic.furniture.solids import panel, rounded_box
+from framework.synthetic.ray_caster import RayCaster
+from framework.synthetic.room_mesh import seen_from, tessellate, visible_mesh
+from framework.synthetic.surfaces import assemble
+from framework.synthetic.textures import Material, Texture
+from framework.synthetic.walk import look
+
+GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))
+CAMERA = Camera(160, 120, 130.0, 130.0, 80.0, 60.0)
+AHEAD = look(np.array([0.0, 0.0, 0.0]), 0.0, 0.0, 0.0)  # from the origin along +x
+
+
+def scene(*solids):
+    """Surfaces of solids, the first of which is the shell and the others instances 1, 2, ..."""
+    objects = []
+    for instance, solid in enumerate(solids):
+        piece = Furniture("thing", "chair" if instance else None)
+        piece.add(solid, GREY)
+        objects.append((instance, piece))
+    return assemble(objects)
+
+
+def wall(distance: float):
+    """A wall of 6 m x 6 m that faces the camera."""
+    return panel(6.0, 6.0, 0.5).moved(z=-3.0).turned("z", np.pi / 2).moved(x=distance)
+
+
+def corners_of(mesh):
+    return mesh.vertices[mesh.triangles].astype(np.float64)
+
+
+def edge_lengths(mesh):
+    corners = corners_of(mesh)
+    return np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
+
+
+def area(corners) -> float:
+    return 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum()
+
+
+@pytest.mark.parametrize("longest", [0.02, 0.05])
+def test_edges_are_short_and_the_surface_is_the_same(longest):
+    surfaces = scene(rounded_box(0.5, 0.3, 0.2, 0.01, 2), rounded_box(0.1, 0.2, 0.3, 0.02, 3).moved(x=1.0))
+    mesh = tessellate(surfaces, longest)
+    assert edge_lengths(mesh).max() <= longest * (1 + 1e-5)
+    exact = surfaces.vertices[surfaces.triangles].astype(np.float64)
+    assert area(corners_of(mesh)) == pytest.approx(area(exact), rel=1e-5)
+    volume = np.einsum("fc,fc->f", corners_of(mesh)[:, 0], np.cross(*corners_of(mesh)[:, 1:].swapaxes(0, 1))).sum() / 6
+    assert volume > 0, "triangles still turn counter-clockwise seen from outside"
+
+
+def test_there_are_no_gaps():
+    """Each edge of a closed body belongs to two triangles, in opposite directions."""
+    mesh = tessellate(scene(rounded_box(0.5, 0.3, 0.2, 0.02, 3)), 0.02)
+    directed = np.concatenate([mesh.triangles[:, [k, (k + 1) % 3]] for k in range(3)])
+    assert len(np.unique(directed, axis=0)) == len(directed)
+    assert np.array_equal(np.unique(directed, axis=0), np.unique(directed[:, ::-1], axis=0))
+
+
+def test_vertices_at_one_place_are_one_but_for_two_instances():
+    half = rounded_box(0.1, 0.1, 0.1, 0.01)
+    mesh = tessellate(scene(wall(5.0), half, half), 0.02)
+    rows = np.column_stack([mesh.vertices, mesh.instance_ids])
+    assert len(np.unique(rows, axis=0)) == len(rows)
+    assert np.array_equal(mesh.vertices[mesh.instance_ids == 1], mesh.vertices[mesh.instance_ids == 2])
+    of_triangle = mesh.instance_ids[mesh.triangles]
+    assert (of_triangle == of_triangle[:, :1]).all()
+
+
+def test_only_what_the_camera_sees_remains():
+    box = rounded_box(1.0, 1.0, 1.0, 1e-3)
+    surfaces = scene(wall(4.0), box.moved(x=2.5))
+    caster = RayCaster(surfaces.vertices, surfaces.triangles)
+    mesh = visible_mesh(surfaces, caster, CAMERA, [AHEAD], (0.4, 6.0))
+    front = mesh.vertices[mesh.instance_ids == 1]
+    np.testing.assert_allclose(front[:, 0], 2.0, atol=1.1e-3)
+    assert np.abs(front[:, 1:]).max() == pytest.approx(0.5, abs=1e-5)
+    behind = mesh.vertices[mesh.instance_ids == 0]
+    shadow = 1.0  # m: the box's front, 0.5 m to each side at 2 m, hides twice that at 4 m
+    assert (np.abs(behind[:, 1:]).max(axis=1) > shadow - 1e-4).all()
+    spacing = 0.02
+    assert (np.abs(behind[:, 1:]).max(axis=1) < shadow + spacing).any()
+    half_width = 4.0 * (CAMERA.cx + 0.5) / CAMERA.fx  # y points to the left
+    assert half_width - spacing < behind[:, 1].max() <= half_width + 1e-5
+    assert mesh.triangles.max() < len(mesh.vertices)
+    assert area(corners_of(mesh)[mesh.instance_ids[mesh.triangles[:, 0]] == 1]) == pytest.approx(1.0, rel=3e-3)
+
+
+def test_nothing_is_seen_beyond_the_reach_or_too_near():
+    surfaces = scene(wall(4.0))
+    caster = RayCaster(surfaces.vertices, surfaces.triangles)
+    assert seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 6.0)).any()
+    assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 3.9)).any()
+    assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (4.1, 6.0)).any()
+
+
+def test_one_view_after_the_other_adds_what_it_sees():
+    surfaces = scene(wall(4.0))
+    caster = RayCaster(surfaces.vertices, surfaces.triangles)
+    aside = look(np.zeros(3), 0.3, 0.0, 0.0)
+    alone = [seen_from(surfaces.vertices, caster, CAMERA, [T], (0.4, 6.0)) for T in (AHEAD, aside)]
+    both = seen_from(surfaces.vertices, caster, CAMERA, [AHEAD, aside], (0.4, 6.0))
+    assert np.array_equal(both, alone[0] | alone[1])
+    assert (alone[0] != alone[1]).any()
+
+
+def test_negative_zero_is_zero():
+    surfaces = scene(wall(4.0))
+    signed = np.where(surfaces.vertices == 0, np.float32(-0.0), surfaces.vertices)
+    assert len(tessellate(replace(surfaces, vertices=signed), 0.1).vertices) == len(tessellate(surfaces, 0.1).vertices)

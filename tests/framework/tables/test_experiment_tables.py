@@ -1,0 +1,264 @@
+"""Tables from records: what stands in them, in three formats."""
+
+from __future__ import annotations
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.errors import DataError
+from framework.records.provenance import config_hash
+from framework.tables.experiment_tables import write_tables
+from framework.tables.layouts import head
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+TABLE = {"over": ["seed"], "base": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
+ROWS = {"identity": ["refiner=identity"], "chain": [], "none_yet": ["refiner=none_yet"]}
+
+
+def run(root: Path, row: str, seed: int, ap: float | None, ms: float, scene: str = "", **metrics: Any) -> Path:
+    directory = root / f"row={row},seed={seed}{scene}"
+    directory.mkdir()
+    config = {"row": row, "seed": seed, "scene": scene, "refiner": {"kind": row}}
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    told = {
+        **{"instances.ap50": ap, "stage_ms.refine.median": ms, "pose_source": "ground_truth", "choice.fuser": "f"},
+        **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
+        **{"environment.cpus": 2, "environment.processor": "Z80"},
+    }
+    (directory / "metrics.json").write_text(json.dumps(told | metrics))
+    return directory
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    root = tmp_path / "ablation_x"
+    root.mkdir()
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": TABLE, "rows": ROWS})))
+    for seed, (bare, chain) in enumerate([(0.2, 0.5), (0.4, 0.6), (0.6, 1.0)]):
+        run(root, "identity", seed, bare, 0.0)
+        run(root, "chain", seed, chain, 150 + seed)
+    return root
+
+
+def test_every_figure_by_hand(sweep: Path) -> None:
+    text = write_tables(sweep)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[0] == "# ablation_x"
+    assert lines[2] == "| row | runs | AP50 | refine (ms) | poses |"
+    # 0.2, 0.4, 0.6: mean 0.4, sd 0.2; 0.5, 0.6, 1.0: mean 0.7, sd sqrt(0.14 / 2) = 0.2646
+    assert "| identity | 3 | 0.400 ± 0.200 | 0.0 ± 0.0 | ground_truth |" in lines
+    assert "| chain | 3 | 0.700 ± 0.265 | 151.0 ± 1.0 | ground_truth |" in lines
+    # -0.3, -0.2, -0.4: mean -0.3, standard error 0.1 / sqrt(3) = 0.0577; t = 5.2 > 4.3
+    assert "| identity | 3 | -0.300 ± 0.058 * | -151.0 ± 0.6 * |" in lines
+    assert "| less chain | pairs | AP50 | refine (ms) |" in lines
+    assert (sweep / "table.md").read_text() == text
+    assert "- What each row changes: identity: refiner=identity; chain: nothing; none_yet: refiner=none_yet." in lines
+    assert "- Without a complete run: none_yet." in lines
+    assert "- In all: fuser=f." in lines
+    assert "- Code: 1234567." in lines
+    assert "- Machine: 2 cores of Z80." in lines
+    assert "Missing" not in text
+    with (sweep / "table.csv").open() as file:
+        first, second = csv.DictReader(file)
+    assert (first["row"], first["runs"], second["row"]) == ("identity", "3", "chain")
+    assert float(first["instances.ap50.mean"]) == pytest.approx(0.4)
+    assert float(first["instances.ap50.sd"]) == pytest.approx(0.2)
+    assert float(first["instances.ap50.difference"]) == pytest.approx(-0.3)
+    assert float(first["instances.ap50.se"]) == pytest.approx(0.1 / 3**0.5)
+    assert first["instances.ap50.pairs"] == "3"
+
+
+def test_seeds_of_a_scene_are_no_independent_evidence(tmp_path: Path) -> None:
+    """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, whatever the number of seeds."""
+    table = {"over": ["seed", "scene"], "columns": ["instances.ap50"]}
+    rows = {"chain": [], "other": ["refiner=other"]}
+    (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": rows}))
+    for row, scene, ap in (("chain", "a", 0.5), ("chain", "b", 0.5), ("other", "a", 0.8), ("other", "b", 0.6)):
+        for seed in range(3):
+            run(tmp_path, row, seed, ap, 1.0, scene=scene)
+    text = write_tables(tmp_path)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "| other | 6 | +0.200 ± 0.100 |" in lines  # over six runs, it would be 0.045 and called significant
+    assert "paired by seed, scene: mean ± standard error over the values of scene, of each of which the runs" in text
+    with (tmp_path / "table.csv").open() as file:
+        _, other = csv.DictReader(file)
+    assert float(other["instances.ap50.se"]) == pytest.approx(0.1)
+    assert other["instances.ap50.pairs"] == "6"
+
+
+def test_what_is_missing_is_said(sweep: Path) -> None:
+    (sweep / "row=chain,seed=1" / "metrics.json").unlink()
+    (sweep / "row=chain,seed=1" / "instancemap.log").write_text("12:00:00 ERROR   the map is full.\n")
+    (sweep / "row=identity,seed=2" / "metrics.json").write_text("{")
+    run(sweep, "identity", 7, None, 1.0, git_commit="89abcdef", pose_source="tracked")
+    text = write_tables(sweep)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert "| identity | 3 | 0.300 ± 0.141 (2 of 3) | 0.3 ± 0.6 | ground_truth/tracked |" in lines
+    assert "| identity | 1 | -0.300 | -150.0 |" in lines  # seed 0 is the only pair, and has no error
+    assert "- Missing in chain: seed=1,7." in lines
+    assert "- Missing in identity: seed=2." in lines
+    assert "- Not complete: row=chain,seed=1: failed: the map is full." in lines
+    assert sum(line.startswith("- Not complete: row=identity,seed=2: ") for line in lines) == 1
+    assert "- Code: 1234567 (4 runs), 89abcde (1 run)." in lines
+
+
+def test_seeds_that_were_asked_for_and_have_not_begun_are_said(sweep: Path) -> None:
+    asked = {"sweeper": {"params": {"row": "${all_of:${rows}}", "seed": 0}}, "overrides": {"task": ["seed=range(0,5)"]}}
+    config = {"table": TABLE, "rows": ROWS, "hydra": asked}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    lines = write_tables(sweep).splitlines()
+    assert "- Missing in identity: seed=3,4." in lines
+    assert "- Missing in chain: seed=3,4." in lines
+
+
+def test_what_evaluated_anew_is_named_beside_what_ran(sweep: Path) -> None:
+    """A table of two evaluators must say so."""
+    path = sweep / "row=chain,seed=1" / "metrics.json"
+    anew = {"evaluation.git_commit": "fedcba9876", "evaluation.git_dirty": True}
+    path.write_text(json.dumps(json.loads(path.read_text()) | anew))
+    told = "- Code: 1234567 (5 runs), 1234567, evaluated by fedcba9 with changes (1 run)."
+    assert told in write_tables(sweep).splitlines()
+
+
+def test_a_note_is_one_line_whatever_a_run_says(sweep: Path) -> None:
+    (sweep / "row=chain,seed=1" / "metrics.json").unlink()
+    partial = {"partial": "the map\nis\r\nfull"}
+    (sweep / "row=chain,seed=1" / "metrics.partial.json").write_text(json.dumps(partial))
+    assert "- Not complete: row=chain,seed=1: partial: the map is full." in write_tables(sweep).splitlines()
+    assert "% Not complete: row=chain,seed=1: partial: the map is full." in (sweep / "table.tex").read_text()
+
+
+def test_what_has_the_seeds_value_by_chance_is_told(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        config = {"seed": seed, "dataset": {"stride": seed}}
+        directory = run(tmp_path, "x", seed, 0.5, 1.0)
+        (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+        metrics = json.loads((directory / "metrics.json").read_text()) | {"config_hash": config_hash(config)}
+        (directory / "metrics.json").write_text(json.dumps(metrics))
+    assert "- Averaged over with seed, whose value they have in every run: dataset.stride." in write_tables(tmp_path)
+
+
+def test_no_differences_without_the_base(sweep: Path) -> None:
+    for path in sweep.glob("row=chain*/metrics.json"):
+        path.unlink()
+    text = write_tables(sweep)
+    assert "less chain" not in text
+    assert "- No differences: chain is no row with a complete run; table.base=ROW names another." in text
+    assert text.count("| identity ") == 1
+
+
+def test_rows_go_by_the_names_that_they_are_given(sweep: Path) -> None:
+    table = TABLE | {"names": {"chain": "all of it"}}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
+    text = write_tables(sweep)
+    assert "| all of it |" in text
+    assert "| less all of it |" in text
+
+
+def test_published_run_times_stand_below(sweep: Path) -> None:
+    table = {"over": ["seed"], "columns": ["fps", "stage_ms.refine.median", "frames_lost"], "published": "table1"}
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
+    text = write_tables(sweep)
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[2] == "| row | runs | Hz | refine (ms) | frames lost | poses |"
+    assert "| the paper (published) | – | 10.8 | not known | – | tracked |" in lines
+    assert "| Voxblox++ (published) | – | not known | not known | not known | not known |" in lines
+    assert "- Published, the paper: DDNS 2020, article 2528954; all components on every frame of 640x480" in text
+
+
+def test_a_split_row_is_compared_with_the_base_of_its_kind(tmp_path: Path) -> None:
+    """Rows that the command line split in two: voxels of one size are compared with each other."""
+    root = tmp_path / "x"
+    root.mkdir()
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": TABLE, "rows": ROWS})))
+    for voxel, better in ((1, 0.25), (2, 0.125)):
+        for row, ap in (("chain", 0.5), ("identity", 0.5 - better)):
+            directory = run(root, row, 0, ap, 1.0)
+            config = OmegaConf.load(directory / "config.yaml")
+            config.fuser = {"voxel": voxel}
+            OmegaConf.save(config, directory / "config.yaml")
+            metrics = json.loads((directory / "metrics.json").read_text())
+            metrics["config_hash"] = config_hash({str(k): v for k, v in OmegaConf.to_object(config).items()})
+            (directory / "metrics.json").write_text(json.dumps(metrics))
+            directory.rename(root / f"{row}{voxel}")
+    lines = [" ".join(line.split()) for line in write_tables(root).splitlines()]
+    assert "| identity, fuser.voxel=1 | 1 | -0.250 | +0.000 |" in lines
+    assert "| identity, fuser.voxel=2 | 1 | -0.125 | +0.000 |" in lines
+
+
+def test_a_figure_that_nobody_knows_is_a_dash(sweep: Path) -> None:
+    (sweep / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": TABLE | {"columns": ["no.such"]}, "rows": ROWS}))
+    text = write_tables(sweep)
+    assert "| identity |    3 |       – | ground_truth |" in text
+    assert "- No run has a figure of this name: no.such." in text, "it may be misspelt"
+
+
+def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        run(tmp_path, name, 0, 0.5, 1.0)
+    text = write_tables(tmp_path)
+    assert "| row | runs | AP50 | AP50 agnostic |" in " ".join(text.split())
+    assert "| a   |    1 | 0.500 |" in text
+    assert "less a" in text
+
+
+def test_an_older_record_of_the_same_run_is_counted(sweep: Path) -> None:
+    (sweep / "again").mkdir()
+    run(sweep / "again", "chain", 0, 0.0, 1.0)
+    assert "- Left out, older records of the same runs: 1." in write_tables(sweep)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("table: [", "cannot be read"), ("table: {columns: [], over: [seed]}", "table.columns must name")],
+)
+def test_a_broken_experiment_is_one_line(sweep: Path, content: str, said: str) -> None:
+    (sweep / "multirun.yaml").write_text(content)
+    with pytest.raises(Exception, match=said) as caught:
+        write_tables(sweep)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_complete_run_is_told_with_the_reason(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="there is no complete run below"):
+        write_tables(tmp_path)
+    with pytest.raises(DataError, match="is not a folder"):
+        write_tables(tmp_path / "nowhere")
+    (tmp_path / "run").mkdir()
+    (tmp_path / "run" / "metrics.partial.json").write_text('{"partial": "the map is full"}')
+    with pytest.raises(DataError, match=r"\(run: partial: the map is full\)"):
+        write_tables(tmp_path)
+    assert not list(tmp_path.glob("table.*"))
+
+
+def test_latex_and_markdown_escape(sweep: Path) -> None:
+    run(sweep, r"50%_{a}|b\c", 0, 0.5, 1.0)
+    assert r"50%_{a}\|b\c" in write_tables(sweep)
+    latex = (sweep / "table.tex").read_text()
+    assert r"50\%\_\{a\}\textbar{}b\textbackslash{}c & 1 & 0.500 &" in latex
+    assert r"chain & 3 & 0.700 $\pm$ 0.265 & 151.0 $\pm$ 1.0 & ground\_truth \\" in latex
+    bodies = [line for line in latex.splitlines() if line.endswith(r"\\")]
+    assert {line.count("&") for line in bodies[:4]} == {4}
+    assert latex.count("\\begin{tabular}{lrrrr}") == 1
+    assert all(line.startswith(("%", "\\")) or "&" in line or not line for line in latex.splitlines())
+
+
+def test_heads_have_units() -> None:
+    keys = ("instances.ap50_agnostic", "stage_ms.fuse.median", "stage_ms.fuse.p95", "trajectory.ate_rmse_m", "x.y")
+    assert [head(key) for key in keys] == ["AP50 agnostic", "fuse (ms)", "fuse (ms, p95)", "ATE (m)", "x.y"]
+
+
+def test_the_command(sweep: Path) -> None:
+    line = [sys.executable, "-m", "framework", "tables", str(sweep)]
+    done = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert done.stdout.startswith("# ablation_x")
+    wrong = subprocess.run([*line, "nowhere"], cwd=CHECKOUT, capture_output=True, text=True, timeout=60)
+    assert (wrong.returncode, wrong.stderr) == (1, "error: nowhere is not a folder with records of runs\n")

@@ -1,0 +1,64 @@
+"""Cells as Markdown and LaTeX."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from framework.tables.grid import Grid, decimals, figure, latex_grid, markdown_grid
+
+GRID = Grid(
+    heads=["scene", "a_b", "x"],
+    body=[["011", "y|z", "0.5 ± 0.1"], ["", "50%", "–"]],
+    words=2,
+    bold=frozenset({(0, 2)}),
+    groups=frozenset({1}),
+)
+
+
+def test_markdown_is_padded_and_words_stand_left() -> None:
+    assert markdown_grid(GRID).splitlines() == [
+        "| scene | a_b  |             x |",
+        "| ----- | ---- | ------------: |",
+        "| 011   | y\\|z | **0.5 ± 0.1** |",
+        "|       | 50%  |             – |",
+    ]
+
+
+@pytest.mark.parametrize("name", ["*star", "[optional]"])
+def test_latex_takes_no_cell_for_an_argument(name: str) -> None:
+    """A star or a bracket behind the \\\\ or the rule of the line above is an argument of that."""
+    assert f"{{}}{name} & 1 \\\\" in latex_grid(Grid(["row", "x"], [[name, "1"]]))
+
+
+def test_a_line_break_ends_no_line_of_a_table() -> None:
+    grid = Grid(["row", "x"], [["a\nb", "1"]])
+    assert "a b & 1 \\\\" in latex_grid(grid)
+    assert "| a b | 1 |" in markdown_grid(grid)
+
+
+def test_latex_escapes_and_has_a_rule_between_groups() -> None:
+    assert latex_grid(GRID) == [
+        "\\begin{tabular}{llr}",
+        "\\toprule",
+        "scene & a\\_b & x \\\\",
+        "\\midrule",
+        "011 & y\\textbar{}z & \\textbf{0.5 $\\pm$ 0.1} \\\\",
+        "\\midrule",
+        " & 50\\% & -- \\\\",
+        "\\bottomrule",
+        "\\end{tabular}",
+        "",
+    ]
+
+
+def test_decimals_follow_the_largest() -> None:
+    assert [decimals([value, 0.1, math.nan]) for value in (-1.9, 2.0, 199.0, 200.0)] == [3, 2, 1, 0]
+    assert decimals([math.nan]) == 3
+
+
+def test_a_figure_has_its_spread_where_there_is_one() -> None:
+    assert figure(0.25, 0.0625, 2) == "0.25 ± 0.06"
+    assert figure(0.25, math.nan, 3, signed=True) == "+0.250"
+    assert figure(-1e-9, math.nan, 3, signed=True) == "+0.000"

@@ -1,0 +1,265 @@
+"""Tables over sequences from records made by hand: the paper's Tables 2 and 3, and what must never be averaged."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.records.provenance import config_hash
+from framework.tables.experiment_tables import write_tables
+
+AP50 = "instances.ap50"
+ROWS = {"ours": [], "rival": ["refiner=geometric"], "other": ["refiner=identity"]}
+NAMES = {"rival": "Rival (re-implementation)"}
+ACROSS = {"over": ["seed"], "across": "dataset.scene", "columns": [AP50], "names": NAMES}
+BY = {"over": ["seed"], "by": "dataset.scene", "names": NAMES, "columns": [f"{AP50}.couch", f"{AP50}.tv", AP50]}
+FIGURES = {  # by row and scene: AP50 of seeds 0 and 1
+    ("ours", "011"): (0.6, 0.8),
+    ("ours", "016"): (0.5, 0.3),
+    ("rival", "011"): (0.5, 0.7),
+    ("rival", "016"): (0.6, 0.4),
+    ("other", "011"): (0.2, 0.2),
+    ("other", "016"): (0.1, None),  # this run fails
+}
+
+
+def experiment(root: Path, table: dict[str, Any]) -> None:
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": ROWS})))
+
+
+def run(root: Path, row: str, scene: str, seed: int, tracker: str = "ground_truth", **told: Any) -> Path:
+    """Leaves a record; `told` are figures of metrics.json, or `data` and `release`."""
+    directory = root / f"dataset.scene={scene},row={row},seed={seed},tracker={tracker}{len(told.get('data', ''))}"
+    directory.mkdir()
+    config = {
+        **{"row": row, "seed": seed, "refiner": {"kind": row}, "tracker": {"kind": tracker}},
+        "dataset": {"root": f"/data{told.pop('data', '')}", "scene": scene, "seed": seed},
+    }
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    metrics = {
+        **{"pose_source": "ground_truth" if tracker == "ground_truth" else "tracked", "choice.tracker": tracker},
+        **{"choice.refiner": row, "annotation_release": told.pop("release", "made up")},
+        **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
+        **{"environment.cpus": 2, "environment.processor": "Z80", **told},
+    }
+    (directory / "metrics.json").write_text(json.dumps(metrics))
+    return directory
+
+
+@pytest.fixture
+def sweep(tmp_path: Path) -> Path:
+    """Three rows, two scenes, two seeds, one failed run."""
+    root = tmp_path / "table3"
+    root.mkdir()
+    experiment(root, ACROSS)
+    for (row, scene), values in FIGURES.items():
+        for seed, value in enumerate(values):
+            directory = run(root, row, scene, seed, **{AP50: value, f"{AP50}.couch": value})
+            if value is None:
+                (directory / "metrics.json").unlink()
+                (directory / "instancemap.log").write_text("12:00:00 ERROR   the map is full.\n")
+    return root
+
+
+def grids(text: str) -> list[list[str]]:
+    """The lines of each of a text's tables, without padding."""
+    blocks = [block.splitlines() for block in text.split("\n\n") if block.startswith("|")]
+    return [[" ".join(line.split()) for line in block] for block in blocks]
+
+
+GOLDEN = """\
+# table3
+
+| system                    | poses        | annotation |               011 |               016 |                mean |
+| ------------------------- | ------------ | ---------- | ----------------: | ----------------: | ------------------: |
+| ours                      | ground truth | made up    | **0.700 ± 0.141** |     0.400 ± 0.141 |   **0.550 ± 0.000** |
+| Rival (re-implementation) | ground truth | made up    |     0.600 ± 0.141 | **0.500 ± 0.141** |   **0.550 ± 0.000** |
+| other                     | ground truth | made up    |     0.200 ± 0.000 |    0.100 (1 of 2) | 0.150 (3 of 4 runs) |
+
+| ours less                 | poses        | annotation |    011 |    016 |           mean | pairs |
+| ------------------------- | ------------ | ---------- | -----: | -----: | -------------: | ----: |
+| Rival (re-implementation) | ground truth | made up    | +0.100 | -0.100 | +0.000 ± 0.100 |     4 |
+| other                     | ground truth | made up    | +0.500 | +0.400 | +0.450 ± 0.050 |     3 |
+
+- Mean ± sample standard deviation over seed, where there are several. The mean is over the sequences (dataset.scene), \
+each of which counts as one; its deviation is over the runs that have all of them. In bold: the highest of the same \
+poses, among means of as many runs. missing: no complete run.
+- Differences are paired by seed, dataset.scene: mean ± standard error over the sequences, of each of which the runs \
+are averaged first; * where the 95% interval of Student's t is without 0.
+- ours against Rival (re-implementation), ground truth: higher in 1 of 2 sequences, lower in 1: 016.
+- ours against other, ground truth: higher in 2 of 2 sequences, lower in 0.
+- What each row changes: ours: nothing; rival: refiner=geometric; other: refiner=identity.
+- In all: tracker=ground_truth.
+- Transfer: each true vertex takes the instance of the map's nearest vertex within 5 cm. AP is in [0, 1].
+- Code: 1234567.
+- Machine: 2 cores of Z80.
+- Config: config.yaml beside each run; SHA-256 of all their hashes: DIGEST.
+- Missing in other: seed=1 dataset.scene=016.
+- Not complete: dataset.scene=016,row=other,seed=1,tracker=ground_truth0: failed: the map is full.
+"""
+
+
+def test_the_papers_table_3_word_by_word(sweep: Path) -> None:
+    text = write_tables(sweep)
+    [line] = [line for line in text.splitlines() if "SHA-256" in line]
+    assert text.replace(line.rpartition(" ")[2], "DIGEST.") == GOLDEN
+
+
+def test_published_numbers_stand_below_with_their_source(sweep: Path) -> None:
+    experiment(sweep, ACROSS | {"published": "table3"})
+    text = write_tables(sweep)
+    first, _ = grids(text)
+    assert (
+        first[0] == "| system | poses | annotation | 011 | 016 | 030 | 061 | 078 | 086 | 096 | 206 | 223 | 255 | mean |"
+    )
+    found, missing = "**0.700 ± 0.141** | 0.400 ± 0.141 |", " ".join(["missing |"] * 8)
+    assert first[2] == f"| ours | ground truth | made up | {found} {missing} **0.550 ± 0.000 (2 of 10)** |"
+    assert f"| the paper (published) | not known | {' '.join(['not known |'] * 12)}" in first
+    assert first[-1] == (
+        "| Voxblox++ with Detectron2 panoptic (published) | ground truth | not known "
+        "| 0.655 | 0.033 | 0.676 | 0.269 | 0.517 | 0.325 | 0.299 | – | 0.190 | – | – |"
+    )
+    assert "- Published, Voxblox++ with Detectron2 panoptic: Han et al., ICRA 2021" in text
+    assert "nobody has looked the numbers up: the paper (DDNS 2020" in text
+    assert "- Without a complete run of any row: dataset.scene=030,061,078,086,096,206,223,255." in text
+    assert "seed=0 dataset.scene=255" not in text  # told once, not for each row and seed
+
+
+def test_pose_sources_are_compared_apart(sweep: Path) -> None:
+    """Better poses make no better system: the base of a tracked row is tracked, too, and so is who it competes with."""
+    for row, value in (("ours", 0.2), ("rival", 0.3)):
+        run(sweep, row, "011", 0, tracker="icp", **{AP50: value})
+    first, second = grids(write_tables(sweep))
+    assert [line.split(" | ")[:2] for line in first[2:]] == [
+        ["| ours", "ground truth"],
+        ["| Rival (re-implementation)", "ground truth"],
+        ["| other", "ground truth"],
+        ["| ours", "tracked (icp)"],
+        ["| Rival (re-implementation)", "tracked (icp)"],
+    ]
+    assert (
+        first[-1]
+        == "| Rival (re-implementation) | tracked (icp) | made up | **0.300 (1 of 2)** | missing | **0.300 (1 of 2)** |"
+    )
+    assert second[-1] == "| Rival (re-implementation) | tracked (icp) | made up | -0.100 | missing | -0.100 | 1 |"
+
+
+def test_a_row_that_alone_is_tracked_is_not_compared_with_given_poses(sweep: Path) -> None:
+    for path in sweep.glob("*row=other*/metrics.json"):
+        path.unlink()
+    run(sweep, "other", "078", 0, tracker="icp", **{AP50: 0.9})
+    text = write_tables(sweep)
+    _, second = grids(text)
+    assert len(second) == 3
+    assert "- Without a row of ours that they could be compared with: other, tracker=icp." in text
+
+
+@pytest.mark.parametrize(
+    ("changed", "usual", "other", "annotation"),
+    [
+        ({"data": "/real"}, "dataset.root=/data", "dataset.root=/data/real", "made up"),
+        ({"release": "2017"}, "annotation=made up", "annotation=2017", "2017"),
+        ({"release": None}, "annotation=made up", "annotation=not told", "–"),
+    ],
+)
+def test_other_data_and_annotations_are_never_averaged_or_compared(
+    sweep: Path, changed: dict[str, Any], usual: str, other: str, annotation: str
+) -> None:
+    """Neither inside of a row nor between rows."""
+    for path in sweep.glob("*row=other*/metrics.json"):
+        path.unlink()
+    run(sweep, "ours", "078", 0, **{AP50: 0.9}, **changed)
+    run(sweep, "other", "078", 0, **{AP50: 0.8}, **changed)
+    first, second = grids(write_tables(sweep))
+    rival, another = f"| Rival (re-implementation), {usual}", f"| other, {other}"
+    assert {line.split(" | ")[0] for line in first[2:]} == {f"| ours, {usual}", rival, f"| ours, {other}", another}
+    assert [line.split(" | ")[1:] for line in second[2:] if line.startswith(another)] == [
+        ["ground truth", annotation, "missing", "missing", "+0.100", "+0.100", "1 |"]
+    ]
+    assert len([line for line in second if line.startswith(rival)]) == 1
+
+
+def test_the_csv_has_a_line_a_run_with_all_digits(sweep: Path) -> None:
+    run(sweep, "ours", "078", 0, **{AP50: 1 / 3})
+    write_tables(sweep)
+    with (sweep / "table.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 12
+    [line] = [line for line in lines if line["dataset.scene"] == "078"]
+    assert float(line["value"]) == 1 / 3
+    assert (line["system"], line["variant"], line["seed"], line["figure"]) == ("ours", "", "0", AP50)
+    assert (line["poses"], line["annotation"], line["code"]) == ("ground_truth", "made up", "1234567")
+
+
+def test_the_papers_table_2_in_groups(sweep: Path) -> None:
+    experiment(sweep, BY)
+    first, second = grids(write_tables(sweep))
+    assert first[0] == "| scene | system | poses | annotation | sofa | television | AP50 |"
+    couch = "**0.700 ± 0.141** | – | **0.700 ± 0.141**"
+    assert first[2] == f"| 011 | ours | ground truth | made up | {couch} |"
+    assert first[5] == "| 016 | ours | ground truth | made up | 0.400 ± 0.141 | – | 0.400 ± 0.141 |"
+    assert first[7] == "| | other | ground truth | made up | 0.100 (1 of 2) | – | 0.100 (1 of 2) |"
+    assert first[8] == "| mean | ours | ground truth | made up | **0.550 ± 0.000** | – | **0.550 ± 0.000** |"
+    assert second[0] == "| less ours | pairs | sofa | television | AP50 |"
+    assert second[2] == "| Rival (re-implementation) | 4 | +0.000 ± 0.100 | – | +0.000 ± 0.100 |"
+
+
+def test_the_highest_mean_is_among_those_of_as_many_sequences(sweep: Path) -> None:
+    """The tracked row with the most sequences has fewer than those with given poses, and wins all the same."""
+    experiment(sweep, BY)
+    for row, scene, value in (("ours", "011", 0.2), ("rival", "011", 0.3), ("other", "078", 0.9), ("ours", "016", 0.2)):
+        run(sweep, row, scene, 0, tracker="icp", **{AP50: value})
+    run(sweep, "rival", "016", 0, tracker="icp", **{AP50: 0.1})
+    run(sweep, "ours", "078", 0, **{AP50: 0.9})
+    first, _ = grids(write_tables(sweep))
+    cells = {tuple(line.split(" | ")[1:3]): line.split(" | ")[-1] for line in first[-6:]}
+    assert cells["ours", "tracked (icp)"] == "**0.200 (2 of 3)** |"
+    assert cells["Rival (re-implementation)", "tracked (icp)"] == "**0.200 (2 of 3)** |"
+    assert cells["other", "tracked (icp)"] == "0.900 (1 of 3) |"
+
+
+@pytest.mark.parametrize("table", [ACROSS, BY])
+def test_one_lucky_seed_does_not_beat_the_mean_of_two(sweep: Path, table: dict[str, Any]) -> None:
+    """A mean of fewer runs says so, also where no sequence is missing."""
+    experiment(sweep, table)
+    for path in sweep.glob("*row=other,seed=1*/metrics.json"):
+        path.unlink()
+    for path in sweep.glob("*row=other,seed=0*/metrics.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {AP50: 0.75}))
+    lines, _ = grids(write_tables(sweep))
+    assert "".join(lines).count("| 0.750 (1 of 2) ") == 2
+    assert sum(line.endswith("| 0.750 (2 of 4 runs) |") for line in lines) == 1
+    assert sum(line.endswith("| **0.550 ± 0.000** |") for line in lines) == 2
+    assert "**0.75" not in "".join(lines)
+
+
+def test_published_numbers_stand_in_their_sequences_group(sweep: Path) -> None:
+    experiment(sweep, BY | {"published": "table2"})
+    first, _ = grids(write_tables(sweep))
+    han = "Voxblox++ with Detectron2 panoptic (published) | ground truth"
+    assert first[5] == f"| | {han} | not known | 0.952 | – | 0.655 |"
+    assert f"| 030 | {han} | not known | 0.991 | 0.000 | 0.676 |" in first  # no run of ours, yet
+    assert first[-1] == "| | Voxblox++ (published) |" + 5 * " not known |"
+    assert not [line for line in first if line.startswith("| 206")]
+
+
+@pytest.mark.parametrize("table", [ACROSS | {"published": "table3"}, BY | {"published": "table2"}])
+def test_every_line_of_the_latex_has_as_many_cells_as_its_tabular(sweep: Path, table: dict[str, Any]) -> None:
+    experiment(sweep, table)
+    write_tables(sweep)
+    latex = (sweep / "table.tex").read_text()
+    tabulars = latex.split("\\begin{tabular}{")[1:]
+    assert len(tabulars) == 2
+    for tabular in tabulars:
+        columns = len(tabular.partition("}")[0])
+        rows = [line for line in tabular.splitlines() if line.endswith("\\\\")]
+        assert {line.replace("\\&", "").count("&") + 1 for line in rows} == {columns}
+    assert "\\textbf{0.700 $\\pm$ 0.141}" in latex
+    cells = [line for line in latex.splitlines() if not line.startswith("%")]
+    assert not any(mark in line for line in cells for mark in ("**", "±", "–"))
+    assert all(line.startswith(("%", "\\")) or "&" in line or not line for line in latex.splitlines())

@@ -1,0 +1,156 @@
+"""A config node becomes a checked plugin, or one line that says what is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from framework.data import Detections, Frame
+from framework.errors import ConfigError, DataError
+from framework.interfaces import Detector, PoseTracker
+from framework.registry import STAGES, build, find_class
+
+HERE = "build_targets"
+
+
+class Storage(Enum):
+    exact = 1
+    compact = 2
+
+
+@dataclass
+class Probe(Detector):
+    weights: Path
+    threshold: float = 0.5
+    limit: int = 10
+    storage: Storage = Storage.exact
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        self.classes = ("chair",)
+        if not 0 <= self.threshold <= 1:
+            raise ConfigError(f"threshold must be in [0, 1], found {self.threshold}")
+        if self.name == "absent":
+            raise DataError(f"{self.weights} is not there")
+        if self.name == "broken":
+            raise ImportError("No module named 'onnxruntime'; install instancemap[onnx]")
+
+    def detect(self, frame: Frame) -> Detections:
+        return Detections.none(frame.camera.shape, self.classes)
+
+
+class Undecorated(Probe):
+    pass
+
+
+@dataclass
+class Abstract(Detector):
+    pass
+
+
+@dataclass
+class OddField(Probe):
+    table: np.ndarray | None = None
+
+
+def some_function() -> None:
+    raise AssertionError("a config must not be able to call this")
+
+
+@pytest.fixture(autouse=True)
+def importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This module under a fixed name, whatever pytest calls it."""
+    import sys
+
+    monkeypatch.setitem(sys.modules, HERE, sys.modules[__name__])
+
+
+def detector(**parameters: object) -> Detector:
+    node = {"_target_": f"{HERE}.Probe", "weights": "w.bin", **parameters}
+    return build(Detector, OmegaConf.create({"detector": node, "seed": 7, "limit": 3})["detector"])
+
+
+def fault(**parameters: object) -> str:
+    with pytest.raises(ConfigError) as caught:
+        detector(**parameters)
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("detector")
+    return message
+
+
+def test_parameters_get_the_types_of_their_fields() -> None:
+    built = detector(threshold=1, storage="compact", limit="${limit}", name=3)
+    assert built == Probe(Path("w.bin"), 1.0, 3, Storage.compact, "3")
+    assert isinstance(built, Probe)
+    assert isinstance(built.weights, Path)
+    assert isinstance(built.threshold, float)
+
+
+def test_defaults_of_the_class_hold_where_the_config_is_silent() -> None:
+    assert detector() == Probe(Path("w.bin"))
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"),
+    [
+        ({"threshold": "high"}, ["Probe", "threshold", "'high'", "Float"]),
+        ({"limit": 2.5}, ["limit", "2.5", "Integer"]),
+        ({"limit": None}, ["limit", "not Optional"]),
+        ({"storage": "exakt"}, ["storage", "exact, compact"]),
+        ({"treshold": 0.2}, ["no parameter 'treshold'", "did you mean 'threshold'?"]),
+        ({"zzz": 0.2}, ["no parameter 'zzz'", "it has weights, threshold, limit, storage, name"]),
+        ({"weights": "???"}, ["weights must be given", "detector.weights=..."]),
+        ({"limit": "${nowhere}"}, ["limit", "nowhere"]),
+        ({"threshold": 2.0}, ["threshold must be in [0, 1], found 2.0"]),
+        ({"name": "broken"}, ["install instancemap[onnx]"]),
+        ({"_target_": f"{HERE}.Undecorated"}, ["@dataclass"]),
+        ({"_target_": f"{HERE}.Abstract"}, ["does not implement detect of Detector"]),
+        ({"_partial_": True}, ["no parameter '_partial_'"]),
+        ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path or Enum", "ndarray"]),
+        ({"_target_": f"{HERE}.Prob"}, ["no Prob", "did you mean 'Probe'?"]),
+        ({"_target_": f"{HERE}.some_function"}, ["implements Detector", "found a function"]),
+        ({"_target_": f"{HERE}.Path"}, ["implements Detector", "found a class that does not"]),
+        ({"_target_": "os.system"}, ["implements Detector"]),
+        ({"_target_": "framework.interfaces.Detector"}, ["implements Detector"]),
+        ({"_target_": "framework.interface.Detector"}, ["no module framework.interface", "did you mean 'interfaces'?"]),
+        ({"_target_": "nowhere.at.All"}, ["no module nowhere"]),
+        ({"_target_": "Probe"}, ["package.module.Class"]),
+        ({"_target_": ""}, ["_target_"]),
+        ({"_target_": None}, ["_target_"]),
+    ],
+    ids=str,
+)
+def test_every_fault_is_one_line(parameters: dict[str, object], said: list[str]) -> None:
+    message = fault(**parameters)
+    for words in said:
+        assert words in message
+
+
+def test_the_plugins_own_error_keeps_its_type_and_gets_a_name() -> None:
+    with pytest.raises(DataError, match=r"detector build_targets\.Probe: w\.bin is not there"):
+        detector(name="absent")
+
+
+def test_a_missing_choice_is_told() -> None:
+    with pytest.raises(ConfigError, match="choose detector=NAME"):
+        build(Detector, OmegaConf.create({"detector": None})["detector"])
+
+
+def test_a_module_that_fails_at_import_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "needs_more.py").write_text("import surely_not_installed\n")
+    (tmp_path / "raises.py").write_text("raise RuntimeError('operator torchvision::nms does not exist\\nmore')\n")
+    with pytest.raises(ConfigError, match="needs the package 'surely_not_installed', which is not installed"):
+        find_class(PoseTracker, "needs_more.Tracker")
+    with pytest.raises(ConfigError, match=r"raises cannot be imported: RuntimeError: operator .* does not exist$"):
+        find_class(PoseTracker, "raises.Tracker")
+
+
+def test_every_stage_has_its_interface() -> None:
+    assert list(STAGES) == ["dataset", "detector", "tracker", "refiner", "fuser"]

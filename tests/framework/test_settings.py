@@ -1,0 +1,54 @@
+"""What the top of the config says to the libraries."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from framework.errors import ConfigError
+from framework.settings import Settings, available_cores
+
+
+def test_threads_limit_what_is_loaded_and_what_is_loaded_later() -> None:
+    """torch is not loaded for it, and obeys when it is."""
+    code = """
+import sys
+from framework.settings import Settings
+Settings(seed=0, device="cpu", threads=1).apply()
+import cv2, numba
+assert "torch" not in sys.modules
+import torch
+print(numba.get_num_threads(), cv2.getNumThreads(), torch.get_num_threads())
+Settings(seed=0, device="cpu", threads=3).apply()
+print(torch.get_num_threads())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == ["1", "1", "1", "3"]
+
+
+def test_torch_is_seeded_whenever_it_is_imported() -> None:
+    code = """
+from framework.settings import Settings
+Settings(seed=4, device="cpu", threads=1).apply()
+Settings(seed=5, device="cpu", threads=1).apply()
+import torch.nn, torch
+print(torch.initial_seed())
+Settings(seed=6, device="cpu", threads=1).apply()
+print(torch.initial_seed())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == ["5", "6"]
+
+
+def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert available_cores() == os.cpu_count()
+
+
+@pytest.mark.parametrize("threads", [-1, 1.0, True])
+def test_threads_are_a_number_of_threads(threads: object) -> None:
+    with pytest.raises(ConfigError, match="threads must be a whole number, 0 or more, found"):
+        Settings(seed=0, device="cpu", threads=threads)  # type: ignore[arg-type]

@@ -1,0 +1,245 @@
+"""A small room whose every pixel is known exactly, and the simplest plugins that can map it: what the tests run on.
+
+The corner of a room (two walls and a floor, textured) with a chair and a couch, both spheres. World: x right, y down,
+z forward, like the first camera.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import (
+    Box,
+    Camera,
+    Detections,
+    Frame,
+    FrameTruth,
+    Instance,
+    InstanceMesh,
+    PointClusters,
+    Pose,
+    SceneTruth,
+    View,
+)
+from framework.errors import DataError, FrameError, MapFullError
+from framework.files.atomic_files import written_whole
+from framework.geometry import back_project, exp_se3, transform
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
+
+CLASSES = ("chair", "couch")
+CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
+PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))  # n . p + d = 0, n into the room
+SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centre, radius: instances 1 and 2
+
+
+def look(camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Depth (H, W) float32, normals (H, W, 3), colour (H, W, 3) uint8 and instance ids (H, W) int32, all exact."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    d = rays @ T_world_camera[:3, :3].T
+    o = T_world_camera[:3, 3]
+    depth = np.full(u.shape, np.inf)
+    normals = np.zeros((*u.shape, 3))
+    ids = np.zeros(u.shape, np.int32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for n, offset in PLANES:
+            t = -(o @ np.array(n) + offset) / (d @ np.array(n))
+            nearer = (t > 1e-3) & (t < depth)
+            depth[nearer], normals[nearer] = t[nearer], n
+        for k, (center, radius) in enumerate(SPHERES, start=1):
+            b, a = d @ (o - center), (d**2).sum(-1)
+            t = (-b - np.sqrt(b**2 - a * (((o - center) ** 2).sum() - radius**2))) / a
+            nearer = (t > 1e-3) & (t < depth)
+            depth[nearer], ids[nearer] = t[nearer], k
+            normals[nearer] = ((o + t[..., None] * d - center) / radius)[nearer]
+    seen = np.isfinite(depth)
+    depth = np.where(seen, depth, 0)
+    p = o + depth[..., None] * d
+    waves = np.stack([np.sin(9 * p + 1.3 * k).sum(-1) + np.sin(23 * p[..., k] + k) for k in range(3)], axis=-1)
+    color = np.where(seen[..., None], 128 + 28 * waves + 20 * (ids[..., None] - 1), 0)
+    return depth.astype(np.float32), normals, np.clip(color, 0, 255).astype(np.uint8), ids
+
+
+def pose_at(k: int) -> np.ndarray:
+    """T_world_camera of frame k: about a centimetre and a third of a degree further than the one before."""
+    return exp_se3(np.array([0.010, -0.003, 0.006, 0.002, -0.005, 0.001]) * k)
+
+
+@dataclass
+class CornerRoom(RGBDSequence):
+    """The room as a video."""
+
+    frames: int = 6
+    unreadable: int = -1  # this frame raises FrameError; -1 = none
+    truth: bool = True  # whether poses and instances are known
+    slow_s: float = 0.0  # how long reading a frame takes
+    scene: str = ""  # any name: all are the same room
+    start: int = 0
+    stop: int = -1  # -1 = to the end
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        self.camera, self.name = CAMERA, "corner_room"
+        self._chosen = range(self.frames)[self.start : None if self.stop < 0 else self.stop : self.stride]
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __getitem__(self, k: int) -> Frame:
+        index = self._chosen[k]
+        time.sleep(self.slow_s)
+        if index == self.unreadable:
+            raise FrameError(f"frame {index}: depth/{index:06d}.png is truncated")
+        depth, _, color, ids = look(CAMERA, pose_at(index))
+        truth = FrameTruth(ids, dict(enumerate(CLASSES, start=1))) if self.truth else None
+        return Frame(index, index / 30, color, depth, CAMERA, pose_at(index) if self.truth else None, truth)
+
+    def scene_truth(self) -> SceneTruth | None:
+        if not self.truth:
+            return None
+        depth, _, _, ids = look(CAMERA, pose_at(0))
+        v, u = np.nonzero(depth > 0)
+        points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])
+        return SceneTruth(points, ids[v, u], dict(enumerate(CLASSES, start=1)))
+
+
+@dataclass
+class SphereDetector(Detector):
+    """Finds both spheres where they really are."""
+
+    broken_at: int = -1  # raises FrameError at this frame
+
+    def __post_init__(self) -> None:
+        self.classes = CLASSES
+
+    def detect(self, frame: Frame) -> Detections:
+        if frame.index == self.broken_at:
+            raise FrameError(f"frame {frame.index}: the detector cannot use it")
+        if frame.truth is None:
+            raise DataError(f"frame {frame.index} has no true instances: choose a detector that needs none")
+        masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
+        boxes = [
+            [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
+        ]
+        sure = np.array([[0.9, 0.1], [0.2, 0.8]], np.float32)
+        return Detections(masks, np.array(boxes, np.float32), sure.max(1), sure, CLASSES)
+
+
+@dataclass
+class GivenPose(PoseTracker):
+    """Passes the true pose on, but for the frames in [lost_from, lost_to)."""
+
+    lost_from: int = 0
+    lost_to: int = 0
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        if frame.T_world_camera is None:
+            raise DataError(f"frame {frame.index} has no true pose: choose a tracker that needs none")
+        lost = self.lost_from <= frame.index < self.lost_to
+        return Pose(frame.T_world_camera, lost, "too few points associate" if lost else "")
+
+
+@dataclass
+class KeepAll(ClusterRefiner):
+    """Changes nothing."""
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        return clusters
+
+
+@dataclass
+class GridMap(SceneMap):
+    """Each frame that was fused, as a grid of triangles of its own."""
+
+    vertices: list[np.ndarray] = field(default_factory=list)
+    colors: list[np.ndarray] = field(default_factory=list)
+    ids: list[np.ndarray] = field(default_factory=list)
+    triangles: list[np.ndarray] = field(default_factory=list)
+    classes: tuple[str, ...] = CLASSES
+
+    @property
+    def voxel_count(self) -> int:
+        return sum(map(len, self.vertices))
+
+    @property
+    def byte_count(self) -> int:
+        return 28 * self.voxel_count
+
+    def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
+        depth, normals, color, ids = look(camera, T_world_camera)  # as a perfect map would
+        return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
+
+    def mesh(self) -> InstanceMesh:
+        ids = np.concatenate([np.zeros(0, np.int32), *self.ids])
+        return InstanceMesh(
+            vertices=np.concatenate([np.zeros((0, 3), np.float32), *self.vertices]),
+            triangles=np.concatenate([np.zeros((0, 3), np.int32), *self.triangles]),
+            colors=np.concatenate([np.zeros((0, 3), np.uint8), *self.colors]),
+            instance_ids=ids,
+            class_ids=ids - 1,
+            classes=self.classes,
+        )
+
+    def instances(self) -> Mapping[int, Instance]:
+        mesh = self.mesh()
+        found = {}
+        for key in np.unique(mesh.instance_ids[mesh.instance_ids > 0]).tolist():
+            vertices = np.flatnonzero(mesh.instance_ids == key).astype(np.int32)
+            points = mesh.vertices[vertices].astype(np.float64)
+            low, high = points.min(0), points.max(0)
+            box = Box((low + high) / 2, high - low, np.eye(3))
+            sure = np.array([0.9, 0.1] if key == 1 else [0.2, 0.8], np.float32)
+            found[key] = Instance(key, sure, float(sure.max()), len(self.vertices), 0, 0, vertices, box, box)
+        return found
+
+    def save(self, path: Path) -> None:
+        mesh = self.mesh()
+        with written_whole(path) as temporary:
+            np.savez(
+                temporary,
+                vertices=mesh.vertices,
+                triangles=mesh.triangles,
+                colors=mesh.colors,
+                ids=mesh.instance_ids,
+            )
+
+    @classmethod
+    def load(cls, path: Path) -> GridMap:
+        with np.load(path) as saved:
+            return cls([saved["vertices"]], [saved["colors"]], [saved["ids"]], [saved["triangles"]])
+
+
+@dataclass
+class GridFuser(MapFuser):
+    """Puts each frame beside the others; cluster k is instance k + 1."""
+
+    capacity: int = 100  # frames
+    slow_s: float = 0.0  # how long fusing takes
+
+    def __post_init__(self) -> None:
+        self.scene: GridMap = GridMap()
+
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        time.sleep(self.slow_s)
+        scene = self.scene
+        if len(scene.vertices) >= self.capacity:
+            raise MapFullError(f"the map holds {self.capacity} frames: raise fuser.capacity")
+        height, width = frame.camera.shape
+        v, u = np.divmod(np.arange(height * width), width)
+        points = back_project(frame.camera, np.stack([u, v], 1).astype(np.int32), frame.depth.ravel())
+        ids = np.zeros((height, width), np.int32)
+        ids[clusters.pixels[:, 1], clusters.pixels[:, 0]] = clusters.cluster + 1
+        corner = (np.arange(height - 1)[:, None] * width + np.arange(width - 1)).ravel()
+        below = corner + width
+        triangles = np.concatenate(
+            [np.stack([corner, below, corner + 1], 1), np.stack([corner + 1, below, below + 1], 1)]
+        )
+        scene.triangles.append((triangles + scene.voxel_count).astype(np.int32))
+        scene.vertices.append(np.asarray(transform(pose.T_world_camera, points), np.float32))
+        scene.colors.append(frame.color.reshape(-1, 3))
+        scene.ids.append(ids.ravel())
