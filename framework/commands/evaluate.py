@@ -15,10 +15,10 @@ from framework.commands.command_line import (
     EXIT_FAILED,
     KNOWN_ERRORS,
     arguments,
-    one_line,
     one_line_errors,
     quiet_when_cut_off,
 )
+from framework.configs import one_line
 from framework.evaluation.instances import Transfer
 from framework.records.metrics import MAIN_FIGURES
 from framework.records.reevaluation import Reevaluation, Truth, dataset_of
