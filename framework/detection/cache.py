@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 from framework.data import Array, Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)

@@ -15,7 +15,7 @@ from isal import isal_zlib
 
 from framework.data import Array
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 

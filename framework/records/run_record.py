@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from framework.files.atomic_files import written_whole
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
+from framework.files.whole_files import written_whole
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
 from framework.records.instances_file import write_instances
