@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import logging
-import resource
 import sys
 from collections import Counter
 from collections.abc import Mapping
@@ -131,8 +130,15 @@ def write_timings(path: Path, result: RunResult) -> None:
         writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)
 
 
-def peak_memory() -> int:
-    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so."""
+def peak_memory() -> int | None:
+    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so.
+
+    None on Windows, which has no `resource`.
+    """
+    try:
+        import resource
+    except ImportError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
 
