@@ -26,7 +26,7 @@ from framework.detection.stored_detection import (
     read_score,
 )
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.label_spaces import COCO
 
 _UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's annotation files: 91 were planned, 80 were annotated

@@ -10,6 +10,7 @@ import numpy as np
 from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.evaluation import instances, trajectory
 from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.files.hashing import add_values
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
 
@@ -84,7 +85,7 @@ def _sha256(truth: SceneTruth) -> str:
     """Of all that predictions are compared with."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):
-        digest.update(np.ascontiguousarray(array).data)
+        add_values(digest, array)
     return digest.hexdigest()
 
 

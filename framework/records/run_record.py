@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import logging
-import resource
 import sys
 from collections import Counter
 from collections.abc import Mapping
@@ -16,9 +15,9 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from framework.files.atomic_files import written_whole
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
+from framework.files.whole_files import written_whole
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
 from framework.records.instances_file import write_instances
@@ -131,8 +130,15 @@ def write_timings(path: Path, result: RunResult) -> None:
         writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)
 
 
-def peak_memory() -> int:
-    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so."""
+def peak_memory() -> int | None:
+    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so.
+
+    None on Windows, which has no `resource`.
+    """
+    try:
+        import resource
+    except ImportError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
 

@@ -26,7 +26,7 @@ from tqdm import tqdm
 
 from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 

@@ -16,8 +16,8 @@ from framework.data import Array, Box, Camera, Float32, Int32
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.datasets.scenenn.trajectory_log import write_trajectory_log
 from framework.errors import ConfigError
-from framework.files.atomic_files import written_whole
 from framework.files.ply import write_ply
+from framework.files.whole_files import written_whole
 from framework.geometry import transform
 from framework.label_spaces import SCENENN_TO_COCO
 from framework.synthetic.benchmark import SceneSpec, plan_scene
