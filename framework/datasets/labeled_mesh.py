@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
-from framework.detection.fingerprint import file_hash
+from framework.files.whole_files import file_hash
 from framework.rendering import rasterizer
 from framework.rendering.rasterizer import Rasterizer
 

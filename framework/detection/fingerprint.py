@@ -12,6 +12,7 @@ from pathlib import Path
 
 from framework.errors import ConfigError
 from framework.files.search_paths import candidates
+from framework.files.whole_files import file_hash
 
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Another version may give other last digits."""
@@ -106,9 +107,3 @@ def content_hash(path: Path) -> str:
         name = file.relative_to(found).as_posix()
         digest.update(f"{len(name)}:{name}:{file_hash(file)}".encode())
     return digest.hexdigest()
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 (hex) of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
