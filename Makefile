@@ -7,6 +7,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed # its time says for which pyproject.toml the environment was made
+INSTALLED_DEV := $(VENV)/.installed-dev # likewise with what tests, linter and type checker need
 DEMO := outputs/demo
 
 IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
@@ -26,17 +27,17 @@ demo: $(INSTALLED) ## map the synthetic room, leave the record in outputs/demo
 	@$(BIN)/python -m framework hydra.run.dir=$(DEMO)
 
 .PHONY: test
-test: $(INSTALLED) ## lint, check types, run the tests
+test: $(INSTALLED_DEV) ## lint, check types, run the tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m pytest
 
 .PHONY: install
-install: $(INSTALLED) ## only set up
+install: $(INSTALLED_DEV) ## only set up, for developers
 
 .PHONY: format
-format: $(INSTALLED) ## format the code and mend what the linter can
+format: $(INSTALLED_DEV) ## format the code and mend what the linter can
 	$(BIN)/ruff check --fix
 	$(BIN)/ruff format
 
@@ -48,7 +49,7 @@ clean: ## remove the environment and all caches; outputs stay
 # The first time pip shows its downloads, which are large; later, after a change of pyproject.toml, only what is wrong.
 # PIP_USE_PEP517 spares the older pips a warning about one of Hydra's libraries.
 PIP_INSTALL = PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_USE_PEP517=1 $(BIN)/python -m pip install \
-	$(if $(wildcard $(INSTALLED)),--quiet)
+	$(if $(wildcard $@),--quiet)
 
 # torch by its exact version first: pip then takes a local CPU wheel where the machine offers one.
 $(INSTALLED): pyproject.toml
@@ -56,8 +57,13 @@ $(INSTALLED): pyproject.toml
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv $(VENV)
 	@echo "installing the libraries into $(VENV)"
 	@$(PIP_INSTALL) 'torch==2.13.0'
-	@$(PIP_INSTALL) --editable '.[dev]'
+	@$(PIP_INSTALL) --editable .
 	@touch $(INSTALLED)
+
+$(INSTALLED_DEV): $(INSTALLED)
+	@echo "installing what the tests need"
+	@$(PIP_INSTALL) --editable '.[dev]'
+	@touch $(INSTALLED_DEV)
 
 # What is missing of: Python with venv, git (for the commit in the run records), Open3D's shared libraries.
 define MISSING

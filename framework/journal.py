@@ -85,6 +85,7 @@ class Journal:
     timings: list[StageTime] = field(default_factory=list)
     stopped_by: KeyboardInterrupt | MapFullError | None = None
     frames_began: list[float] = field(default_factory=list)  # s, when each frame was taken
+    lost_for: int = 0  # frames up to the last one
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
@@ -94,7 +95,6 @@ class Journal:
         )
         if not self._bar.disable:
             self._screen.enter_context(logging_redirect_tqdm())
-        self._lost_for = 0  # frames
         self._counted_at = self._started = time.perf_counter()
         return self
 
@@ -135,12 +135,12 @@ class Journal:
         """Keeps the pose; says when tracking gets lost and when it is found again."""
         self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
         if pose.lost:
-            if not self._lost_for:
+            if not self.lost_for:
                 log.warning("frame %d: lost: %s", frame.index, pose.reason or "the tracker gave no reason")
-            self._lost_for += 1
-        elif self._lost_for:
-            log.warning("frame %d: tracked again after %d lost frames", frame.index, self._lost_for)
-            self._lost_for = 0
+            self.lost_for += 1
+        elif self.lost_for:
+            log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
+            self.lost_for = 0
 
     def result(self) -> RunResult:
         """The run as it stands once the loop has ended."""

@@ -16,7 +16,7 @@ from typing import TypeVar
 
 import numba
 
-from framework.data import Detections, Frame
+from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
@@ -55,7 +55,10 @@ class Pipeline:
         with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
             try:
                 for frame, detections in detected:
-                    self.map_frame(frame, detections, journal)
+                    try:
+                        self.map_frame(frame, detections, journal)
+                    except FrameError as error:
+                        journal.frame_skipped(error)
                     if interrupted.is_set():
                         raise KeyboardInterrupt
             except (KeyboardInterrupt, MapFullError) as stop:
@@ -99,22 +102,20 @@ class Pipeline:
             ],
         )
 
-    def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> None:
-        """Track, lift, refine, fuse: what happens to one frame."""
-        try:
-            with journal.timed(frame.index, "track"):
-                pose = self.tracker.track(frame, self.fuser.scene)
-            journal.frame_tracked(frame, pose)
-            if pose.lost:
-                return
-            with journal.timed(frame.index, "lift"):
-                clusters = lift(detections, frame, pose)
-            with journal.timed(frame.index, "refine"):
-                clusters = self.refiner.refine(clusters, frame)
-            with journal.timed(frame.index, "fuse"):
-                self.fuser.fuse(frame, pose, clusters)
-        except FrameError as error:
-            journal.frame_skipped(error)
+    def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
+        """Track, lift, refine, fuse: what happens to one frame. Raises FrameError when it cannot be used."""
+        with journal.timed(frame.index, "track"):
+            pose = self.tracker.track(frame, self.fuser.scene)
+        journal.frame_tracked(frame, pose)
+        if pose.lost:
+            return pose
+        with journal.timed(frame.index, "lift"):
+            clusters = lift(detections, frame, pose)
+        with journal.timed(frame.index, "refine"):
+            clusters = self.refiner.refine(clusters, frame)
+        with journal.timed(frame.index, "fuse"):
+            self.fuser.fuse(frame, pose, clusters)
+        return pose
 
 
 def map_ahead(function: Callable[[Item], Outcome], items: Iterable[Item], ahead: int) -> Generator[Outcome]:

@@ -11,15 +11,15 @@ import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
 
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import OmegaConfBaseException
 
+from framework.configs import one_line
 from framework.errors import InstanceMapError
 
 log = logging.getLogger(__name__)
@@ -52,10 +52,15 @@ def one_line_errors() -> Iterator[None]:
         print("interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
     except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
-        if "debug=true" in sys.argv:
-            traceback.print_exception(error)
+        show_traceback(error)
         print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
+
+
+def show_traceback(error: BaseException) -> None:
+    """Where an error comes from, for whoever asks with `debug=true`; it precedes the line that says what is wrong."""
+    if "debug=true" in sys.argv:
+        traceback.print_exception(error)
 
 
 def quiet_when_cut_off() -> None:
@@ -82,6 +87,7 @@ def print_for_directories(description: str, place: str, write: Callable[[Path], 
             try:
                 print(write(directory))
             except KNOWN_ERRORS as error:
+                show_traceback(error)
                 print(f"error: {one_line(error)}", file=sys.stderr)
                 refused += 1
     if refused:
@@ -123,52 +129,6 @@ def _in_worker() -> bool:
     own = HydraConfig.get()
     of_sweep = not OmegaConf.is_missing(own.job, "num")
     return of_sweep and not str(own.launcher._target_).endswith(".BasicLauncher")
-
-
-def one_line(error: BaseException) -> str:
-    """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
-        return _no_such_option(error)
-    if isinstance(error, OverrideParseException):
-        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
-    if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
-        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
-    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
-        return _joined(f"{error} {error.__cause__}")
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{error.filename}: {error.strerror}"
-    return _joined(str(error)) or type(error).__name__
-
-
-_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
-"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
-
-
-def _no_such_option(error: MissingConfigException) -> str:
-    group, _, name = str(error.missing_cfg_file).rpartition("/")
-    if not group:
-        return _joined(str(error))
-    if group == "hydra/launcher" and name in _EXTRAS:
-        extra = _EXTRAS[name]
-        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
-    options = list(error.options or ())
-    close = get_close_matches(name, options, n=1)
-    suggestion = f"; did you mean {close[0]}?" if close else "."
-    return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
-
-
-def _known_keys(error: OmegaConfBaseException) -> str:
-    """The keys that there are in place of the one that is not."""
-    keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
-    close = get_close_matches(str(error.key), keys, n=1)
-    path = str(error.full_key or error.key)
-    if close:
-        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
-    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
-
-
-def _joined(text: str) -> str:
-    return " ".join(text.split())
 
 
 def _log_error(message: str, error: BaseException | None) -> None:

@@ -22,7 +22,8 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from framework.commands.command_line import arguments, one_line, one_line_errors, quiet_when_cut_off
+from framework.commands.command_line import arguments, one_line_errors, quiet_when_cut_off
+from framework.configs import one_line
 from framework.errors import ConfigError
 from framework.files.search_paths import CONF
 from framework.registry import STAGES, find_class, plugin_fields

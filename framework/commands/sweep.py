@@ -14,7 +14,7 @@ from typing import Any
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 
-from framework.commands.command_line import one_line
+from framework.configs import one_line
 from framework.errors import InstanceMapError
 from framework.files.directory_lock import locked
 from framework.settings import available_cores

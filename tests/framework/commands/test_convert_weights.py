@@ -6,12 +6,12 @@ import sys
 
 import pytest
 import torch
-from tests.framework.detection.mask_rcnn.test_detectron2_checkpoint import synthetic_state
 
 from framework.commands import convert_weights
 from framework.detection.mask_rcnn.network_file import describe_network, load_network
 from framework.label_spaces import COCO
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
+from tests.framework.detection.mask_rcnn.test_detectron2_checkpoint import synthetic_state
 from tests.tiny_mask_rcnn import TINY, tiny_network
 
 

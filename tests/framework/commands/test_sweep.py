@@ -16,8 +16,8 @@ from hydra import compose, initialize_config_dir
 from hydra.errors import MissingConfigException
 from omegaconf import OmegaConf
 
-from framework.commands.command_line import one_line
 from framework.commands.sweep import jobs_at_once
+from framework.configs import one_line
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.records.provenance import config_hash

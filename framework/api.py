@@ -1,0 +1,120 @@
+"""Mapping from Python: the same stages, names and defaults as on the command line."""
+
+from __future__ import annotations
+
+import json
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from framework.configs import composed
+from framework.data import (
+    Box,
+    Camera,
+    Detections,
+    Frame,
+    FrameTruth,
+    Instance,
+    InstanceMesh,
+    PointClusters,
+    Pose,
+    SceneTruth,
+    SurfaceView,
+    View,
+)
+from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
+from framework.journal import Journal, RunResult
+from framework.pipeline import Pipeline
+from framework.registry import build
+from framework.settings import Settings
+
+__all__ = [
+    "Box",
+    "Camera",
+    "ClusterRefiner",
+    "ConfigError",
+    "DataError",
+    "Detections",
+    "Detector",
+    "Frame",
+    "FrameError",
+    "FrameTruth",
+    "Instance",
+    "InstanceMapError",
+    "InstanceMesh",
+    "MapFullError",
+    "MapFuser",
+    "Mapper",
+    "Pipeline",
+    "PointClusters",
+    "Pose",
+    "PoseTracker",
+    "RGBDSequence",
+    "RunResult",
+    "SceneMap",
+    "SceneTruth",
+    "SurfaceView",
+    "View",
+    "load_map",
+]
+
+
+class Mapper:
+    """Maps frames as they come: `Mapper("detector=maskrcnn2go", "fuser.voxel_size=0.02")`.
+
+    The arguments are those of a run on the command line, with its defaults; `dataset` is left out, since the frames are
+    yours. Raises ConfigError for a name or a value that there is not.
+    """
+
+    scene: SceneMap  # the map: mesh(), render(), instances(), save()
+
+    def __init__(self, *overrides: str) -> None:
+        config = composed("~dataset", *overrides)
+        Settings.of(config).apply()
+        self.pipeline = Pipeline(
+            detector=build(Detector, config.detector),
+            tracker=build(PoseTracker, config.tracker),
+            refiner=build(ClusterRefiner, config.refiner),
+            fuser=build(MapFuser, config.fuser),
+        )
+        self.scene = self.pipeline.fuser.scene
+        self._journal = Journal(self.scene, frames_expected=0)
+
+    def add(self, frame: Frame) -> Pose:
+        """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
+
+        Returns the camera's pose; one that is lost was not fused, and the next frames may be found again. Raises
+        FrameError when the frame cannot be used, which leaves the map as it was, and MapFullError at the end of
+        `fuser.max_blocks`.
+        """
+        return self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
+
+    def instances(self) -> Mapping[int, Instance]:
+        """The objects found so far, by id; `scene.classes` names their classes, `scene.mesh()` has their vertices."""
+        return self.scene.instances()
+
+
+def load_map(path: Path | str) -> SceneMap:
+    """The map that a run left behind as map.npz, or that `SceneMap.save` wrote, of whatever fuser.
+
+    Raises DataError when the file is none or was damaged.
+    """
+    from framework.mapping import instance_map
+    from framework.rivals import object_map, open3d_map, semantic_map
+
+    kinds: dict[object, type[SceneMap]] = {
+        instance_map.FORMAT: instance_map.InstanceMap,
+        object_map.FORMAT: object_map.ObjectMap,
+        open3d_map.FORMAT: open3d_map.Open3DMap,
+        semantic_map.FORMAT: semantic_map.SemanticMap,
+    }
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            found = json.loads(file["header"].tobytes())["format"]
+    except (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zipfile.BadZipFile) as error:
+        raise DataError(f"{path} is not a map that can be read: {error}") from error
+    return kinds.get(found, instance_map.InstanceMap).load(path)

@@ -1,0 +1,83 @@
+"""The configs: composing one as the command line does, and saying in one line what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+
+from hydra import compose, initialize_config_dir
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+
+from framework.errors import ConfigError
+from framework.files.search_paths import CONF
+
+
+def composed(*overrides: str, name: str = "config") -> DictConfig:
+    """A main config with these overrides. Raises ConfigError for a name or a value that there is not."""
+    try:
+        with config_directory():
+            return compose(name, [*overrides])
+    except (HydraException, OmegaConfBaseException) as error:
+        raise ConfigError(one_line(error)) from error
+
+
+@contextmanager
+def config_directory() -> Iterator[None]:
+    """Has Hydra compose from our configs, also inside of another program that uses it for itself."""
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer
+
+
+def one_line(error: BaseException) -> str:
+    """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _no_such_option(error)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
+        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return _joined(f"{error} {error.__cause__}")
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return _joined(str(error)) or type(error).__name__
+
+
+_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
+"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
+
+
+def _no_such_option(error: MissingConfigException) -> str:
+    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if not group:
+        return _joined(str(error))
+    if group == "hydra/launcher" and name in _EXTRAS:
+        extra = _EXTRAS[name]
+        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
+    options = list(error.options or ())
+    close = get_close_matches(name, options, n=1)
+    suggestion = f"; did you mean {close[0]}?" if close else "."
+    return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
+
+
+def _known_keys(error: OmegaConfBaseException) -> str:
+    """The keys that there are in place of the one that is not."""
+    keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
+    close = get_close_matches(str(error.key), keys, n=1)
+    path = str(error.full_key or error.key)
+    if close:
+        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
+
+
+def _joined(text: str) -> str:
+    return " ".join(text.split())

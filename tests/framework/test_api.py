@@ -1,0 +1,119 @@
+"""Mapping from Python is what the command does, frame by frame."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+
+import instancemap
+from framework.api import Mapper, load_map
+from framework.configs import composed
+from framework.errors import ConfigError, DataError
+from framework.files.search_paths import CONF
+from framework.geometry import lift
+from framework.interfaces import MapFuser
+from framework.pipeline import Pipeline
+from framework.registry import build
+from tests import registered
+from tests.scenes.corner_room import CornerRoom, pose_at
+
+STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
+
+
+def test_a_mapper_makes_the_map_of_a_run(room: CornerRoom) -> None:
+    mapper = Mapper(*STAGES)
+    poses = [mapper.add(frame) for frame in room]
+    assert not any(pose.lost for pose in poses)
+    np.testing.assert_array_equal(poses[3].T_world_camera, pose_at(3))
+    config = composed("~dataset", *STAGES)
+    stages = {
+        stage: build(registered.STAGES[stage], config[stage]) for stage in registered.STAGES if stage != "dataset"
+    }
+    result = Pipeline(**stages).run(room)
+    ours, of_run = mapper.scene.mesh(), result.scene.mesh()
+    np.testing.assert_array_equal(ours.vertices, of_run.vertices)
+    np.testing.assert_array_equal(ours.instance_ids, of_run.instance_ids)
+    assert list(mapper.instances()) == list(result.scene.instances()) != []
+
+
+def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) -> None:
+    mapper = Mapper(*STAGES)
+    mapper.add(room[0])
+    before = mapper.scene.mesh().vertices
+    with pytest.raises(DataError, match="frame 1 has no pose"):
+        mapper.add(replace(room[1], T_world_camera=None))
+    np.testing.assert_array_equal(mapper.scene.mesh().vertices, before)
+    assert not mapper.add(room[2]).lost
+
+
+@pytest.mark.parametrize(
+    ("override", "said"),
+    [
+        ("detector=nobody", "there is no detector=nobody"),
+        ("fuser.voxel_sise=1", "did you mean fuser.voxel_size?"),
+        ("fuser.voxel_size=-1", "voxel_size must be in"),
+        ("seed=-1", "seed must be a whole number"),
+    ],
+)
+def test_a_name_or_a_value_that_there_is_not_is_one_line(override: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said.replace("?", r"\?")) as refused:
+        Mapper(*STAGES, override)
+    assert "\n" not in str(refused.value)
+
+
+def test_it_works_inside_of_another_program_that_uses_hydra(tmp_path: Path) -> None:
+    (tmp_path / "theirs.yaml").write_text("theirs: 1\n")
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        Mapper(*STAGES)
+        assert compose("theirs").theirs == 1
+
+
+@pytest.mark.parametrize("fuser", registered.names("fuser"))
+def test_any_map_is_read_back(fuser: str, room: CornerRoom, tmp_path: Path) -> None:
+    config = composed("~dataset", f"fuser={fuser}", "fuser.voxel_size=0.04")
+    made: MapFuser = build(MapFuser, config.fuser)  # type: ignore[type-abstract]
+    detector = registered.built("detector", "ground_truth")
+    for frame in room:
+        pose = instancemap.Pose(frame.T_world_camera)
+        made.fuse(frame, pose, lift(detector.detect(frame), frame, pose))
+    made.scene.save(tmp_path / "map.npz")
+    scene = load_map(tmp_path / "map.npz")
+    assert type(scene) is type(made.scene)
+    assert list(scene.instances()) == list(made.scene.instances())
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"[]"])
+def test_what_is_no_map_is_told_in_one_line(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "map.npz").write_bytes(content)
+    with pytest.raises(DataError, match=r"map\.npz is not a map that can be read"):
+        load_map(tmp_path / "map.npz")
+    np.savez(tmp_path / "others.npz", a=np.zeros(3))
+    with pytest.raises(DataError, match=r"others\.npz is not a map that can be read"):
+        load_map(tmp_path / "others.npz")
+
+
+def test_configs_are_those_of_the_command() -> None:
+    assert (CONF / "config.yaml").exists()
+    assert composed("dataset=synthetic").fuser.voxel_size == composed("~dataset").fuser.voxel_size
+
+
+def test_the_help_is_a_page_to_work_from() -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", "import instancemap; help(instancemap)"], capture_output=True, text=True, check=True
+    )
+    for words in ("mapper.add(", "load_map(", "class Mapper", "class Frame", "depth: ", "class MapFuser"):
+        assert words in done.stdout
+
+
+def test_another_package_in_the_way_is_named(tmp_path: Path) -> None:
+    (tmp_path / "framework").mkdir()
+    (tmp_path / "framework" / "__init__.py").touch()
+    code = f"import sys; sys.path.insert(0, {str(tmp_path)!r}); import instancemap"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert f"the package 'framework' at {tmp_path}/framework/__init__.py stands in the way" in done.stderr
