@@ -15,7 +15,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from pathlib import Path
 
 from framework.data import (
@@ -32,7 +31,6 @@ from framework.data import (
     SurfaceView,
     View,
 )
-from framework.detection.fingerprint import fingerprint
 
 
 class RGBDSequence(ABC):
@@ -66,20 +64,9 @@ class Detector(ABC):
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; known once the detector is built
 
-    reads: tuple[str, ...] = tuple(field.name for field in fields(Frame))
-    """The fields of a frame that `detect` looks at. One that names fewer shares more of the detection cache."""
-
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
         """The objects in `frame`. The same frame gives the same detections, in whatever order frames come."""
-
-    def fingerprint(self) -> str:
-        """A hash of all that the detections depend on beside the frame: the detection cache's key.
-
-        As it is, it covers class, code, parameters and what Path parameters name. A detector that gets weights in
-        another way (by a name from the network, or through an address in a str) adds their hash.
-        """
-        return fingerprint(self)
 
 
 class PoseTracker(ABC):

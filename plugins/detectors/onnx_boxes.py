@@ -19,6 +19,8 @@ from framework.parameters import require
 
 log = logging.getLogger(__name__)
 
+YOLOX_NANO = "d39bee73564e338080378b0ad567fbb40e818b55bbfaf971de82a0267ed16b8a"
+
 
 @dataclass
 class OnnxBoxes(Detector):
@@ -30,10 +32,8 @@ class OnnxBoxes(Detector):
     `boxes_without_depth`. The parameters of the default network are those of YOLOX-nano (Megvii, COCO).
     """
 
-    weights: Path = Path(
-        "../shared/weights/yolox_nano/yolox_nano.onnx"
-    )  # relative: to the working, then project folder
-    sha256: str = ""  # what the file must have; "" = whatever it is
+    weights: Path = Path("../shared/weights/yolox_nano/yolox_nano.onnx")  # relative: to the working, project folder
+    sha256: str = YOLOX_NANO  # what the file must have; "" = whatever it is
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
     layout: Layout = Layout.yolox  # what the outputs are
     score_threshold: float = 0.1  # in (0, 1): low, for weak detections may still update instances that exist

@@ -78,7 +78,7 @@ def tiny(folder, layout, **parameters):
     labels = folder / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(folder / "tiny.onnx", (1, 3, *SHAPE), outputs_of(layout))
-    return OnnxBoxes(weights=weights, labels=str(labels), layout=layout, device="cpu", **parameters)
+    return OnnxBoxes(weights=weights, sha256="", labels=str(labels), layout=layout, device="cpu", **parameters)
 
 
 @pytest.mark.parametrize("runtime", RUNTIMES)
@@ -105,7 +105,13 @@ def test_where_the_image_lies_in_the_input_is_undone(tmp_path, placement):
     labels = tmp_path / "labels.txt"
     labels.write_text("cup\nchair")
     detector = OnnxBoxes(
-        weights=weights, labels=str(labels), layout=Layout.yolo, placement=placement, device="cpu", min_readings=1.0
+        weights=weights,
+        sha256="",
+        labels=str(labels),
+        layout=Layout.yolo,
+        placement=placement,
+        device="cpu",
+        min_readings=1.0,
     )
     # at this significance everything in the box is foreground: the mask is the box
     flat = replace(frame(), depth=np.ones((120, 160), np.float32))
@@ -132,7 +138,7 @@ def test_two_boxes_of_one_thing_come_back_as_the_better(tmp_path):
     labels = tmp_path / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": rows[None]})
-    parameters = {"weights": weights, "labels": str(labels), "layout": Layout.yolo, "device": "cpu"}
+    parameters = {"weights": weights, "sha256": "", "labels": str(labels), "layout": Layout.yolo, "device": "cpu"}
     np.testing.assert_allclose(OnnxBoxes(**parameters).detect(frame()).scores, [0.6])
     np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms=1.0).detect(frame()).scores, [0.6, 0.5])
 
@@ -140,7 +146,7 @@ def test_two_boxes_of_one_thing_come_back_as_the_better(tmp_path):
 def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_path):
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": np.zeros((1, 6, 9))})
     with pytest.raises(DataError, match="84 columns"):
-        OnnxBoxes(weights=weights, layout=Layout.yolo, device="cpu")
+        OnnxBoxes(weights=weights, sha256="", layout=Layout.yolo, device="cpu")
     (tmp_path / "labels.txt").write_text("chair\nflibbertigibbet")
     with pytest.raises(ConfigError, match="flibbertigibbet"):
         OnnxBoxes(weights=weights, labels=str(tmp_path / "labels.txt"), layout=Layout.yolo, device="cpu")
