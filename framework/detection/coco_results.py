@@ -1,6 +1,7 @@
 """COCO's result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
 
-Beside COCO's own keys an entry may have `category_name`, and `class_probabilities`: the whole distribution.
+Beside COCO's own keys an entry may have `category_name`, and `class_probabilities`: the whole distribution. pycocotools
+reads such a file only beside the annotations of its images, and trusts its entries.
 """
 
 from __future__ import annotations

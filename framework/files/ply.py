@@ -1,4 +1,7 @@
-"""Triangle meshes as PLY files: any of the format's three encodings is read, little-endian binary is written."""
+"""Triangle meshes as PLY files: any of the format's three encodings is read, little-endian binary is written.
+
+Hand-written, for Open3D crashes the process on some malformed files, and plyfile is GPL.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Trajectories in the TUM format: a line a pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, metres, seconds."""
+"""Trajectories in the TUM format: a line a pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, metres, seconds.
+
+Hand-written, for evo, which reads them too, is GPL.
+"""
 
 from __future__ import annotations
 
