@@ -88,7 +88,7 @@ class ClusterRefiner(ABC):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         """Points in, points out. `pixels` say where in `frame` each point was seen; N may change.
 
-        Clusters that are `exact` come back as they are: cleaning the truth could only damage it.
+        Clusters that are `exact` never get here: `framework.refinement.refine` passes them on.
         """
 
 

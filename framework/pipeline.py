@@ -21,6 +21,7 @@ from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from framework.journal import Journal, RunResult, StageTime
+from framework.refinement.refine import refine
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -112,7 +113,7 @@ class Pipeline:
         with journal.timed(frame.index, "lift"):
             clusters = lift(detections, frame, pose)
         with journal.timed(frame.index, "refine"):
-            clusters = self.refiner.refine(clusters, frame)
+            clusters = refine(self.refiner, clusters, frame)
         with journal.timed(frame.index, "fuse"):
             self.fuser.fuse(frame, pose, clusters)
         return pose

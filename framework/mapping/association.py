@@ -17,7 +17,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, PointClusters
-from framework.errors import DataError
+from framework.geometry import require_pixels_inside
 from framework.mapping.evidence import Evidence, best_instance
 from framework.mapping.sensor import Pinhole, seen_point
 from framework.mapping.voxel_grid import Grid, find_block
@@ -59,19 +59,6 @@ class Overlaps:
         otherwise overlap it completely, and win it from the instance that it belongs to.
         """
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), least)
-
-
-def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raises DataError when a cluster's pixel lies outside the (height, width) image.
-
-    A refiner made it up then, and kernels do not check bounds.
-    """
-    u, v = clusters.pixels.T
-    if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
-        raise DataError(
-            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
-            f"v in [{v.min()}, {v.max()}]"
-        )
 
 
 class PixelLists(NamedTuple):

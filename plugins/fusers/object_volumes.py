@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
-from framework.mapping.association import OverlapRule, Overlaps, count_overlaps, require_pixels_inside
+from framework.geometry import require_pixels_inside
+from framework.mapping.association import OverlapRule, Overlaps, count_overlaps
 from framework.mapping.instance_fuser import VOTES_ACROSS
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceRecord
