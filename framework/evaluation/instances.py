@@ -24,6 +24,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
+import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -313,8 +314,8 @@ def carry(points: Float32, labels: Int32, targets: Float32, max_distance: float)
     order = np.lexsort((labels, points[:, 2], points[:, 1], points[:, 0]))
     points, labels = points[order], labels[order]
     tree = cKDTree(points, balanced_tree=False)
-    # the bound is exclusive in SciPy
-    _, nearest = tree.query(targets, distance_upper_bound=np.nextafter(max_distance, np.inf), workers=-1)
+    bound = np.nextafter(max_distance, np.inf)  # exclusive in SciPy
+    _, nearest = tree.query(targets, distance_upper_bound=bound, workers=numba.get_num_threads())
     carried: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy answers "none" with the index after the last
     return carried
 
