@@ -24,7 +24,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
-import numba
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -310,6 +309,8 @@ def carry(points: Float32, labels: Int32, targets: Float32, max_distance: float)
     """The label of the nearest of `points` for each target, 0 where none is within `max_distance`."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
+    import numba  # here: commands that only read figures are answered before it loads
+
     # Meshes come in an order that differs between runs: sorted, equally near points give the same label each time.
     order = np.lexsort((labels, points[:, 2], points[:, 1], points[:, 0]))
     points, labels = points[order], labels[order]

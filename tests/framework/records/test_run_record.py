@@ -84,7 +84,15 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
         *("instances.count", "instances.ap50", "instances.ap25", "instances.ap50.chair", "instances.ap50.couch"),
         *("instances.ap25.chair", "instances.ap.chair", "instances.true_count.chair", "annotation_release"),
         *("instances.ap50_agnostic", "instances.mean_iou", "trajectory.ate_rmse_m", "trajectory.rpe_rmse_m"),
-        *("seed", "config_hash", "git_commit", "environment.python", "environment.torch", "environment.cpus"),
+        *(
+            "seed",
+            "config_hash",
+            "inputs_sha256",
+            "git_commit",
+            "environment.python",
+            "environment.torch",
+            "environment.cpus",
+        ),
     }
     assert (metrics["frames"], metrics["instances.count"], metrics["instances.ap50"]) == (6, 2, 1.0)
     assert metrics["trajectory.ate_rmse_m"] == pytest.approx(0, abs=1e-9)
