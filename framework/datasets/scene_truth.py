@@ -54,7 +54,7 @@ class _VoteTable:
         self.ids = np.zeros(capacity, np.int32)
         self.votes = np.zeros(capacity, np.int64)
         self.sums = np.zeros((capacity, 3))  # of the points' coordinates, m
-        self.first = np.zeros(capacity, np.int64)  # order of first buffer
+        self.first = np.zeros(capacity, np.int64)  # order of first sight
 
     def add(self, view: LabeledDepth, truth_voxel: float) -> None:
         pixels = view.depth.size
@@ -83,7 +83,7 @@ class _VoteTable:
         _move(*old, self.keys, self.ids, self.votes, self.sums, self.first)
 
     def elect(self) -> tuple[Float32, Int32]:
-        """Each voxel's mean point (V, 3) and majority id (V,), in the order of first buffer."""
+        """Each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
         slots = np.flatnonzero(self.votes)
         best_first = slots[np.lexsort((self.ids[slots], -self.votes[slots], self.keys[slots]))]
         voxel = self.keys[best_first]
