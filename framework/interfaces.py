@@ -72,6 +72,8 @@ class Detector(ABC):
 class PoseTracker(ABC):
     """Estimates the camera pose."""
 
+    pose_source: str = "tracked"  # for tables; `ground_truth` of a tracker that returns the sequence's own poses
+
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         """The pose of `frame`; called once per frame, in order. `scene` is read only.

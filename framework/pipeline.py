@@ -52,7 +52,7 @@ class Pipeline:
         """
         if len(sequence) == 0:
             raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
-        journal = Journal(self.fuser.scene, len(sequence))
+        journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
         with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
             try:
                 for frame, detections in detected:

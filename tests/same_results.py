@@ -13,7 +13,7 @@ import sys
 from pathlib import Path
 
 FILES = ("mesh.ply", "map.npz", "trajectory.txt", "instances.json", "overview.png", "refined.png")
-NOT_RESULTS = ("fps", "stage_ms.", "peak_rss", "environment.", "git_", "config_hash", "time.", "code")
+NOT_RESULTS = ("fps", "stage_ms.", "peak_rss", "environment.", "git_", "config_hash", "inputs_sha256", "time.", "code")
 
 
 def results(directory: Path) -> dict[str, object]:

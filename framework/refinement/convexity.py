@@ -36,7 +36,7 @@ class Limits:
 
     noise_factor: float  # standard deviations of depth that count as noise
     min_noise: float  # m, least standard deviation of depth, where readings come in coarser steps than the sensor's
-    max_slope: float  # change of depth over the distance across the line of buffer, m per m
+    max_slope: float  # change of depth over the distance across the line of sight, m per m
     max_angle: float  # rad, by which a surface may bend towards the camera; what noise may bend it by comes on top
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d
-from numba import njit
+from numba import get_num_threads, njit
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
 
@@ -24,10 +24,9 @@ class Hits:
 
 
 class RayCaster:
-    """Casts rays at a fixed triangle mesh. Safe to call from several threads."""
+    """Casts rays at a fixed triangle mesh, by as many threads as numba has. Safe to call from several threads."""
 
-    def __init__(self, vertices: Float32, triangles: Int32, threads: int = 0) -> None:
-        self._threads = threads  # that cast rays, 0 = one for each core
+    def __init__(self, vertices: Float32, triangles: Int32) -> None:
         # One thread builds the tree, so that ties between triangles are always decided alike.
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
@@ -37,7 +36,7 @@ class RayCaster:
 
     def cast(self, rays: Float32) -> Hits:
         """The first hits of rays (..., 6), origin and direction."""
-        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), self._threads)
+        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
         return Hits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
@@ -45,7 +44,7 @@ class RayCaster:
         """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         tensor = o3d.core.Tensor.from_numpy(rays)
-        return np.asarray(self._scene.test_occlusions(tensor, 1e-3, 0.999, self._threads).numpy())
+        return np.asarray(self._scene.test_occlusions(tensor, 1e-3, 0.999, get_num_threads()).numpy())
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:

@@ -29,9 +29,9 @@ class Rendering:
 class Renderer:
     """Renders `surfaces` under `lamps`, whose light is baked once. Safe to call from several threads."""
 
-    def __init__(self, surfaces: Surfaces, lamps: list[Lamp], casting_threads: int = 0) -> None:
+    def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
-        self.caster = RayCaster(surfaces.vertices, surfaces.triangles, casting_threads)
+        self.caster = RayCaster(surfaces.vertices, surfaces.triangles)
         self._lit = lit(surfaces, bake(surfaces, self.caster, lamps))
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 

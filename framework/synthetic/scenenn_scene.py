@@ -99,7 +99,7 @@ class SceneNNScene:
         self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
         scene = plan_scene(spec, self._stream, recording.frames)
         self.room, self.path = scene.room, scene.path
-        self.renderer = Renderer(self.room.surfaces, list(self.room.lamps), casting_threads=1)
+        self.renderer = Renderer(self.room.surfaces, list(self.room.lamps))
         self._sensor = DepthSensor(NOISE, MAX_RANGE)
         ids = 1 + scene.rng.choice(LARGEST_ID, len(self.room.objects), replace=False)
         ids[0] = 0  # the shell is no instance

@@ -1,4 +1,4 @@
-"""Aligning a frame to a view of the map: point-to-plane and photometric terms, eq. 2 of the method.
+"""Aligning a frame to a view of the map: point-to-plane and photometric terms, as ElasticFusion (Whelan et al. 2015).
 
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 

@@ -134,6 +134,7 @@ class SphereDetector(Detector):
 class GivenPose(PoseTracker):
     """Passes the true pose on, but for the frames in [lost_from, lost_to)."""
 
+    pose_source = "ground_truth"
     lost_from: int = 0
     lost_to: int = 0
 
