@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d
-from numba import get_num_threads, njit
+from numba import get_num_threads
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
 
@@ -53,24 +53,13 @@ def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) 
     The direction has length 1 along the optical axis, so that the distance of a hit is its depth.
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    shape = np.broadcast_shapes(x.shape, y.shape)
-    rays = np.empty((*shape, 6), np.float32)
-    T_world_camera = np.ascontiguousarray(T_world_camera, np.float64)
-    _write_rays(np.broadcast_to(x, shape), np.broadcast_to(y, shape), T_world_camera, rays)
+    rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)
+    for axis, (to_right, down, ahead, at) in enumerate(T_world_camera[:3]):  # BLAS might round by number of threads
+        rays[..., axis] = at
+        rays[..., 3 + axis] = to_right * x + (down * y + ahead)
     return rays
 
 
 def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
     """The rays (H, W, 6) through all pixel centres."""
     return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])
-
-
-@njit(cache=True, nogil=True)
-def _write_rays(x: Float64, y: Float64, T_world_camera: Float64, rays: Float32) -> None:
-    """Without BLAS: its rounding may depend on the number of threads."""
-    T = T_world_camera
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            for c in range(3):
-                rays[i, j, c] = T[c, 3]
-                rays[i, j, 3 + c] = T[c, 0] * x[i, j] + (T[c, 1] * y[i, j] + T[c, 2])
