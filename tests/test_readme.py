@@ -121,13 +121,17 @@ def test_every_command_composes(command: str) -> None:
 
 
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
+OWN = [
+    "dataset=rgbd_folder",
+    "dataset.root=DIR",
+]  # smaller still, and no room has to be furnished
 DEFAULTS = "python -m framework"
 RUNNABLE = {  # what to append, by a command that then takes seconds
     DEFAULTS: [*SMALL, "hydra.run.dir=defaults"],
     "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=simulated"],
-    "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*SMALL, "hydra.run.dir=coarse"],
-    "python -m framework -m refiner=identity,kmeans,gmm_em": [*SMALL, "hydra.sweep.dir=outputs/table3_map"],
-    "python -m framework detection_cache=read_write refiner=kmeans": [*SMALL, "hydra.run.dir=cached"],
+    "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
+    "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
+    "python -m framework detection_cache=read_write refiner=kmeans": [*OWN, "hydra.run.dir=cached"],
     "python -m framework detect dataset=synthetic detector=simulated out=detections.json": SMALL,
     "python -m framework show-refinement dataset=synthetic detector=simulated frame=24 out=refinement.png": [
         *SMALL,
