@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import random
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -37,6 +40,23 @@ def shared_data(shared: Path) -> Path:
     if not (shared / "data").is_dir():
         pytest.skip(f"{shared / 'data'} is not there")
     return shared / "data"
+
+
+@pytest.fixture(scope="session")
+def ready(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
+    """Builds an option with what only a user has. Skips where a package or ../shared is not there, and only there."""
+    from tests import option_files, registered
+
+    made = functools.cache(lambda *option: option_files.overrides(*option, tmp_path_factory.mktemp(option[1])))
+
+    def build(stage: str, name: str) -> Any:
+        if weights := option_files.SHARED_WEIGHTS.get((stage, name)):
+            path = request.getfixturevalue("shared") / "weights" / weights
+            if not path.exists():
+                pytest.skip(f"{path} is not there")
+        return registered.built(stage, name, *made(stage, name))
+
+    return build
 
 
 @pytest.fixture

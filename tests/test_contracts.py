@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -10,19 +11,14 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Frame, FrameTruth, PointClusters, Pose
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
-from tests import detector_files, registered
+from tests import registered
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 from tests.thread_counts import by_one_thread_and_two
 
-
-def built(stage: str, name: str, *overrides: str) -> Any:
-    try:
-        return registered.built(stage, name, *overrides)
-    except (DataError, ConfigError) as absent:
-        pytest.skip(str(absent))
+Ready = Callable[[str, str], Any]
 
 
 def same(a: object, b: object) -> bool:
@@ -36,9 +32,9 @@ def same(a: object, b: object) -> bool:
 # Datasets
 
 
-@pytest.fixture(params=registered.names("dataset"))
-def sequence(request: pytest.FixtureRequest) -> RGBDSequence:
-    sequence: RGBDSequence = built("dataset", request.param)
+@pytest.fixture(params=registered.names("dataset"), scope="module")
+def sequence(request: pytest.FixtureRequest, ready: Ready) -> RGBDSequence:
+    sequence: RGBDSequence = ready("dataset", request.param)
     return sequence
 
 
@@ -46,6 +42,7 @@ def test_dataset_gives_frames_of_its_camera(sequence: RGBDSequence) -> None:
     assert sequence.name
     assert len(sequence) > 0
     frame = sequence[0]
+    assert frame.T_world_camera is not None, "the tests' recordings have poses"
     assert frame.camera == sequence.camera
     assert (frame.depth > 0).any()
     assert same(frame, sequence[0])
@@ -60,8 +57,8 @@ def test_dataset_is_in_order(sequence: RGBDSequence) -> None:
 
 
 @pytest.fixture(params=registered.names("detector"))
-def detector(request: pytest.FixtureRequest, tmp_path: Path) -> Detector:
-    detector: Detector = built("detector", request.param, *detector_files.overrides(request.param, tmp_path))
+def detector(request: pytest.FixtureRequest, ready: Ready) -> Detector:
+    detector: Detector = ready("detector", request.param)
     return detector
 
 
@@ -116,8 +113,8 @@ def test_detector_needs_no_truth_or_says_so(detector: Detector) -> None:
 
 
 @pytest.fixture(params=registered.names("tracker"))
-def tracker(request: pytest.FixtureRequest) -> PoseTracker:
-    tracker: PoseTracker = built("tracker", request.param)
+def tracker(request: pytest.FixtureRequest, ready: Ready) -> PoseTracker:
+    tracker: PoseTracker = ready("tracker", request.param)
     return tracker
 
 
@@ -165,8 +162,8 @@ def test_tracker_survives_a_frame_without_depth(tracker: PoseTracker, room: Corn
 
 
 @pytest.fixture(params=registered.names("refiner"))
-def refiner(request: pytest.FixtureRequest) -> ClusterRefiner:
-    refiner: ClusterRefiner = built("refiner", request.param)
+def refiner(request: pytest.FixtureRequest, ready: Ready) -> ClusterRefiner:
+    refiner: ClusterRefiner = ready("refiner", request.param)
     return refiner
 
 
@@ -229,8 +226,8 @@ def test_refiner_takes_empty_and_tiny_clusters(refiner: ClusterRefiner, room: Co
 
 
 @pytest.fixture(params=registered.names("fuser"))
-def fuser(request: pytest.FixtureRequest) -> MapFuser:
-    fuser: MapFuser = built("fuser", request.param)
+def fuser(request: pytest.FixtureRequest, ready: Ready) -> MapFuser:
+    fuser: MapFuser = ready("fuser", request.param)
     return fuser
 
 

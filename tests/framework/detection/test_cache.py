@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -37,7 +38,7 @@ from framework.interfaces import Detector
 from framework.label_spaces import COCO
 from framework.rendering.rasterizer import Rasterizer
 from plugins.detectors.simulated import SimulatedDetector
-from tests import detector_files, registered
+from tests import registered
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector
 
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -247,12 +248,11 @@ def test_reading_a_field_that_there_is_not_is_told(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", registered.names("detector"))
-def test_detectors_read_no_more_than_they_say(name: str, room: CornerRoom, tmp_path: Path) -> None:
+def test_detectors_read_no_more_than_they_say(
+    name: str, ready: Callable[..., Detector], room: CornerRoom, tmp_path: Path
+) -> None:
     """Else the cache would give one frame's detections to another."""
-    try:
-        detector = registered.built("detector", name, *detector_files.overrides(name, tmp_path))
-    except (DataError, ConfigError) as absent:
-        pytest.skip(str(absent))
+    detector = ready("detector", name)
     frame = room[1]
     others = {
         "index": 7,

@@ -27,139 +27,18 @@ from tests.test_contracts import (  # noqa: F401
     test_detector_returns_distributions_and_masks_in_the_image,
     test_detector_takes_a_blank_image,
 )
+from tests.tiny_transformers import FIXED, LABELS, MODELS, write_network
 
 transformers = pytest.importorskip("transformers")
 
-LABELS = ("chair", "wall", "sofa", "armchair", "tv", "LABEL_5")
 CLASSES = ("chair", "couch", "tv")
 MEANING = {0: 0, 2: 1, 3: 0, 4: 2}  # label -> index in CLASSES
-STAGES = ["stage1", "stage2", "stage3", "stage4"]
-SWIN = {
-    "model_type": "swin",
-    "image_size": 32,
-    "embed_dim": 8,
-    "depths": [1] * 4,
-    "num_heads": [1, 1, 2, 2],
-    "window_size": 4,
-    "out_features": STAGES,
-}
-RESNET = {
-    "model_type": "resnet",
-    "embedding_size": 8,
-    "hidden_sizes": [8, 8, 16, 16],
-    "depths": [1] * 4,
-    "out_features": STAGES,
-}
-DINO = {
-    "model_type": "rf_detr_dinov2",
-    "hidden_size": 16,
-    "num_hidden_layers": 2,
-    "num_attention_heads": 2,
-    "image_size": 64,
-    "patch_size": 16,
-    "num_windows": 2,
-    "out_features": STAGES[:2],
-}
-DETR = {
-    "encoder_layers": 1,
-    "decoder_layers": 1,
-    "encoder_attention_heads": 8,
-    "decoder_attention_heads": 8,
-    "encoder_ffn_dim": 32,
-    "decoder_ffn_dim": 32,
-    "d_model": 32,
-    "num_queries": 12,
-    "backbone_config": RESNET,
-}
-EOMT = {
-    "hidden_size": 16,
-    "num_hidden_layers": 2,
-    "num_attention_heads": 2,
-    "image_size": 64,
-    "patch_size": 16,
-    "num_blocks": 1,
-    "num_queries": 12,
-    "num_register_tokens": 1,
-}
-MODELS = {
-    "mask2former": (
-        "Mask2FormerForUniversalSegmentation",
-        {
-            "backbone_config": SWIN,
-            "feature_size": 32,
-            "mask_feature_size": 32,
-            "hidden_dim": 32,
-            "encoder_feedforward_dim": 32,
-            "dim_feedforward": 32,
-            "encoder_layers": 1,
-            "decoder_layers": 2,
-            "num_attention_heads": 2,
-            "num_queries": 12,
-        },
-    ),
-    "maskformer": (
-        "MaskFormerForInstanceSegmentation",
-        {
-            "backbone_config": SWIN,
-            "decoder_config": {"model_type": "detr", **DETR},
-            "fpn_feature_size": 32,
-            "mask_feature_size": 32,
-        },
-    ),
-    "eomt": ("EomtForUniversalSegmentation", EOMT),
-    "eomt_dinov3": ("EomtDinov3ForUniversalSegmentation", {**EOMT, "intermediate_size": 32}),
-    "detr": ("DetrForSegmentation", DETR),
-    "rf_detr": (
-        "RfDetrForInstanceSegmentation",
-        {
-            "backbone_config": DINO,
-            "d_model": 16,
-            "decoder_layers": 1,
-            "decoder_self_attention_heads": 2,
-            "decoder_cross_attention_heads": 2,
-            "decoder_ffn_dim": 32,
-            "num_queries": 12,
-            "group_detr": 1,
-            "decoder_n_points": 2,
-            "intermediate_size": 32,
-        },
-    ),
-}
-FIXED = {"height": 64, "width": 64}
-PREPROCESSING = {
-    "mask2former": {"size": {"shortest_edge": 48, "longest_edge": 80}, "size_divisor": 32},
-    "maskformer": {"size": 48, "max_size": 100, "size_divisibility": 32},
-    "eomt": {"size": {"shortest_edge": 64, "longest_edge": 64}, "do_pad": True},
-    "eomt_dinov3": {"size": {"shortest_edge": 64, "longest_edge": 64}, "do_pad": True},
-    "detr": {"size": {"shortest_edge": 64, "longest_edge": 90}},
-    "rf_detr": {"size": FIXED},
-}
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
 @pytest.fixture(scope="session")
 def folders(tmp_path_factory):
-    """A random network of each family, spread so that classes and masks differ from query to query."""
-    found = {}
-    for kind, (name, parameters) in MODELS.items():
-        torch.manual_seed(3)
-        model_class = getattr(transformers, name)
-        config = model_class.config_class(**parameters, id2label=dict(enumerate(LABELS)), num_labels=len(LABELS))
-        model = model_class(config)
-        with torch.no_grad():
-            for key, weights in model.named_parameters():
-                spread = 3.0 if "quer" in key else 0.7
-                if (
-                    any(part in key for part in ("class", "quer", "mask", "bbox_attention", "decoder.layers"))
-                    and "norm" not in key
-                ):
-                    weights.copy_(torch.randn_like(weights) * spread)
-        found[kind] = tmp_path_factory.mktemp(kind)
-        model.save_pretrained(found[kind])
-        kind_of_processor = {"eomt": "EomtImageProcessor", "eomt_dinov3": "EomtImageProcessorFast"}
-        content = {**PREPROCESSING[kind], "image_processor_type": kind_of_processor.get(kind, "Other")}
-        (found[kind] / "preprocessor_config.json").write_text(json.dumps(content))
-    return found
+    return {kind: write_network(tmp_path_factory.mktemp(kind), kind) for kind in MODELS}
 
 
 def built(folder, **parameters):
