@@ -122,8 +122,8 @@ def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
 def membership(clusters: PointClusters, frame: Frame) -> csr_array:
     """(N, H * W) 1 where a cluster has a point at the pixel."""
     held = clusters.cluster >= 0
-    places = clusters.cluster[held], pixel_index(clusters, frame)[held]
-    return csr_array((np.ones(held.sum(), np.int32), places), (len(clusters), frame.depth.size))
+    entries = clusters.cluster[held], pixel_index(clusters, frame)[held]
+    return csr_array((np.ones(held.sum(), np.int32), entries), (len(clusters), frame.depth.size))
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:

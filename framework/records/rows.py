@@ -64,12 +64,12 @@ class Row:
 
     @property
     def pose_source(self) -> str:
-        return self._told("pose_source")
+        return self._distinct("pose_source")
 
     @property
     def poses(self) -> str:
         """The pose source in words, and the tracker where there was one."""
-        tracked = {"tracked": f"tracked ({self._told(f'{CHOICE}tracker')})"}
+        tracked = {"tracked": f"tracked ({self._distinct(f'{CHOICE}tracker')})"}
         return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
 
     @property
@@ -77,7 +77,7 @@ class Row:
         """The release of the true instances; "" = the dataset does not say."""
         return "/".join(sorted({record.annotation for record in self.records.values()}))
 
-    def _told(self, key: str) -> str:
+    def _distinct(self, key: str) -> str:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 
     def values(self, column: str) -> dict[Run, float]:
@@ -88,7 +88,7 @@ class Row:
     def mean(self, column: str) -> Mean:
         return Mean.of(self.values(column).values())
 
-    def less(self, base: Row, column: str) -> dict[Run, float]:
+    def differences(self, base: Row, column: str) -> dict[Run, float]:
         """This row's figure less the base's, for the runs that both rows have.
 
         Runs of one seed have the same room and the same detections: most of what varies between seeds cancels.

@@ -39,7 +39,7 @@ class Hits:
         """(H, W, 3) m, 0 where nothing is seen."""
         return self.interpolated(self.vertices)
 
-    def every(self, n: int) -> Hits:
+    def subsampled(self, n: int) -> Hits:
         """The picture of each n-th pixel."""
         seen, c = self.buffer, self.camera
         triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])

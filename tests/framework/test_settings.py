@@ -56,7 +56,7 @@ def test_libraries_that_are_told_their_threads_at_each_call_obey(monkeypatch: py
     before = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
-        instances.carry(triangle, np.arange(3, dtype=np.int32), triangle, 0.1)
+        instances.transfer_labels(triangle, np.arange(3, dtype=np.int32), triangle, 0.1)
         caster.cast(np.ones((1, 6), np.float32))
     finally:
         numba.set_num_threads(before)
