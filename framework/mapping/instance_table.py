@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.data import Float32, Float64
+from framework.data import Float32, Float64, Int32
 from framework.mapping.evidence import Combine
 
 
@@ -83,6 +83,13 @@ class InstanceTable:
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
+
+    def class_ids(self) -> Int32:
+        """(ids + 1,) the most likely class of each instance, by id; -1 for none."""
+        class_ids = np.full(self.last_id + 1, -1, np.int32)
+        for record in self.records.values():
+            class_ids[record.id] = record.class_evidence.argmax()
+        return class_ids
 
 
 def _combined(old: Float64, new: Float64, combine: Combine) -> Float64:

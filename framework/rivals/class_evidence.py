@@ -24,9 +24,9 @@ from numba import njit, prange
 
 from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
-from framework.mapping.association import PixelLists
 from framework.mapping.evidence import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS, best_first, named_classes
 from framework.mapping.integration import SeenBlocks
+from framework.mapping.pixel_lists import PixelLists
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
 MOST_FRAMES = np.uint16(65535)  # that a voxel counts

@@ -10,19 +10,21 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import lift
+from framework.interfaces import MapFuser
 from framework.mapping.association import OverlapRule
-from framework.mapping.instance_fuser import InstanceFuser, floored_log
+from framework.mapping.label_rule import floored_log
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.scenes.analytic_scene import CAMERA, Scene, room, walk
 from tests.true_masks import fuse_masks, masks_of
 
-NewFuser = Callable[..., InstanceFuser]
+NewFuser = Callable[..., MapFuser]
 
 
 @pytest.fixture(params=[BayesianTsdf, Open3DVoxelBlockGrid], ids=["our voxels", "Open3D's voxels"])
 def new_fuser(request: pytest.FixtureRequest) -> NewFuser:
-    return lambda **parameters: request.param(**{"voxel_size": 0.02, "max_depth": 4.0} | parameters)
+    return lambda **parameters: assemble(request.param, **{"voxel_size": 0.02, "max_depth": 4.0} | parameters)
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +101,10 @@ def test_two_halves_become_one_when_they_are_seen_as_one(new_fuser: NewFuser, fr
     [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # where a vote is a vote, the other half is soon outvoted
 )
 def test_two_instances_that_keep_lying_under_one_cluster_are_merged(
-    fuser_class: type[InstanceFuser], merge_frames: int, frames: list[Frame]
+    fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
     """Weak detections of the whole, which would take long to outvote the voxels of the other half."""
-    fuser = fuser_class(voxel_size=0.02, max_depth=4.0, merge_frames=merge_frames)
+    fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
     left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
