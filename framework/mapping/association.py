@@ -207,7 +207,7 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, lea
         table.observe(int(instance_ids[k]), class_evidence[k], float(scores[k]), matches.frame_index)
     in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= least].tolist())
     for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
-        table.records[instance_id].visible += 1
+        table.records[instance_id].in_view.add(matches.frame_index)
 
 
 @dataclass

@@ -21,7 +21,7 @@ from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
 
-FORMAT = 4  # of the saved file; a change of meaning counts it up
+FORMAT = 5  # of the saved file; a change of meaning counts it up
 ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
 
 

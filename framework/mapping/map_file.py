@@ -17,7 +17,7 @@ from framework.data import Array
 from framework.errors import DataError
 from framework.files.atomic_files import written_whole
 from framework.mapping.evidence import Combine
-from framework.mapping.instance_table import InstanceRecord, InstanceTable
+from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceTable
 
 DEFLATE_LEVEL = 1  # of ISA-L: at most 5 % larger than zlib's level 1, in a sixth of its time
 
@@ -78,6 +78,7 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
                 **asdict(record),
                 "class_evidence": record.class_evidence.tolist(),
                 "observed_in": sorted(record.observed_in),
+                "in_view": record.in_view.spans,
             }
             for record in table.records.values()
         ],
@@ -89,7 +90,9 @@ def table_of(plain: Mapping[str, Any]) -> InstanceTable:
     table = InstanceTable(Combine[plain["combine"]], plain["logarithmic"])
     table.last_id = plain["last_id"]
     for entry in plain["instances"]:
-        mended = {"class_evidence": np.array(entry["class_evidence"]), "observed_in": set(entry["observed_in"])}
-        record = InstanceRecord(**{**entry, **mended})
+        record = InstanceRecord(**entry)
+        record.class_evidence = np.array(record.class_evidence)
+        record.observed_in = set(record.observed_in)
+        record.in_view = FrameSet(entry["in_view"])
         table.records[record.id] = record
     return table
