@@ -11,18 +11,27 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes, look_up_instances
-from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.evidence import INSTANCE_SLOTS, Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_classes,
+    check_instances,
+    check_like,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
 from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import render
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
+from framework.mapping.voxel_grid import BLOCK_VOXELS
 
 FORMAT = 5  # of the saved file; a change of meaning counts it up
-ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
 
 
 class InstanceMap(SceneMap):
@@ -119,18 +128,20 @@ class InstanceMap(SceneMap):
 
     @classmethod
     def load(cls, path: Path) -> InstanceMap:
-        header, arrays = read_map(path, FORMAT, ARRAYS)
-        table = table_of(header["table"])
-        scene = cls(
-            TsdfVolume.load(header, arrays),
-            Confirmation(**header["confirmation"]),
-            table.combine,
-            table.logarithmic,
-            Storage[header["storage"]],
-        )
-        scene.begin(tuple(header["classes"]))
-        scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
-        scene.labels.row_count = len(scene.labels.evidence.instance_ids)
-        scene.labels.evicted = header["evicted"]
-        scene.table = table
+        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
+        with faults_of(path):
+            table, storage, classes = table_of(header["table"]), Storage[header["storage"]], tuple(header["classes"])
+            volume = TsdfVolume.load(header, arrays, len(arrays["instance_ids"]))
+            scene = cls(volume, Confirmation(**header["confirmation"]), table.combine, table.logarithmic, storage)
+            scene.begin(classes)
+            slots = arrays["instance_ids"].shape[-1] if storage is Storage.EXACT else INSTANCE_SLOTS
+            free = np.empty((0, BLOCK_VOXELS, slots), np.float32)
+            free_rows = scene.labels.evidence._replace(instance_ids=free.astype(np.int32), instance_value=free)
+            check_like(arrays, free_rows._asdict(), len(arrays["instance_ids"]))
+            check_classes(arrays["class_ids"], len(classes))
+            check_instances("instance_ids", arrays["instance_ids"], table)
+            scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
+            scene.labels.row_count = len(scene.labels.evidence.instance_ids)
+            scene.labels.evicted = header["evicted"]
+            scene.table = table
         return scene

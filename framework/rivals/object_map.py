@@ -36,7 +36,15 @@ from framework.mapping.evidence import Combine
 from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_instances,
+    check_like,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
 from framework.mapping.meshing import Surface
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
@@ -222,14 +230,18 @@ class ObjectMap(SceneMap):
     @classmethod
     def load(cls, path: Path) -> ObjectMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
-        scene = cls(TsdfVolume.load(header, arrays), Confirmation(**header["confirmation"]))
-        scene.classes = tuple(header["classes"])
-        scene.table = table_of(header["table"])
-        first = 0
-        for key, blocks in header["objects"].items():
-            volume = scene.volumes[int(key)] = scene._empty_volume()
-            volume.fill({name: arrays[OBJECT + name][first : first + blocks] for name in VOLUME_ARRAYS})
-            first += blocks
+        with faults_of(path):
+            scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation(**header["confirmation"]))
+            scene.classes = tuple(header["classes"])
+            scene.table = table_of(header["table"])
+            counts = {int(key): blocks for key, blocks in header["objects"].items()}
+            check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
+            check_instances("objects", np.array([*counts], np.int32), scene.table)
+            first = 0
+            for key, blocks in counts.items():
+                volume = scene.volumes[key] = scene._empty_volume()
+                volume.fill({name: arrays[OBJECT + name][first : first + blocks] for name in VOLUME_ARRAYS})
+                first += blocks
         return scene
 
 

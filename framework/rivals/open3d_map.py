@@ -15,7 +15,14 @@ from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_instances,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
 from framework.rivals.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
 
 FORMAT = "open3d_vbg 3"  # of the saved file; a change of meaning counts it up
@@ -136,9 +143,11 @@ class Open3DMap(SceneMap):
     @classmethod
     def load(cls, path: Path) -> Open3DMap:
         header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
-        scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
-        scene.classes = tuple(header["classes"])
-        scene.grid.frames = header["frames"]
-        scene.grid.fill(arrays)
-        scene.table = table_of(header["table"])
+        with faults_of(path):
+            scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
+            scene.classes = tuple(header["classes"])
+            scene.table = table_of(header["table"])
+            scene.grid.frames = header["frames"]
+            scene.grid.fill(arrays)
+            check_instances("instance", arrays["instance"], scene.table)
         return scene

@@ -12,13 +12,13 @@ from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, Sur
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes
 from framework.mapping.instance_list import aligned_box, oriented_box, vertices_by_id, vertices_of_area
-from framework.mapping.map_file import read_map, write_map
+from framework.mapping.map_file import faults_of, read_map, write_map
 from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.rivals.class_evidence import ClassEvidence, ClassRows, best_class
-from framework.rivals.connected_components import connected_components, opinions, vertex_classes
+from framework.rivals.connected_components import component_statistics, connected_components, vertex_classes
 
 FORMAT = "semantic 1"  # of the saved file; a change of meaning counts it up
 
@@ -108,7 +108,7 @@ class SemanticMap(SceneMap):
         """
         mesh = self.mesh()
         surface = self.volume.surface()
-        said = opinions(
+        statistics = component_statistics(
             self.volume.voxels.grid,
             self.labels.evidence,
             self._log_missed,
@@ -118,14 +118,14 @@ class SemanticMap(SceneMap):
         )
         instances = {}
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
-            sums, points = said.probability_sums[k], mesh.vertices[vertices]
+            sums, points = statistics.probability_sums[k], mesh.vertices[vertices]
             instances[k] = Instance(
                 id=k,
                 class_probabilities=(sums / sums.sum()).astype(np.float32),
-                confidence=float(sums[mesh.class_ids[vertices[0]]] / said.vertices[k]),
-                observations=int(said.masked[k]),
-                first_frame=int(said.first_frame[k]),
-                last_frame=int(said.last_frame[k]),
+                confidence=float(sums[mesh.class_ids[vertices[0]]] / statistics.vertices[k]),
+                observations=int(statistics.masked[k]),
+                first_frame=int(statistics.first_frame[k]),
+                last_frame=int(statistics.last_frame[k]),
                 vertices=vertices,
                 aabb=aligned_box(points),
                 obb=oriented_box(points),
@@ -146,8 +146,11 @@ class SemanticMap(SceneMap):
     @classmethod
     def load(cls, path: Path) -> SemanticMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
-        scene = cls(TsdfVolume.load(header, arrays), header["missed"], header["min_area"])
-        scene.begin(tuple(header["classes"]))
-        scene.labels.fill(arrays)
-        scene.labels.evicted = header["evicted"]
+        with faults_of(path):
+            volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
+            scene = cls(volume, header["missed"], header["min_area"])
+            classes = tuple(header["classes"])
+            scene.begin(classes)
+            scene.labels.fill(arrays, len(classes))
+            scene.labels.evicted = header["evicted"]
         return scene
