@@ -222,7 +222,8 @@ class Association:
     duplicate_overlap: float = 0.6  # in [0, 1]: a cluster that shares this with a better one creates nothing
     split: bool = True  # whether two clusters on one instance split it: the better one keeps it, the other is new
     merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
-    merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart
+    merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
+    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate)
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -234,8 +235,9 @@ class Association:
             duplicate_overlap=(0.0, 1.0),
             merge_overlap=(0.0, 1.0),
             merge_frames=(1, 2**31),
+            merge_agreement=(0.0, 1.0),
         )
-        self._together: Counter[tuple[int, int]] = Counter()  # frames that see two instances as one, less those as two
+        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that see two as one, less those that do not
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the instances that the map has at the measured surface."""
@@ -275,20 +277,25 @@ class Association:
     def merge(self, scene: LabeledMap, matches: Matches) -> None:
         """Merges two instances that keep lying under one cluster and are hardly ever seen as two (after Voxblox++)."""
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
-        self._together.subtract(combinations(matched, 2))
+        self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
             kept = int(matches.instance_ids[k])
             covered = matches.overlaps.instance_ids[row > self.merge_overlap].tolist() if kept else []
             for other in set(covered) - set(matched):
                 pair = (min(kept, other), max(kept, other))
-                self._together[pair] += 1
-                if self._together[pair] >= self.merge_frames:
+                self._merge_votes[pair] += 1
+                if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
                     self._forget(pair[1])
                     return  # overlaps are out of date now; what else is to be merged will be seen again
 
+    def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
+        """Whether two instances may be one thing, by their classes: a book is not the table that it lies on."""
+        known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
+        return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
+
     def _forget(self, instance_id: int) -> None:
-        self._together = Counter({pair: n for pair, n in self._together.items() if instance_id not in pair})
+        self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if instance_id not in pair})
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:

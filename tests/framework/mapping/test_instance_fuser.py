@@ -127,6 +127,26 @@ def test_two_instances_that_keep_lying_under_one_cluster_are_merged(
     assert record.observations == 2 + last
 
 
+@pytest.mark.parametrize(
+    ("merge_agreement", "agrees", "merged"), [(0.1, False, False), (0, False, True), (0.1, True, True)]
+)
+def test_a_book_that_is_rarely_found_alone_stays_on_its_table(
+    merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
+) -> None:
+    """The table's mask covers it in every frame; a part of the table in its place would be merged."""
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, merge_agreement=merge_agreement, on_top=0.0)
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    book = whole & (np.arange(CAMERA.width) < u[0] + (u[-1] - u[0]) // 3)
+    table = (0.99, 0.01)
+    for k in range(3):
+        classes = [table, table if agrees else (0.01, 0.99)]
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole & ~book, book], [0.9, 0.9], classes)
+    for k in range(3, 12):
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1], [table])
+    assert len(fuser.scene.table.records) == (1 if merged else 2)
+
+
 def test_two_objects_seen_apart_stay_two_under_a_mask_that_covers_both(
     new_fuser: NewFuser, frames: list[Frame]
 ) -> None:
@@ -218,6 +238,7 @@ def test_the_least_area_of_an_instance_does_not_depend_on_the_voxels(new_fuser: 
         {"overlap": 1.5},
         {"class_gate": -0.1},
         {"merge_frames": 0},
+        {"merge_agreement": 1.1},
         {"min_confidence": float("nan")},
         {"min_area": -0.001},
     ],
