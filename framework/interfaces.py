@@ -16,7 +16,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
-from dataclasses import fields
 from pathlib import Path
 
 from framework.data import (
@@ -33,7 +32,6 @@ from framework.data import (
     SurfaceView,
     View,
 )
-from framework.detection.fingerprint import fingerprint
 
 
 class RGBDSequence(ABC):
@@ -67,24 +65,15 @@ class Detector(ABC):
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; known once the detector is built
 
-    reads: tuple[str, ...] = tuple(field.name for field in fields(Frame))
-    """The fields of a frame that `detect` looks at. One that names fewer shares more of the detection cache."""
-
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
         """The objects in `frame`. The same frame gives the same detections, in whatever order frames come."""
 
-    def fingerprint(self) -> str:
-        """A hash of all that the detections depend on beside the frame: the detection cache's key.
-
-        As it is, it covers class, code, parameters and what Path parameters name. A detector that gets weights in
-        another way (by a name from the network, or through an address in a str) adds their hash.
-        """
-        return fingerprint(self)
-
 
 class PoseTracker(ABC):
     """Estimates the camera pose."""
+
+    pose_source: str = "tracked"  # for tables; `ground_truth` of a tracker that returns the sequence's own poses
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
@@ -102,7 +91,7 @@ class ClusterRefiner(ABC):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         """Points in, points out. `pixels` say where in `frame` each point was seen; N may change.
 
-        Clusters that are `exact` come back as they are: cleaning the truth could only damage it.
+        Clusters that are `exact` never get here: `framework.refinement.refine` passes them on.
         """
 
 

@@ -2,19 +2,28 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
-import importlib
+import importlib.util
 import inspect
 import pkgutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from difflib import get_close_matches
+from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import ConfigError, InstanceMapError
+from framework.files.search_paths import CONF, PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 
 STAGES: Mapping[str, type[Any]] = {
@@ -32,9 +41,11 @@ Plugin = TypeVar("Plugin")
 def build(interface: type[Plugin], node: DictConfig) -> Plugin:
     """The plugin that a config node describes: `_target_` names the class, every other key is a parameter of it.
 
-    The class is imported and refused unless it is a concrete dataclass that implements `interface`; only then is
-    anything called, so a config cannot run arbitrary code. Interpolations in the node are resolved against the config
-    that it belongs to.
+    In a run, the class must be one that an option of the stage names: those of this project, of installed packages and
+    of --config-dir. Where no Hydra with our configs runs (from Python, or when a stored run is evaluated anew), its
+    module's source must define it. Only then is it imported, and refused unless it is a concrete dataclass that
+    implements `interface`; only then is anything called, so a config cannot run arbitrary code. Interpolations in the
+    node are resolved against the config that it belongs to.
 
     Raises:
         ConfigError: the class or a parameter is wrong; one line that names the stage, the plugin and what is wrong.
@@ -46,6 +57,10 @@ def build(interface: type[Plugin], node: DictConfig) -> Plugin:
             f"{stage}: expected a plugin's config with a _target_, found {_shown(node)}; choose {stage}=NAME"
         )
     target = str(node["_target_"])
+    if loader := _running_loader():
+        _refuse_unregistered(loader, stage, target)
+    else:
+        _refuse_undefined(stage, target)
     plugin_class = find_class(interface, target)
     where = f"{stage} {target}"
     arguments = parameters(where, plugin_class, node)
@@ -94,6 +109,46 @@ def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]
 def stage_of(interface: type) -> str:
     """The config group whose options implement `interface`."""
     return next(stage for stage, of in STAGES.items() if of is interface)
+
+
+def _refuse_unregistered(loader: Any, stage: str, target: str) -> None:
+    if target not in _targets(loader, stage, target):
+        close = _did_you_mean(target, list(_targets(loader, stage, target)))
+        raise ConfigError(f"{stage} {target}: no registered option of {stage} has this _target_{close}")
+
+
+def _refuse_undefined(stage: str, target: str) -> None:
+    module_name, _, class_name = target.rpartition(".")
+    if module_name and module_name not in sys.modules:
+        known = _names_in(_found(f"{stage} {target}", module_name))
+        if class_name not in known:
+            close = _did_you_mean(class_name, known)
+            raise ConfigError(f"{stage} {target}: module {module_name} defines no {class_name}{close}")
+
+
+def _running_loader() -> Any:
+    """The loader of the Hydra that runs, where our configs are on its search path; else None."""
+    if not GlobalHydra.instance().is_initialized():
+        return None
+    loader = GlobalHydra.instance().config_loader()
+    paths = [str(element.path).removeprefix("file://") for element in loader.get_search_path().get_path()]
+    return loader if str(CONF) in paths else None
+
+
+def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
+    """The classes that the stage's options name, first of those options whose names `sought` has in it."""
+    inheriting = []
+    for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
+        own = loader.repository.load_config(f"{stage}/{name}").config
+        if "_target_" in own:
+            yield str(own["_target_"])
+        else:
+            inheriting.append(name)
+    for name in inheriting:  # from another option, which was asked, or from what is none
+        with suppress(HydraException):  # of an option that cannot be used
+            for entry in loader.compute_defaults_list(f"{stage}/{name}", [], RunMode.RUN).defaults:
+                if entry.package == stage:
+                    yield str(loader.repository.load_config(entry.config_path).config.get("_target_"))
 
 
 def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
@@ -197,27 +252,61 @@ def _plugins(where: str, interface: type[Plugin], node: Any) -> dict[str, Plugin
 
 
 def _import(where: str, module_name: str) -> ModuleType:
+    if module_name not in sys.modules:
+        _found(where, module_name)
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        missing = error.name or ""
-        if not f"{module_name}.".startswith(f"{missing}."):  # the module is there, something that it needs is not
-            raise ConfigError(
-                f"{where}: {module_name} needs the package {missing!r}, which is not installed"
-            ) from error
-        raise ConfigError(f"{where}: there is no module {missing}{_siblings_of(missing)}") from error
+        raise ConfigError(f"{where}: {module_name} needs the package {error.name!r}, which is not installed") from error
     except Exception as error:  # whatever a third party's module does at import
         kind = type(error).__name__
         raise ConfigError(f"{where}: {module_name} cannot be imported: {kind}: {_first_line(error)}") from error
 
 
-def _siblings_of(module_name: str) -> str:
-    """A suggestion from the modules beside the one that does not exist."""
-    package_name, _, name = module_name.rpartition(".")
-    if not package_name:
-        return ""
-    package = importlib.import_module(package_name)
-    return _did_you_mean(name, [module.name for module in pkgutil.iter_modules(getattr(package, "__path__", []))])
+def _found(where: str, module_name: str) -> ModuleSpec:
+    """Where a module is. Nothing is imported for it, as importlib.util.find_spec would its packages."""
+    package, *inner = module_name.split(".")
+    try:
+        spec, name = importlib.util.find_spec(package), package
+    except ValueError:  # no name, or one that is taken by what is no module
+        spec, name = None, package
+    if package == "plugins" and spec is not None:
+        _refuse_another(spec)
+    for part in inner:
+        if spec is None:
+            break
+        beside = list(spec.submodule_search_locations or [])
+        name = f"{name}.{part}"
+        specs = [finder.find_spec(name) for finder in map(pkgutil.get_importer, beside) if finder]
+        spec = next((spec for spec in specs if spec and spec.loader), next(filter(None, specs), None))
+        if spec is None:
+            close = _did_you_mean(part, [module.name for module in pkgutil.iter_modules(beside)])
+            raise ConfigError(f"{where}: there is no module {name}{close}")
+    if spec is None:
+        raise ConfigError(f"{where}: there is no module {name}")
+    return spec
+
+
+def _refuse_another(plugins: ModuleSpec) -> None:
+    """Raises InstanceMapError when the user has a package called `plugins`, and Python finds it before ours."""
+    found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
+    if found != PROJECT_ROOT / "plugins":
+        raise InstanceMapError(
+            f"the package 'plugins' at {found} stands in the way of InstanceMap's own at {PROJECT_ROOT / 'plugins'}: "
+            "rename it or start elsewhere"
+        )
+
+
+def _names_in(spec: ModuleSpec) -> list[str]:
+    """The classes that a module's source defines or imports by name."""
+    get_source = getattr(spec.loader, "get_source", None)
+    try:
+        nodes = list(ast.walk(ast.parse((get_source(spec.name) if get_source else None) or "")))
+    except (SyntaxError, OSError):
+        return []
+    of_others = [alias for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
+    defined = [node.name for node in nodes if isinstance(node, ast.ClassDef)]
+    return defined + [alias.asname or alias.name for alias in of_others]
 
 
 def _implements(found: Any, interface: type) -> bool:

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
+from typing import Any
+
 import pytest
 from omegaconf import OmegaConf
 
 from framework.commands.plugins import registered as options_of
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
-from framework.registry import STAGES
+from framework.registry import STAGES, find_class, parameters, plugin_fields
+from framework.tables.comparison import TableChoice
+from framework.training.trainer import Schedule
 from tests import registered
 
 
@@ -35,6 +41,50 @@ def test_every_parameter_is_in_the_yaml_with_a_comment(stage: str, name: str) ->
     node = registered.composed(stage, name)[stage]
     assert {parameter.name for parameter in option.parameters} == set(node) - {"_target_"}
     assert not [parameter.name for parameter in option.parameters if not parameter.comment]
+
+
+def default_of(field: dataclasses.Field[Any]) -> Any:
+    """What OmegaConf calls "???" where there is none."""
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return "???" if field.default is dataclasses.MISSING else field.default
+
+
+@pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
+def test_every_value_in_the_yaml_is_the_default_of_the_class(stage: str, name: str) -> None:
+    """But for what a variant changes. What only the user knows has no default, in either."""
+    path = CONF / stage / f"{name}.yaml"
+    own = OmegaConf.load(path)
+    is_variant = "_target_" not in own  # of the option that it inherits
+    assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "a variant says first what it changes"
+    node = registered.composed(stage, name)[stage]
+    plugin_class = find_class(STAGES[stage], node["_target_"])
+    links = plugin_fields(plugin_class)
+    for key in links:
+        for link in node[key]:
+            assert node[key][link] == registered.composed(stage, link)[stage], "a link is the option of its name"
+    fields = [field for field in dataclasses.fields(plugin_class) if field.init and field.name not in links]
+    asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
+    assert asked == [field.name for field in fields if default_of(field) == "???"]
+    typed = parameters(stage, plugin_class, OmegaConf.merge(node, dict.fromkeys(asked, "given by the user")))
+    differing = {
+        field.name: f"{value!r} and not {default!r}"
+        for field in fields
+        for value, default in [(typed[field.name], default_of(field))]
+        if field.name not in asked and (type(value), value) != (type(default), default)
+    }
+    assert set(differing) == (set(own) - {"defaults"} if is_variant else set()), differing
+    of_the_run = {key for key in node if OmegaConf.is_interpolation(node, key)}
+    assert of_the_run <= {"seed", "device"}, "interpolations were resolved above, against the defaults of a run"
+
+
+def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> None:
+    schedule = OmegaConf.load(CONF / "train_detector.yaml").schedule
+    assert Schedule(**schedule) == Schedule()
+    assert set(schedule) == {field.name for field in dataclasses.fields(Schedule)} - {"seed", "budget"}
+    table = OmegaConf.load(CONF / "parts" / "experiment.yaml").table
+    assert TableChoice.of(table) == TableChoice(columns=list(table.columns))
+    assert set(table) == {field.name for field in dataclasses.fields(TableChoice)}
 
 
 @pytest.mark.parametrize("name", registered.names("dataset"))

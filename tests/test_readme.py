@@ -80,16 +80,15 @@ def test_the_detector_finds_what_it_says(my_plugins: Path) -> None:
 
 def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
     """The README's command, with the other stages faked for speed."""
-    fakes = [f"{stage}._target_=tests.scenes.corner_room.{name}" for stage, name in FAKES.items()]
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
-    for stage in FAKES:
+    for stage, name in FAKES.items():
         group = my_plugins / "my_conf" / stage
         group.mkdir(exist_ok=True)
-        (group / "fake.yaml").write_text("_target_: null\n")
+        (group / "fake.yaml").write_text(f"_target_: tests.scenes.corner_room.{name}\n")
     command = "-m framework --config-dir my_conf detector=color_blobs detector.hue=120 hydra.run.dir=run"
     done = subprocess.run(
-        [sys.executable, *command.split(), *chosen, *fakes],
+        [sys.executable, *command.split(), *chosen],
         cwd=my_plugins,
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{CHECKOUT}:{my_plugins}", "HOME": str(my_plugins)},
         capture_output=True,

@@ -52,15 +52,21 @@ def one_line_errors() -> Iterator[None]:
         print("interrupted", file=sys.stderr)
         sys.exit(EXIT_INTERRUPTED)
     except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
-        if "debug=true" in sys.argv:
-            traceback.print_exception(error)
+        show_traceback(error)
         print(f"error: {one_line(error)}", file=sys.stderr)
         sys.exit(EXIT_FAILED)
 
 
+def show_traceback(error: BaseException) -> None:
+    """Where an error comes from, for whoever asks with `debug=true`; it precedes the line that says what is wrong."""
+    if "debug=true" in sys.argv:
+        traceback.print_exception(error)
+
+
 def quiet_when_cut_off() -> None:
     """Lets `| head` end this process without a word."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    if hasattr(signal, "SIGPIPE"):  # not on Windows
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
@@ -82,6 +88,7 @@ def print_for_directories(description: str, place: str, write: Callable[[Path], 
             try:
                 print(write(directory))
             except KNOWN_ERRORS as error:
+                show_traceback(error)
                 print(f"error: {one_line(error)}", file=sys.stderr)
                 refused += 1
     if refused:

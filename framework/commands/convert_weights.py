@@ -7,7 +7,6 @@ so that it needs no more than `detector.weights=OUT`. No code that IN may contai
 from __future__ import annotations
 
 import argparse
-import hashlib
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
@@ -38,13 +37,12 @@ def convert(source: Path, target: Path, kind: str | None, classes: str | None, n
     from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network
     from framework.detection.mask_rcnn.network_file import save_network
     from framework.detection.mask_rcnn.published_weights import find_network
+    from framework.files.hashing import path_hash
 
     path = find_network(source)
     names = tuple(name.strip() for name in classes.split(",")) if classes else None
     network = read_network(path, CheckpointKind(kind) if kind else None, names, norm_eps)
-    with path.open("rb") as file:
-        origin = hashlib.file_digest(file, "sha256").hexdigest()
-    save_network(network, target, {"converted_from": path.name, "converted_from_sha256": origin}, half)
+    save_network(network, target, {"converted_from": path.name, "converted_from_sha256": path_hash(path)}, half)
     architecture = network.architecture
     print(
         f"{target}: {architecture.backbone.name}, {len(architecture.classes)} classes,"

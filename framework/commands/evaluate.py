@@ -17,6 +17,7 @@ from framework.commands.command_line import (
     arguments,
     one_line_errors,
     quiet_when_cut_off,
+    show_traceback,
 )
 from framework.configs import one_line
 from framework.evaluation.instances import Transfer
@@ -64,6 +65,7 @@ def evaluate_runs(roots: Sequence[Path], transfer: Transfer, write: bool, other_
             try:
                 truth = Truth.of(same_truth[0].config)
             except KNOWN_ERRORS as error:
+                show_traceback(error)
                 for record in same_truth:
                     _refuse(f"{record.directory}: {one_line(error)}")
                 count += len(same_truth)
@@ -76,6 +78,7 @@ def evaluate_runs(roots: Sequence[Path], transfer: Transfer, write: bool, other_
                         found.write()
                     tqdm.write(f"{record.directory}: {summary(found, transfer)}")
                 except KNOWN_ERRORS as error:
+                    show_traceback(error)
                     _refuse(one_line(error))
                     count += 1
                 bar.update()

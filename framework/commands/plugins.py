@@ -11,21 +11,18 @@ import importlib.resources
 import inspect
 import re
 import textwrap
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra import initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from framework.commands.command_line import arguments, one_line_errors, quiet_when_cut_off
-from framework.configs import one_line
+from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
-from framework.files.search_paths import CONF
 from framework.registry import STAGES, find_class, parameter_fields, plugin_fields
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -54,12 +51,11 @@ class Option:
     parameters: tuple[Parameter, ...]
 
 
-def registered(stage: str) -> Iterator[Option]:
-    """The options of a config group, by name."""
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+def registered(stage: str, only: str | None = None) -> list[Option]:
+    """The options of a config group, by name, or the one that is asked for."""
+    with config_directory():
         loader = GlobalHydra.instance().config_loader()
-        found = [_option(loader, stage, name) for name in loader.get_group_options(stage)]
-    yield from found
+        return [_option(loader, stage, name) for name in loader.get_group_options(stage) if only in (None, name)]
 
 
 def _option(loader: Any, stage: str, name: str) -> Option:
@@ -134,7 +130,7 @@ def main() -> None:
     asked = arguments(parser)
     with one_line_errors():
         for stage in [asked.stage] if asked.stage else STAGES:
-            options = [option for option in registered(stage) if asked.name in (None, option.name)]
+            options = registered(stage, asked.name)
             if asked.name and not options:
                 raise ConfigError(f"there is no {stage}={asked.name}")
             print(f"{stage} ({STAGES[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")

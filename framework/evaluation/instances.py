@@ -1,9 +1,9 @@
 """3D instance segmentation: average precision and overlap of a map's instances against the true ones.
 
-The protocol is the one of protocol.md: labels are carried between map vertices and true surface points by nearest
-neighbor, predictions are matched to truth greedily in order of confidence, and a class's AP is the area under its
-precision-recall curve with all-point interpolation (the precision at a recall is the largest precision at that or any
-higher recall, as in Pascal VOC from 2010 on), averaged over the classes that have a true instance.
+The paper's figure is AP at IoU 0.5, averaged over classes. Labels are carried between map vertices and true surface
+points by nearest neighbor, predictions are matched to truth greedily in order of confidence, and a class's AP is the
+area under its precision-recall curve with all-point interpolation (the precision at a recall is the largest precision
+at that or any higher recall, as in Pascal VOC from 2010 on), averaged over the classes that have a true instance.
 
 **What is evaluated.** A true instance counts when its class is known and it has at least `min_points` points. The other
 true instances (class None, or too few points) are *ignored* ones: something is there, but nobody can say whether a
@@ -39,7 +39,7 @@ IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # those 
 class Transfer(Enum):
     """Which way labels are carried; tables name it."""
 
-    TO_TRUTH = "to_truth"  # each true point takes the instance of the nearest map vertex: protocol.md, the default
+    TO_TRUTH = "to_truth"  # each true point takes the instance of the nearest map vertex: the default
     TO_MAP = "to_map"  # each map vertex takes the instance of the nearest true point
 
 
@@ -309,12 +309,14 @@ def carry(points: Float32, labels: Int32, targets: Float32, max_distance: float)
     """The label of the nearest of `points` for each target, 0 where none is within `max_distance`."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
+    import numba  # here: commands that only read figures are answered before it loads
+
     # Meshes come in an order that differs between runs: sorted, equally near points give the same label each time.
     order = np.lexsort((labels, points[:, 2], points[:, 1], points[:, 0]))
     points, labels = points[order], labels[order]
     tree = cKDTree(points, balanced_tree=False)
-    # the bound is exclusive in SciPy
-    _, nearest = tree.query(targets, distance_upper_bound=np.nextafter(max_distance, np.inf), workers=-1)
+    bound = np.nextafter(max_distance, np.inf)  # exclusive in SciPy
+    _, nearest = tree.query(targets, distance_upper_bound=bound, workers=numba.get_num_threads())
     carried: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy answers "none" with the index after the last
     return carried
 

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from framework.data import Bool, Detections, Float64, Frame, FrameTruth, Int32, PointClusters, Pose
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
+from framework.refinement.refine import refine
 
 TIMED = 5  # calls, of which the median counts; the one before them may have to compile
 
@@ -31,11 +32,11 @@ class Refinement:
         """Lifts the detections at the frame's true pose, or else in the camera's own frame, and refines them."""
         pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
         before = lift(detections, frame, pose)
-        after = refiner.refine(before, frame)
+        after = refine(refiner, before, frame)
         times = []
         for _ in range(TIMED):
             started = time.perf_counter()
-            refiner.refine(before, frame)
+            refine(refiner, before, frame)
             times.append(1e3 * (time.perf_counter() - started))
         return cls(frame, before, after, statistics.median(times))
 

@@ -11,20 +11,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Bool, Int32, PointClusters
-from framework.errors import DataError
-
-
-def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raises DataError when a cluster's pixel lies outside the (height, width) image.
-
-    A refiner made it up then, and kernels do not check bounds.
-    """
-    u, v = clusters.pixels.T
-    if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
-        raise DataError(
-            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
-            f"v in [{v.min()}, {v.max()}]"
-        )
+from framework.geometry import require_pixels_inside
 
 
 class PixelLists(NamedTuple):

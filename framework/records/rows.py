@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from framework.records.provenance import WITHOUT_EFFECT
+from framework.records.provenance import leaves, relevant
 from framework.records.stored_runs import Record
 
 CHOICE = "choice."  # starts the keys of metrics.json that say which option was chosen of a config group
@@ -169,20 +169,12 @@ class _Variant:
 
     @classmethod
     def of(cls, record: Record, over: Sequence[str]) -> _Variant:
-        parameters = dict(_leaves({key: value for key, value in record.config.items() if key not in WITHOUT_EFFECT}))
+        parameters = dict(leaves(relevant(record.config)))
         choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
         choices["annotation"] = record.annotation or "not told"
         run = tuple(str(parameters.get(key)) for key in over)
         row = record.config.get("row")
         return cls(record, "" if row is None else str(row), run, choices, parameters)
-
-
-def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:

@@ -55,7 +55,8 @@ class LitView:
 
     def _developed(self, color: Float32) -> UInt8:
         """The lit picture on paper, scaled down to the camera's size; `color` is used up."""
-        _develop(color, self._light, self._fine.depth, np.array(NOTHING, np.float32))
+        np.clip(color * self._light[..., None], 0, 255, out=color)
+        color[self._fine.depth <= 0] = NOTHING
         return np.asarray(cv2.resize(color, self.hits.depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
 
@@ -95,13 +96,3 @@ def _paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> Non
             texture = np.float32(0.84) + np.float32(0.16 / 140) * gray[v, u]
             for k in range(3):
                 painted[v, u, k] = dim * (palette[one, k] * texture if one > 0 else background)
-
-
-@njit(cache=True, nogil=True)
-def _develop(color: Float32, light: Float32, depth: Float32, nothing: Float32) -> None:
-    """Lights the colours (H, W, 3), and puts `nothing` (3,) where nothing is seen."""
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            for k in range(3):
-                lit = min(max(color[v, u, k] * light[v, u], np.float32(0)), np.float32(255))
-                color[v, u, k] = lit if depth[v, u] > 0 else nothing[k]

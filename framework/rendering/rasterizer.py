@@ -46,7 +46,7 @@ class Rasterizer:
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         """vertices (V, 3) m, world; triangles (F, 3), seen from both sides."""
         self._vertices = np.ascontiguousarray(vertices, np.float32)
-        # neighbours in space one after the other, so that they are in buffer, and in the processor's caches, together
+        # neighbours in space one after the other, so that they are in sight, and in the processor's caches, together
         self._order = np.argsort(_curve(self._vertices, triangles), kind="stable").astype(np.int32)
         self._triangles = triangles.astype(np.int32, copy=False)[self._order]
         self._spheres = _bounding_spheres(self._vertices, self._triangles)

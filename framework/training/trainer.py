@@ -20,7 +20,7 @@ from tqdm import tqdm
 from framework.detection.mask_rcnn.network import MaskRCNN
 from framework.detection.masks import tight_boxes
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.parameters import require
 from framework.training.augmentation import augmented
 from framework.training.losses import Budget, Objects, losses
@@ -34,11 +34,11 @@ LARGEST_GRADIENT = 10.0  # norm
 class Schedule:
     """How long and how fast to learn."""
 
-    steps: int = 6000  # >= 1
+    steps: int = 8000  # >= 1
     batch: int = 4  # pictures a step, >= 1
     learning_rate: float = 1e-3  # > 0, at its height (AdamW)
     weight_decay: float = 1e-2  # >= 0
-    warmup: int = 200  # steps, >= 0, in which the learning rate rises; then it falls as a cosine to a hundredth
+    warmup: int = 300  # steps, >= 0, in which the learning rate rises; then it falls as a cosine to a hundredth
     averaging: float = 0.998  # in [0, 1): of the weights, over steps; what is saved is the average
     checkpoint_every: int = 250  # steps, >= 1
     bfloat16: bool = False  # products in 16 bits, sums and weights in 32: faster where the processor has them

@@ -17,6 +17,7 @@ from torch.nn import functional
 
 from framework.data import Detections, Float32, Frame, UInt8
 from framework.detection.device import torch_device
+from framework.detection.fingerprint import fingerprint
 from framework.detection.masks import suppress_duplicates, tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
@@ -125,7 +126,7 @@ class TransformersSegmentation(Detector):
         self._commit = checkpoint.commit
 
     def fingerprint(self) -> str:
-        return f"{super().fingerprint()} {self._commit}"
+        return f"{fingerprint(self)} {self._commit}"
 
     @torch.inference_mode()
     def detect(self, frame: Frame) -> Detections:

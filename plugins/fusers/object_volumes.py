@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
+from framework.geometry import require_pixels_inside
 from framework.interfaces import MapFuser
 from framework.mapping.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceRecord
-from framework.mapping.pixel_lists import require_pixels_inside
 from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
 from framework.rivals.object_map import ObjectMap

@@ -11,9 +11,8 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from framework.data import Camera, Detections, Frame, FrameTruth
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.detection.cache import CachedDetector, frame_hash, pack, unpack
+from framework.detection.cache import FRAME_FIELDS, CachedDetector, frame_hash, pack, unpack
 from framework.detection.masks import tight_boxes
-from framework.interfaces import Detector
 from framework.label_spaces import COCO
 from plugins.detectors.maskrcnn2go import MaskRCNN2Go
 
@@ -39,7 +38,7 @@ def ellipses() -> Detections:
     return Detections(masks, tight_boxes(masks), np.linspace(1, 0, OBJECTS, dtype=np.float32), rows, COCO)
 
 
-@pytest.mark.parametrize("reads", [("color",), Detector.reads], ids=["color", "everything"])
+@pytest.mark.parametrize("reads", [("color",), FRAME_FIELDS], ids=["color", "everything"])
 def test_hashing_a_frame(benchmark: BenchmarkFixture, reads: tuple[str, ...]) -> None:
     benchmark(frame_hash, noise(), reads)
 

@@ -181,7 +181,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
 
 @pytest.fixture(scope="module")
 def walks(shared: Path) -> dict[str, list[Frame]]:
-    """The issue's two videos for accuracy: 300 real frames, and 200 without any noise."""
+    """Two videos for accuracy: 300 real frames, and 200 without any noise."""
     return {
         "redkitchen": list(RgbdFolder(shared / "data" / "redkitchen", stop=300)),
         "room without noise": list(Synthetic(frames=240, stop=200, noise=0.0)),

@@ -4,13 +4,37 @@ from __future__ import annotations
 
 import ast
 from collections.abc import Iterator
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 CHECKOUT = Path(__file__).resolve().parents[2]
-LAYERS = ["errors", "data", "geometry", "interfaces", "mapping", "journal", "pipeline", "reports"]
-"""From the ground up: a module imports nothing from a layer above its own; modules not named here stand beside."""
+LAYERS = [
+    ["errors"],
+    ["data", "parameters", "settings"],
+    ["geometry", "label_spaces"],
+    ["interfaces"],
+    ["files"],
+    ["configs"],
+    ["registry"],
+    ["rendering"],
+    ["detection", "mapping", "refinement", "tracking"],
+    ["rivals", "datasets"],
+    ["synthetic"],
+    ["journal"],
+    ["pipeline"],
+    ["evaluation"],
+    ["records", "training"],
+    ["tables"],
+    ["figures"],
+    ["api"],
+    ["commands"],
+    ["__main__"],
+]
+"""All of framework/, from the ground up: nothing imports from a layer above its own."""
+
+LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 
 OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas"}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
@@ -26,7 +50,8 @@ def imported(tree: ast.AST) -> Iterator[str]:
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, "imports are absolute"
-            yield str(node.module)
+            whole = node.module in ("framework", "plugins")
+            yield from (f"{node.module}.{alias.name}" for alias in node.names) if whole else [str(node.module)]
 
 
 def at_module_level(tree: ast.Module) -> Iterator[str]:
@@ -35,9 +60,9 @@ def at_module_level(tree: ast.Module) -> Iterator[str]:
             yield from imported(node)
 
 
-def layer(module: str) -> int | None:
-    part = module.partition(".")[2].partition(".")[0]
-    return LAYERS.index(part) if part in LAYERS else None
+def part_of(module: str) -> str:
+    """The package or root module of framework/ that a module of it is in."""
+    return module.split(".")[1]
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)
@@ -46,11 +71,25 @@ def test_imports_run_one_way(path: Path) -> None:
     for module in imported(ast.parse(path.read_text())):
         if name.startswith("framework"):
             assert not module.startswith("plugins"), f"{name} imports {module}: framework never imports plugins"
-        own, other = layer(name), layer(module) if module.startswith("framework.") else None
-        if name.startswith("framework") and own is not None and other is not None:
-            assert other <= own, f"{name} imports {module}, which stands above it"
+        if name.startswith("framework.") and module.startswith("framework."):
+            above = LAYER[part_of(module)] > LAYER[part_of(name)]
+            assert not above, f"{name} imports {module}, which stands above it"
         if name.startswith("plugins.") and module.startswith("plugins."):
             assert module == name, f"{name} imports {module}: plugins never import each other"
+
+
+def test_every_part_of_the_framework_has_its_layer() -> None:
+    assert sorted(LAYER) == sorted({part_of(name) for name in map(name_of, MODULES) if name.startswith("framework.")})
+
+
+def test_no_packages_import_each_other_in_a_circle() -> None:
+    """Imports inside of functions count, too."""
+    imports = {part: set[str]() for part in LAYER}
+    for path in MODULES:
+        if (name := name_of(path)).startswith("framework."):
+            of_ours = {module for module in imported(ast.parse(path.read_text())) if module.startswith("framework.")}
+            imports[part_of(name)] |= {part_of(module) for module in of_ours} - {part_of(name)}
+    TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
 
 
 @pytest.mark.parametrize("path", MODULES, ids=name_of)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
+
+from framework.__main__ import COMMANDS, main
+from framework.files.search_paths import CONF
+from framework.records.provenance import config_hash
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
@@ -64,6 +70,62 @@ def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert "Traceback (most recent call last)" in done.stderr
     assert "ValidationError" in done.stderr
+
+
+def words(*arguments: str, directory: Path) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "framework", *arguments]
+    return subprocess.run(line, cwd=directory, env=environment(), capture_output=True, text=True, timeout=120)
+
+
+def test_help_lists_the_commands_and_each_is_there(tmp_path: Path) -> None:
+    done = words("--help", directory=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    for name, says in COMMANDS.items():
+        assert re.search(rf"^  {name} +{re.escape(says)}$", done.stdout, re.MULTILINE)
+        assert find_spec(f"framework.commands.{name.replace('-', '_')}")
+
+
+def test_a_misspelt_command_suggests_the_nearest(tmp_path: Path) -> None:
+    done = words("tabels", "outputs", directory=tmp_path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "error: there is no command 'tabels'; did you mean tables?\n"
+    assert "the commands are tables, figures" in words("xyz", directory=tmp_path).stderr
+
+
+FAULTY = {
+    "tables": ["nowhere"],
+    "figures": ["nowhere"],
+    "evaluate": ["old"],
+    "detect": ["dataset=synthetic", "detector=simulated"],
+    "show-refinement": ["dataset=synthetic", "detector=simulated"],
+    "plugins": ["detector", "nothing"],
+    "synthesize": ["new", "--scenes=999"],
+    "train-detector": ["device=tpu"],
+    "convert-weights": ["nothing.pth", "out.safetensors"],
+    "convert-oni": ["nothing.oni", "out"],
+}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_debug_shows_where_a_fault_of_any_command_comes_from(
+    command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "metrics.json").write_text(json.dumps({"config_hash": config_hash({})}))
+    (tmp_path / "old" / "config.yaml").write_text("{}")
+    if (CONF / f"{command.replace('-', '_')}.yaml").exists():  # what Hydra changes for its process stays there
+        stderr = words(command, *FAULTY[command], "debug=true", directory=tmp_path).stderr
+    else:
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setattr("signal.signal", lambda *_: None)
+        monkeypatch.setattr(sys, "argv", ["instancemap", command, *FAULTY[command], "debug=true"])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        assert ended.value.code == 1
+        stderr = capsys.readouterr().err
+    assert "Traceback (most recent call last)" in stderr
+    assert re.search("(ERROR +|error: |refused: )", stderr)
+    assert not (tmp_path / "debug=true").exists()
 
 
 def test_a_run_leaves_its_record(tmp_path: Path) -> None:

@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import os
+import re
+import subprocess
+import sys
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
+from framework.configs import config_directory
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker
 from framework.parameters import check_bounds
 from framework.registry import STAGES, assemble, build, find_class, parameter_fields
 
+CHECKOUT = Path(__file__).resolve().parents[2]
 HERE = "build_targets"
 
 
@@ -89,8 +96,6 @@ def some_function() -> None:
 @pytest.fixture(autouse=True)
 def importable(monkeypatch: pytest.MonkeyPatch) -> None:
     """This module under a fixed name, whatever pytest calls it."""
-    import sys
-
     monkeypatch.setitem(sys.modules, HERE, sys.modules[__name__])
 
 
@@ -182,12 +187,73 @@ def test_a_missing_choice_is_told() -> None:
 
 def test_a_module_that_fails_at_import_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "needs_more.py").write_text("import surely_not_installed\n")
-    (tmp_path / "raises.py").write_text("raise RuntimeError('operator torchvision::nms does not exist\\nmore')\n")
+    tracker = "class Tracker: pass\n"
+    (tmp_path / "needs_more.py").write_text(f"import surely_not_installed\n{tracker}")
+    failing = "raise RuntimeError('operator torchvision::nms does not exist\\nmore')\n"
+    (tmp_path / "raises.py").write_text(failing + tracker)
     with pytest.raises(ConfigError, match="needs the package 'surely_not_installed', which is not installed"):
         find_class(PoseTracker, "needs_more.Tracker")
     with pytest.raises(ConfigError, match=r"raises cannot be imported: RuntimeError: operator .* does not exist$"):
         find_class(PoseTracker, "raises.Tracker")
+
+
+@pytest.fixture
+def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package, and a module with a class Named in it, that print when they are imported."""
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "talkative").mkdir()
+    (tmp_path / "talkative" / "__init__.py").write_text("print('imported')\n")
+    (tmp_path / "talkative" / "one.py").write_text("print('imported')\nclass Named: pass\n")
+
+
+@pytest.mark.parametrize("target", ["this.X", "this.s.X", "antigravity.X", "talkative.one.Name", "talkative.two.Named"])
+@pytest.mark.usefixtures("talkative")
+def test_what_does_not_define_the_class_is_not_imported(target: str, capfd: pytest.CaptureFixture[str]) -> None:
+    assert re.search("defines no X|defines no Name; did you mean 'Named'|there is no module", fault(_target_=target))
+    assert not {"this", "antigravity", "talkative", "talkative.one"} & set(sys.modules)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        ("plugins.detectors.none.NoDetection", "did you mean 'plugins.detectors.none.NoDetections'?"),
+        ("plugins.trackers.ground_truth.GroundTruth", "no registered option of detector"),  # of another stage
+        ("talkative.one.Named", "no registered option of detector"),
+        ("os.system", "no registered option of detector"),
+        ("this.X", "no registered option of detector"),
+    ],
+)
+@pytest.mark.usefixtures("talkative")
+def test_a_run_takes_what_its_options_register(target: str, said: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """The options are those of Hydra's search path. Nothing else is imported."""
+    with config_directory():
+        assert said in fault(_target_=target)
+        assert build(Detector, OmegaConf.create({"_target_": "plugins.detectors.none.NoDetections"})).classes
+    assert not {"this", "talkative"} & set(sys.modules)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_inside_of_another_program_that_uses_hydra_its_options_do_not_matter(tmp_path: Path) -> None:
+    with initialize_config_dir(str(tmp_path), version_base="1.3"):
+        assert detector() == Probe(Path("w.bin"))
+
+
+IN_THE_WAY = "import sys, framework; sys.path.insert(0, ''); from framework.__main__ import main; main()"
+
+
+def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
+    """Python finds what lies in the working folder first, under `python -m`."""
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "__init__.py").write_text("print('imported')\n")
+    line = [sys.executable, "-c", IN_THE_WAY, "plugins"]
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    said = f"the package 'plugins' at {tmp_path}/plugins stands in the way of InstanceMap's own at {CHECKOUT}/plugins: "
+    assert f"{said}rename it or start elsewhere" in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert "imported" not in done.stdout
 
 
 def test_every_stage_has_its_interface() -> None:

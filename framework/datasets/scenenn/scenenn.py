@@ -55,6 +55,7 @@ class SceneNN(LabeledRecording):
     some. Truth is the labelled mesh, all of it, whatever frames are chosen.
     """
 
+    scene: str = "011"  # the sequence
     sensor: Sensor = Sensor.ASUS  # names the file of intrinsics
     release: str = ""  # of the annotation, for tables: two exist and give other results; "" = what release.txt says
 

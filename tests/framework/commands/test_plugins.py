@@ -59,6 +59,21 @@ PACKAGE = {
                     classes=self.classes,
                 )
     ''',
+    "acme/another.py": """
+        from dataclasses import dataclass
+        from acme.everything import Everything
+
+        @dataclass
+        class Another(Everything):
+            pass
+    """,
+    "acme/conf/parts/acme_another.yaml": """
+        _target_: acme.another.Another
+    """,
+    "acme/conf/detector/acme_by_part.yaml": """
+        defaults: ["/parts/acme_another@_here_", _self_]
+        score: 0.5
+    """,
     "acme/conf/detector/acme_everything.yaml": """
         _target_: acme.everything.Everything
         score: 0.75 # in [0, 1], of the one object
@@ -134,9 +149,14 @@ def test_an_installed_package_runs(environment: dict[str, str], tmp_path: Path) 
     done = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everything", "dataset.frames=1")
     assert done.returncode == 0, done.stderr
     assert '"instances.count": 1' in (tmp_path / "run" / "metrics.json").read_text()
+    unregistered = run(environment, tmp_path, "framework", *places, *fakes, "detector._target_=acme.another.Anothr")
+    assert (
+        "no registered option of detector has this _target_; did you mean 'acme.another.Another'?"
+        in unregistered.stderr
+    )
     typo = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everthing")
     assert "did you mean acme_everything?" in typo.stderr
-    wrong = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everything", "detector.score=2")
+    wrong = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_by_part", "detector.score=2")
     assert "score must be in [0, 1], found 2.0" in wrong.stderr
     assert len(wrong.stderr.splitlines()) == 1
 

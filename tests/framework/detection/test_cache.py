@@ -19,7 +19,18 @@ from framework.commands.run import run
 from framework.data import Detections, Frame, FrameTruth
 from framework.datasets.labeled_mesh import LabeledMesh
 from framework.detection import cache
-from framework.detection.cache import CachedDetector, CacheMode, cache_metrics, frame_hash, pack, unpack, with_cache
+from framework.detection.cache import (
+    FRAME_FIELDS,
+    CachedDetector,
+    CacheMode,
+    cache_metrics,
+    frame_hash,
+    identity_of,
+    pack,
+    unpack,
+    with_cache,
+)
+from framework.detection.fingerprint import fingerprint
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.search_paths import CONF
 from framework.interfaces import Detector
@@ -116,6 +127,36 @@ def test_another_detector_misses(room: CornerRoom, tmp_path: Path, changed: Dete
     assert (other.hits, other.misses) == (0, 1)
 
 
+@dataclass
+class Named(Noise):
+    """Gets its weights by a name."""
+
+    revision: str = "main"
+
+    def fingerprint(self) -> str:
+        return f"{fingerprint(self)} {self.revision}"
+
+
+@dataclass
+class NamedAsOnce(Noise):
+    """Written when Detector itself had a fingerprint."""
+
+    def fingerprint(self) -> str:
+        return f"{super().fingerprint()} main"  # type: ignore[misc]
+
+
+def test_a_detector_is_identified_by_what_it_says_or_by_what_it_is(tmp_path: Path) -> None:
+    """The contract knows of no cache: a detector says what it reads, and what it is, if it wants to."""
+    assert not {"reads", "fingerprint"} & set(dir(Detector))
+    silent = SphereDetector()
+    assert identity_of(silent) == fingerprint(silent)
+    assert CachedDetector(silent, tmp_path).reads == FRAME_FIELDS
+    assert identity_of(Named()) == f"{fingerprint(Named())} main"
+    assert CachedDetector(Named(), tmp_path).reads == ("color",)
+    with pytest.raises(ConfigError, match=r"'super' .*; call framework\.detection\.fingerprint's"):
+        CachedDetector(NamedAsOnce(), tmp_path)
+
+
 def test_other_weights_miss(room: CornerRoom, tmp_path: Path) -> None:
     weights = tmp_path / "weights"
     counts = []
@@ -153,8 +194,7 @@ def test_what_a_detector_reads_of_a_frame_counts(room: CornerRoom) -> None:
         "truth names": replace(frame, truth=FrameTruth(frame.truth.instance_ids, {1: None, 2: "couch"})),
         "no truth": replace(frame, truth=None),
     }
-    everything = Detector.reads
-    assert len({frame_hash(other, everything) for other in (frame, *changed.values())}) == len(changed) + 1
+    assert len({frame_hash(other, FRAME_FIELDS) for other in (frame, *changed.values())}) == len(changed) + 1
     for name, other in changed.items():
         assert (frame_hash(other, ("color",)) == frame_hash(frame, ("color",))) == (name != "color")
 
@@ -223,7 +263,8 @@ def test_detectors_read_no_more_than_they_say(name: str, room: CornerRoom, tmp_p
         "T_world_camera": np.eye(4),
         "truth": None,
     }
-    unread = replace(frame, **{key: value for key, value in others.items() if key not in detector.reads})
+    reads = CachedDetector(detector, tmp_path).reads
+    unread = replace(frame, **{key: value for key, value in others.items() if key not in reads})
     assert_same(detector.detect(frame), detector.detect(unread))
 
 

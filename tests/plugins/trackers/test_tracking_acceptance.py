@@ -1,6 +1,6 @@
 """What the tracker promises: accuracy on scenes known exactly, and a map that no bad frame damages.
 
-The issue's longer runs (300 real frames, 200 synthetic ones) are rows of `pytest tests/benchmarks -k slam`.
+Longer runs (300 real frames, 200 synthetic ones) are rows of `pytest tests/benchmarks -k slam`.
 """
 
 from __future__ import annotations
