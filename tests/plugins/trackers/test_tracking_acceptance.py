@@ -19,6 +19,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
 from framework.interfaces import SceneMap
+from framework.registry import assemble
 from framework.synthetic.sequence import Synthetic
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
@@ -30,7 +31,7 @@ WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as
 
 def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = VOXEL) -> tuple[list[Pose], SceneMap]:
     """As the pipeline does it: what is lost is not fused."""
-    fuser = BayesianTsdf(voxel_size=voxel_size)
+    fuser = assemble(BayesianTsdf, voxel_size=voxel_size)
     poses = []
     for frame in frames:
         poses.append(tracker.track(frame, fuser.scene))

@@ -9,6 +9,7 @@ from framework.data import Camera, Frame, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.interfaces import SceneMap
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers import voxel_hashing_icp
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
@@ -16,7 +17,7 @@ from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:
-    fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     poses = []
     for frame in frames:
         pose = tracker.track(frame, fuser.scene)
