@@ -11,28 +11,23 @@ import numpy as np
 
 from framework.configs import composed
 from framework.data import (
-    Box,
     Camera,
     Detections,
     Frame,
-    FrameTruth,
     Instance,
     InstanceMesh,
     PointClusters,
     Pose,
-    SceneTruth,
-    SurfaceView,
     View,
 )
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
-from framework.journal import Journal, RunResult
+from framework.journal import Journal
 from framework.pipeline import Pipeline
 from framework.registry import build
 from framework.settings import Settings
 
 __all__ = [
-    "Box",
     "Camera",
     "ClusterRefiner",
     "ConfigError",
@@ -41,7 +36,6 @@ __all__ = [
     "Detector",
     "Frame",
     "FrameError",
-    "FrameTruth",
     "Instance",
     "InstanceMapError",
     "InstanceMesh",
@@ -53,10 +47,7 @@ __all__ = [
     "Pose",
     "PoseTracker",
     "RGBDSequence",
-    "RunResult",
     "SceneMap",
-    "SceneTruth",
-    "SurfaceView",
     "View",
     "load_map",
 ]

@@ -14,6 +14,7 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Frame, Int32, Int64, PointClusters
+from framework.parameters import check_bounds
 
 Int16 = npt.NDArray[np.int16]
 
@@ -107,31 +108,39 @@ class Surroundings:
         return Neighborhoods(points, depth_in_mask, starts, mask_counts, self.ring_widths, self.mask_radii)
 
 
-def ring_bounds(min_ring: int) -> dict[str, tuple[float, float]]:
-    """For `check_bounds`: what the parameters may be by which a plugin chooses rings and what it looks at of them."""
-    return {
-        "ring_fraction": (0.0, 10.0),
-        "min_ring": (1, MAX_RING_WIDTH),
-        "max_ring": (min_ring, MAX_RING_WIDTH),
-        "max_points": (100, 10**9),
-        "min_points": (10, 10**9),
-    }
+@dataclass
+class Ring:
+    """The band around a mask that shows what surrounds the object, and what a refiner looks at of both."""
+
+    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
+    min_ring: int = 4  # px, least width
+    max_ring: int = 12  # px, largest width
+    max_points: int = 1000  # from 100, points of a mask and its ring that are fitted to; all are judged at the end
+    min_points: int = 30  # from 10, smaller clusters or rings are too little
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            ring_fraction=(0.0, 10.0),
+            min_ring=(1, MAX_RING_WIDTH),
+            max_ring=(self.min_ring, MAX_RING_WIDTH),
+            max_points=(100, 10**9),
+            min_points=(10, 10**9),
+        )
 
 
-def surroundings(
-    clusters: PointClusters, frame: Frame, ring_fraction: float, min_ring: int, max_ring: int
-) -> Surroundings:
+def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundings:
     """The N clusters of one frame with their rings.
 
     A ring holds the pixels that have a depth reading, are not in the cluster themselves and lie within
     `ring_fraction` * sqrt(points in the cluster) px of it, bounded to [`min_ring`, `max_ring`] px. Pixels of other
     clusters belong to it like any other; those of known structure are as if they had no reading: they need not be told
-    from the object any more, and are no border to it. `max_ring` is at most MAX_RING_WIDTH.
+    from the object any more, and are no border to it.
     """
     order, firsts = members(clusters)
     pixels, areas = clusters.pixels[order], np.diff(firsts)
     readings = frame.depth if clusters.structure is None else np.where(clusters.structure, np.float32(0), frame.depth)
-    widths = np.clip(np.rint(ring_fraction * np.sqrt(areas)), min_ring, max_ring).astype(np.int64)
+    widths = np.clip(np.rint(ring.ring_fraction * np.sqrt(areas)), ring.min_ring, ring.max_ring).astype(np.int64)
     windows = np.zeros((len(clusters), 4), np.int64)
     _bound(pixels, firsts, widths, *frame.camera.shape, windows)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])

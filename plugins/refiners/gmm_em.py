@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from framework.parameters import check_bounds
 from framework.refinement import mixture
 from framework.refinement.mask_evidence import mask_log_odds
 from framework.refinement.mixture_start import start_labels
-from framework.refinement.neighborhood import ring_bounds, surroundings
+from framework.refinement.neighborhood import Ring, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -38,11 +38,7 @@ class GmmEm(ClusterRefiner):
     min_posterior: float = 0.5  # in (0, 1), a point stays when the object's share of it is larger
     mask_log_odds: float = 4.0  # nats, from 0; 0 = the mask is the start only, as in the paper
     expected_bleed: float = 0.4  # in [0, 1), how far inside of the mask its log-odds are 0, in widths of the ring
-    ring_fraction: float = 0.25  # width of the ring in square roots of the mask's area
-    min_ring: int = 4  # px, least width
-    max_ring: int = 12  # px, largest width
-    max_points: int = 1000  # from 100, points of a mask and its ring that EM sees; all are judged at the end
-    min_points: int = 30  # from 10, smaller clusters or rings are too little for a mixture
+    ring: Ring = field(default_factory=Ring)
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -56,12 +52,11 @@ class GmmEm(ClusterRefiner):
             min_posterior=(1e-6, 1 - 1e-6),
             mask_log_odds=(0.0, 20.0),
             expected_bleed=(0.0, 0.99),
-            **ring_bounds(self.min_ring),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
-        sample = around.sampled(self.max_points)
+        around = surroundings(clusters, frame, self.ring)
+        sample = around.sampled(self.ring.max_points)
         log_odds = mask_log_odds(sample, self.mask_log_odds, self.expected_bleed)
         mixtures = mixture.fit(
             sample.points_camera,
@@ -75,7 +70,7 @@ class GmmEm(ClusterRefiner):
             prior_log_odds=log_odds,
             own_components=self.object_components,
         )
-        own, judged = around.own(), around.of_at_least(self.min_points)
+        own, judged = around.own(), around.of_at_least(self.ring.min_points)
         claimed = mixture.likely_members(
             own.points_camera,
             own.starts[:-1],

@@ -16,7 +16,7 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
 from framework.refinement import mixture, mixture_tree
-from framework.refinement.neighborhood import surroundings
+from framework.refinement.neighborhood import Ring, surroundings
 from plugins.refiners.chain import Chain
 from plugins.refiners.dbscan import Dbscan
 from plugins.refiners.geometric import Geometric
@@ -88,7 +88,7 @@ def test_em_beside_scikit_learn(benchmark):
     """The same points, start and number of iterations: log-likelihoods agree, times are compared."""
     iterations, components = 8, 8
     clusters, frame = ten_masks()
-    sample = surroundings(clusters, frame, 0.25, 4, 12).sampled(1000)
+    sample = surroundings(clusters, frame, Ring()).sampled(1000)
     # a start without empty groups, which scikit-learn could not take
     labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
@@ -133,7 +133,7 @@ def test_em_beside_scikit_learn(benchmark):
 def test_tree_beside_flat_mixture(benchmark, levels: int, components: int):
     """As many Gaussians, the same kind of start, iterations and points, of ten masks at once: who is faster."""
     clusters, frame = ten_masks()
-    sample = surroundings(clusters, frame, 0.25, 4, 12).sampled(10_000)
+    sample = surroundings(clusters, frame, Ring()).sampled(10_000)
     points, starts = sample.points_camera, sample.starts
     em = {"max_iterations": 8, "tolerance": 1e-3, "variance_floor": 0.01**2, "outlier_fraction": 0.02}
 

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.errors import ConfigError
 from framework.geometry import back_project, lift
-from framework.refinement.neighborhood import Neighborhoods, grouped, members, surroundings, thread_shares
+from framework.refinement.neighborhood import Neighborhoods, Ring, grouped, members, surroundings, thread_shares
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
 
@@ -30,7 +31,7 @@ def clusters_of(masks: np.ndarray, frame: Frame) -> PointClusters:
 
 def neighborhoods(clusters: PointClusters, frame: Frame, *ring: float, **named: float) -> Neighborhoods:
     """All points of masks and rings."""
-    return surroundings(clusters, frame, *ring, **named).sampled(10**9)
+    return surroundings(clusters, frame, Ring(*ring, **named)).sampled(10**9)
 
 
 def random_scene(seed: int) -> tuple[np.ndarray, Frame]:
@@ -166,7 +167,7 @@ def test_depth_in_mask_ignores_pixels_without_a_reading():
 def test_thinned_keeps_every_nth_point():
     masks, frame = random_scene(1)
     around = neighborhoods(clusters_of(masks, frame), frame, 0.25, 4, 12)
-    thin = surroundings(clusters_of(masks, frame), frame, 0.25, 4, 12).sampled(50)
+    thin = surroundings(clusters_of(masks, frame), frame, Ring()).sampled(50)
     counts = np.diff(around.starts)
     for k, step in enumerate(np.maximum(-(-counts // 50), 1)):
         own = slice(around.starts[k], around.starts[k + 1])
@@ -183,3 +184,8 @@ def test_nothing_at_all():
     assert len(around) == 0
     around = neighborhoods(clusters_of(np.ones((2, 40, 60), bool), frame), frame, 0.25, 4, 12)
     assert around.mask_counts.tolist() == around.ring_counts.tolist() == [0, 0]
+
+
+def test_a_ring_is_checked() -> None:
+    with pytest.raises(ConfigError, match=r"Ring.max_ring must be in \[20, 80\], found 12"):
+        Ring(min_ring=20)

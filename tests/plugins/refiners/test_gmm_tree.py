@@ -134,7 +134,6 @@ def test_same_result_with_one_thread_and_with_two():
         ({"levels": 0}, "GmmTree.levels must be in"),
         ({"children": 1}, "GmmTree.children must be in"),
         ({"min_support": 1.0}, "GmmTree.min_support"),
-        ({"min_ring": 20}, r"max_ring must be in \[20, 80\], found 12"),
     ],
 )
 def test_parameters_are_checked(parameters, message):

@@ -237,7 +237,6 @@ def test_largest_component_is_that_of_all_pairs(reach, density):
         (GmmEm, {"object_components": 0}, "GmmEm.object_components must be in"),
         (GmmEm, {"std_floor": float("nan")}, "std_floor .* found nan"),
         (GmmEm, {"min_posterior": 1.0}, "min_posterior"),
-        (GmmEm, {"min_ring": 20}, r"max_ring must be in \[20, 80\], found 12"),
         (KMeans, {"background_centers": 0}, "KMeans.background_centers"),
         (LargestComponent, {"reach": 0}, "LargestComponent.reach"),
     ],
