@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import json
+import os
 import re
 import shlex
 import subprocess
@@ -14,12 +16,14 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from framework.api import load_map
 from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
 from framework.geometry import lift
 from framework.interfaces import Detector
+from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
-from tests import registered
+from tests import option_files, registered
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -114,6 +118,81 @@ def test_every_command_composes(command: str) -> None:
                 COMMANDS[command],
                 overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides],
             )
+
+
+SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
+OWN = [
+    "dataset=rgbd_folder",
+    "dataset.root=DIR",
+]  # smaller still, and no room has to be furnished
+DEFAULTS = "python -m framework"
+RUNNABLE = {  # what to append, by a command that then takes seconds
+    DEFAULTS: [*SMALL, "hydra.run.dir=defaults"],
+    "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=simulated"],
+    "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
+    "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
+    "python -m framework detection_cache=read_write refiner=kmeans": [*OWN, "hydra.run.dir=cached"],
+    "python -m framework detect dataset=synthetic detector=simulated out=detections.json": SMALL,
+    "python -m framework show-refinement dataset=synthetic detector=simulated frame=24 out=refinement.png": [
+        *SMALL,
+        "frame=1",
+    ],
+    "python -m framework dataset=rgbd_folder dataset.root=DIR tracker=trajectory_file tracker.path=FILE": [
+        "hydra.run.dir=own"
+    ],
+    "python -m framework tables outputs/table3_map": [],  # of the sweep above
+    "python -m framework evaluate outputs/table3_map": [],
+    "python -m framework plugins": [],
+    "python -m framework plugins detector": [],
+}
+LEFT_BEHIND = ["detections.json", "refinement.png", *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own"))]
+RUN = """
+import json, sys
+from framework.__main__ import main
+for line in json.load(open("commands.json")):
+    print(">>>", line, flush=True)
+    sys.argv = ["instancemap", *line]
+    main()
+"""
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which all of these ran, one after the other in one process: to load the libraries takes longest."""
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "DIR").mkdir()
+    option_files.overrides("dataset", "rgbd_folder", folder / "DIR")
+    (folder / "FILE").write_text((folder / "DIR" / "poses.txt").read_text())
+    lines = [shlex.split(command)[3:] + small for command, small in RUNNABLE.items()]
+    (folder / "commands.json").write_text(json.dumps(lines))
+    done = subprocess.run(
+        [sys.executable, "-c", RUN],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(CHECKOUT), "XDG_CACHE_HOME": str(folder), "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    return folder
+
+
+def test_commands_that_take_seconds_run(ran: Path) -> None:
+    assert set(RUNNABLE) - {DEFAULTS} <= set(LINES)
+    assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
+    assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
+    assert list(ran.glob("instancemap/detections/*/*.detections"))
+
+
+def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
+    """The network that comes with the project, tracked, refined by both links and fused: on four small frames."""
+    metrics = json.loads((ran / "defaults" / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["frames_lost"], metrics["frames_skipped"]) == (4, 0, 0)
+    assert metrics["pose_source"] == "tracked"
+    assert metrics["trajectory.ate_rmse_m"] < 0.02
+    mesh = read_mesh(ran / "defaults" / "mesh.ply")
+    assert len(mesh.vertices) > 1000
+    assert load_map(ran / "defaults" / "map.npz").voxel_count == metrics["map.voxels"] > 0
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
