@@ -81,7 +81,7 @@ class Mapper:
             fuser=build(MapFuser, config.fuser),
         )
         self.scene = self.pipeline.fuser.scene
-        self._journal = Journal(self.scene, frames_expected=0)
+        self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
 
     def add(self, frame: Frame) -> Pose:
         """Detects, tracks, refines and fuses one frame; the frames of a video in their order.

@@ -83,7 +83,7 @@ class FrameTruth:
     class_names: Mapping[int, str | None]  # instance id -> class name; None = the class is not known, do not evaluate
 
     def __post_init__(self) -> None:
-        _check("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
+        check_array("FrameTruth.instance_ids", self.instance_ids, (None, None), np.int32)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -121,7 +121,7 @@ class DeferredTruth(FrameTruth):
         with self._lock:
             if self._ids is None:
                 ids = self._render()
-                _check("DeferredTruth.instance_ids", ids, self._shape, np.int32)
+                check_array("DeferredTruth.instance_ids", ids, self._shape, np.int32)
                 self._ids = ids
             return self._ids
 
@@ -140,8 +140,8 @@ class Frame:
 
     def __post_init__(self) -> None:
         where = f"frame {self.index}: "
-        _check(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
-        _check(where + "depth", self.depth, self.camera.shape, np.float32)
+        check_array(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
+        check_array(where + "depth", self.depth, self.camera.shape, np.float32)
         if self.depth.size and self.depth.min() < 0:
             raise DataError(f"{where}depth must be 0 or positive, found {self.depth.min()} m")
         if self.T_world_camera is not None:
@@ -178,9 +178,9 @@ class Detections:
 
     def __post_init__(self) -> None:
         n, c = len(self.scores), len(self.classes)
-        _check("Detections.masks", self.masks, (n, None, None), np.bool_)
-        _check("Detections.boxes", self.boxes, (n, 4), np.float32)
-        _check("Detections.scores", self.scores, (n,), np.float32)
+        check_array("Detections.masks", self.masks, (n, None, None), np.bool_)
+        check_array("Detections.boxes", self.boxes, (n, 4), np.float32)
+        check_array("Detections.scores", self.scores, (n,), np.float32)
         _check_scores("Detections.scores", self.scores)
         _check_distributions("Detections.class_probabilities", self.class_probabilities, (n, c))
 
@@ -217,10 +217,10 @@ class PointClusters:
 
     def __post_init__(self) -> None:
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)
-        _check("PointClusters.points_world", self.points_world, (p, 3), np.float32)
-        _check("PointClusters.pixels", self.pixels, (p, 2), np.int32)
-        _check("PointClusters.cluster", self.cluster, (p,), np.int32)
-        _check("PointClusters.scores", self.scores, (n,), np.float32)
+        check_array("PointClusters.points_world", self.points_world, (p, 3), np.float32)
+        check_array("PointClusters.pixels", self.pixels, (p, 2), np.int32)
+        check_array("PointClusters.cluster", self.cluster, (p,), np.int32)
+        check_array("PointClusters.scores", self.scores, (n,), np.float32)
         _check_scores("PointClusters.scores", self.scores)
         _check_distributions("PointClusters.class_probabilities", self.class_probabilities, (n, c))
         if p and (self.cluster.min() < -1 or self.cluster.max() >= n):
@@ -228,7 +228,7 @@ class PointClusters:
                 f"PointClusters.cluster must be in [-1, {n}), found {self.cluster.min()} to {self.cluster.max()}"
             )
         if self.structure is not None:
-            _check("PointClusters.structure", self.structure, (None, None), np.bool_)
+            check_array("PointClusters.structure", self.structure, (None, None), np.bool_)
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -290,11 +290,11 @@ class InstanceMesh:
 
     def __post_init__(self) -> None:
         v = len(self.vertices)
-        _check("InstanceMesh.vertices", self.vertices, (v, 3), np.float32)
-        _check("InstanceMesh.triangles", self.triangles, (None, 3), np.int32)
-        _check("InstanceMesh.colors", self.colors, (v, 3), np.uint8)
-        _check("InstanceMesh.instance_ids", self.instance_ids, (v,), np.int32)
-        _check("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
+        check_array("InstanceMesh.vertices", self.vertices, (v, 3), np.float32)
+        check_array("InstanceMesh.triangles", self.triangles, (None, 3), np.int32)
+        check_array("InstanceMesh.colors", self.colors, (v, 3), np.uint8)
+        check_array("InstanceMesh.instance_ids", self.instance_ids, (v,), np.int32)
+        check_array("InstanceMesh.class_ids", self.class_ids, (v,), np.int32)
 
     def of(self, instance: Instance) -> InstanceMesh:
         """The instance's own mesh: its vertices, in their order, and the triangles between them."""
@@ -322,20 +322,20 @@ class SceneTruth:
 
     def __post_init__(self) -> None:
         v = len(self.points_world)
-        _check("SceneTruth.points_world", self.points_world, (v, 3), np.float32)
-        _check("SceneTruth.instance_ids", self.instance_ids, (v,), np.int32)
+        check_array("SceneTruth.points_world", self.points_world, (v, 3), np.float32)
+        check_array("SceneTruth.instance_ids", self.instance_ids, (v,), np.int32)
 
 
 def check_rigid(name: str, T: Float64) -> None:
     """Raises DataError, naming `name`, unless `T` is a finite (4, 4) float64 rigid transform."""
-    _check(name, T, (4, 4), np.float64)
+    check_array(name, T, (4, 4), np.float64)
     R = T[:3, :3]
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
         raise DataError(f"{name} is not a rigid transform: |R R^T - I| is {error:.2g}, det R {np.linalg.det(R):.2g}")
 
 
-def _check(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:
+def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:
     """Raises DataError unless `array` has this shape (None = any length) and dtype and only finite values."""
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
@@ -356,7 +356,7 @@ def _check_scores(name: str, scores: Float32) -> None:
 
 
 def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> None:
-    _check(name, rows, shape, np.float32)
+    check_array(name, rows, shape, np.float32)
     if shape[0] and not shape[1]:
         raise DataError(f"{name}: there are {shape[0]} rows and no class to be distributed over")
     if rows.size and (rows.min() < 0 or np.abs(rows.sum(axis=1) - 1).max() > PROBABILITY_TOLERANCE):

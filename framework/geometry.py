@@ -137,6 +137,19 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
     )
 
 
+def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
+    """Raises DataError when a cluster's pixel lies outside the (height, width) image.
+
+    Whoever made it up is told so here: kernels do not check bounds, and NumPy takes -1 for the last row.
+    """
+    u, v = clusters.pixels.T
+    if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
+        raise DataError(
+            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
+            f"v in [{v.min()}, {v.max()}]"
+        )
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _count_readings(masks: Bool, depth: Float32, counts: npt.NDArray[np.int64]) -> None:
     """Sets counts (N * H + 1,) to how many pixels of each row of each mask have a reading, one place on."""

@@ -7,8 +7,9 @@
 
 A plugin is a dataclass that implements one of the four interfaces. Its dataclass fields are its parameters (bool, int,
 float, str, Path or Enum, with unit and bounds beside the default), checked in `__post_init__`; whatever else it keeps
-is assigned there as a plain attribute, never declared as a field. One YAML file in the stage's config group
-registers it.
+is assigned there as a plain attribute, never declared as a field. What several plugins do by the same parameters is a
+part, a field of another dataclass that has these and the methods; in a config they are the plugin's own. One YAML file
+in the stage's config group registers it.
 """
 
 from __future__ import annotations
@@ -72,6 +73,8 @@ class Detector(ABC):
 class PoseTracker(ABC):
     """Estimates the camera pose."""
 
+    pose_source: str = "tracked"  # for tables; `ground_truth` of a tracker that returns the sequence's own poses
+
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         """The pose of `frame`; called once per frame, in order. `scene` is read only.
@@ -88,7 +91,7 @@ class ClusterRefiner(ABC):
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         """Points in, points out. `pixels` say where in `frame` each point was seen; N may change.
 
-        Clusters that are `exact` come back as they are: cleaning the truth could only damage it.
+        Clusters that are `exact` never get here: `framework.refinement.refine` passes them on.
         """
 
 

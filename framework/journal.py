@@ -16,7 +16,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import Float64, Frame, Pose
 from framework.errors import FrameError, MapFullError
-from framework.interfaces import SceneMap
+from framework.interfaces import PoseTracker, SceneMap
 
 log = logging.getLogger(__name__)
 
@@ -56,6 +56,7 @@ class RunResult:
     seconds: float  # wall clock of the whole loop
     stopped_by: KeyboardInterrupt | MapFullError | None = None  # None = the sequence was mapped to its end
     intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
+    pose_source: str = PoseTracker.pose_source
 
     @property
     def frames_lost(self) -> int:
@@ -79,6 +80,7 @@ class Journal:
 
     scene: SceneMap
     frames_expected: int
+    pose_source: str
     frames: int = 0
     frames_skipped: int = 0
     tracked: list[TrackedFrame] = field(default_factory=list)
@@ -153,4 +155,5 @@ class Journal:
             seconds=self.seconds,
             stopped_by=self.stopped_by,
             intervals=tuple(np.diff(self.frames_began).tolist()),
+            pose_source=self.pose_source,
         )

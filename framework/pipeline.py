@@ -21,6 +21,7 @@ from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
 from framework.journal import Journal, RunResult, StageTime
+from framework.refinement.refine import refine
 
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
@@ -51,7 +52,7 @@ class Pipeline:
         """
         if len(sequence) == 0:
             raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
-        journal = Journal(self.fuser.scene, len(sequence))
+        journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
         with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
             try:
                 for frame, detections in detected:
@@ -112,7 +113,7 @@ class Pipeline:
         with journal.timed(frame.index, "lift"):
             clusters = lift(detections, frame, pose)
         with journal.timed(frame.index, "refine"):
-            clusters = self.refiner.refine(clusters, frame)
+            clusters = refine(self.refiner, clusters, frame)
         with journal.timed(frame.index, "fuse"):
             self.fuser.fuse(frame, pose, clusters)
         return pose

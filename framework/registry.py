@@ -14,7 +14,7 @@ from difflib import get_close_matches
 from importlib.machinery import ModuleSpec
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
@@ -65,11 +65,45 @@ def build(interface: type[Plugin], node: DictConfig) -> Plugin:
     where = f"{stage} {target}"
     arguments = parameters(where, plugin_class, node)
     try:
-        return plugin_class(**arguments)
+        return assemble(plugin_class, **arguments)
     except InstanceMapError as error:
         raise type(error)(f"{where}: {error}") from error
     except (ImportError, ValueError) as error:
         raise ConfigError(f"{where}: {_first_line(error)}") from error
+
+
+def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
+    """The plugin with these parameters; those of its parts are given as if they were its own."""
+    parts = {
+        name: assemble(part, **{key: values.pop(key) for key in parameter_fields(part) if key in values})
+        for name, (_, part) in _fields(plugin_class).items()
+        if _is_part(part)
+    }
+    return plugin_class(**parts, **values)
+
+
+def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
+    """The parameters of a plugin by name, each its field and type; a part's parameters stand in its place.
+
+    A part is a field whose type is a dataclass. Raises ConfigError when two parameters have one name.
+    """
+    found: dict[str, tuple[dataclasses.Field[Any], Any]] = {}
+    for name, (field, kind) in _fields(plugin_class).items():
+        more = parameter_fields(kind) if _is_part(kind) else {name: (field, kind)}
+        if twice := found.keys() & more.keys():
+            raise ConfigError(f"{plugin_class.__name__} has two parameters {', '.join(sorted(twice))}")
+        found |= more
+    return found
+
+
+def _is_part(kind: object) -> TypeGuard[type[Any]]:
+    return isinstance(kind, type) and dataclasses.is_dataclass(kind)
+
+
+def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
+    """The fields that a plugin or a part is made with, and their types."""
+    hints = get_type_hints(plugin_class)
+    return {field.name: (field, hints[field.name]) for field in dataclasses.fields(plugin_class) if field.init}
 
 
 def stage_of(interface: type) -> str:
@@ -139,6 +173,10 @@ def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
     if inspect.isabstract(found):
         missing = ", ".join(sorted(found.__abstractmethods__))
         raise ConfigError(f"{where}: {class_name} does not implement {missing} of {interface.__name__}")
+    try:
+        parameter_fields(found)
+    except ConfigError as error:
+        raise ConfigError(f"{where}: {error}") from error
     plugin_class: type[Plugin] = found
     return plugin_class
 
@@ -149,13 +187,14 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
     Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing mandatory value.
     """
     stages = plugin_fields(plugin_class)
+    fields = parameter_fields(plugin_class)
     try:
-        schema = OmegaConf.structured(_without(plugin_class, stages) if stages else plugin_class)
+        schema = _schema(plugin_class.__name__, {name: of for name, of in fields.items() if name not in stages})
     except OmegaConfBaseException as error:
         raise ConfigError(
             f"{where}: parameters must be bool, int, float, str, Path or Enum: {_first_line(error)}"
         ) from error
-    names = [field.name for field in dataclasses.fields(plugin_class) if field.init]
+    names = list(fields)
     plugins: dict[str, Any] = {}
     for key in node:
         if key == "_target_" or OmegaConf.is_missing(node, key):
@@ -188,17 +227,14 @@ def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
     return found
 
 
-def _without(plugin_class: type, left_out: Mapping[str, Any]) -> type:
-    """A dataclass with the same fields but for some."""
-    hints = get_type_hints(plugin_class)
-    kept = [field for field in dataclasses.fields(plugin_class) if field.init and field.name not in left_out]
-    return dataclasses.make_dataclass(
-        plugin_class.__name__,
-        [
-            (f.name, hints[f.name], dataclasses.field(default=f.default, default_factory=f.default_factory))
-            for f in kept
-        ],
-    )
+def _schema(name: str, fields: Mapping[str, tuple[dataclasses.Field[Any], Any]]) -> DictConfig:
+    """A config that takes what fits these fields, with their defaults."""
+    kept = [
+        (key, hint, dataclasses.field(default=field.default, default_factory=field.default_factory))
+        for key, (field, hint) in fields.items()
+    ]
+    schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(name, kept))
+    return schema
 
 
 def _plugins(where: str, interface: type[Plugin], node: Any) -> dict[str, Plugin]:

@@ -2,8 +2,8 @@
 
     python tests/same_results.py BEFORE AFTER
 
-Compares the runs below both, by their place: the files of the map, and metrics.json but for what measures the machine
-or names the code. Prints what differs; the exit status is 1 where anything does.
+Compares the runs below both, by their place: the files of the map, of map.npz the arrays, and metrics.json but for what
+measures the machine or names the code. Prints what differs; the exit status is 1 where anything does.
 """
 
 from __future__ import annotations
@@ -12,13 +12,17 @@ import json
 import sys
 from pathlib import Path
 
-FILES = ("mesh.ply", "map.npz", "trajectory.txt", "instances.json", "overview.png", "refined.png")
-NOT_RESULTS = ("fps", "stage_ms.", "peak_rss", "environment.", "git_", "config_hash", "time.", "code")
+import numpy as np
+
+FILES = ("mesh.ply", "trajectory.txt", "instances.json")
+NOT_RESULTS = ("fps", "stage_ms.", "peak_rss", "environment.", "git_", "config_hash", "inputs_sha256", "time.", "code")
 
 
 def results(directory: Path) -> dict[str, object]:
     """What a run found, by name of the file or key of metrics.json."""
     found: dict[str, object] = {name: (directory / name).read_bytes() for name in FILES if (directory / name).exists()}
+    with np.load(directory / "map.npz") as arrays:
+        found |= {f"map.npz: {name}": arrays[name].tobytes() for name in arrays.files}
     metrics = json.loads((directory / "metrics.json").read_text())
     return found | {key: value for key, value in metrics.items() if not key.startswith(NOT_RESULTS)}
 

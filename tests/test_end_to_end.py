@@ -6,6 +6,7 @@ import pytest
 from framework.evaluation.instances import PredictedInstances, evaluate
 from framework.mapping.instance_map import InstanceMap
 from framework.pipeline import Pipeline
+from framework.registry import assemble
 from framework.synthetic.sequence import Synthetic
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.simulated import SimulatedDetector
@@ -20,7 +21,7 @@ def sequence() -> Synthetic:
 
 
 def mapped(sequence: Synthetic, detector: SimulatedDetector | GroundTruthDetector, ahead: int) -> InstanceMap:
-    fuser = BayesianTsdf(voxel_size=0.02)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02)
     tracker = VoxelHashingIcp(finest=1.0)
     result = Pipeline(detector, tracker, GmmEm(), fuser, ahead=ahead).run(sequence)
     assert result.frames_lost == 0
@@ -33,8 +34,8 @@ def test_running_ahead_changes_nothing(sequence: Synthetic) -> None:
     maps = []
     for ahead in (0, 2):
         scene = mapped(sequence, SimulatedDetector(seed=1), ahead)
-        b, r = scene.voxels.block_count, scene.labels.row_count
-        grid = scene.voxels.grid
+        b, r = scene.volume.voxels.block_count, scene.labels.row_count
+        grid = scene.volume.voxels.grid
         arrays = [a[:b] for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color, grid.label_row)]
         maps.append([a.tobytes() for a in arrays + [a[:r] for a in scene.labels.evidence]])
     assert maps[0] == maps[1]

@@ -20,15 +20,21 @@ def masks_of(frame: Frame) -> list[np.ndarray]:
     return [frame.truth.instance_ids == i for i in frame.truth.class_names]
 
 
-def fuse_masks(fuser: MapFuser, frame: Frame, masks: Sequence[np.ndarray], scores: Sequence[float]) -> None:
-    """Fuses the frame at its true pose, with these masks detected."""
+def fuse_masks(
+    fuser: MapFuser,
+    frame: Frame,
+    masks: Sequence[np.ndarray],
+    scores: Sequence[float],
+    probabilities: Sequence[tuple[float, float]] | None = None,
+) -> None:
+    """Fuses the frame at its true pose, with these masks detected, each with its distribution over the classes."""
     assert frame.T_world_camera is not None
     n = len(masks)
     detections = Detections(
         masks=np.array(masks, np.bool_).reshape(n, *frame.depth.shape),
         boxes=np.zeros((n, 4), np.float32),
         scores=np.array(scores, np.float32),
-        class_probabilities=np.tile(np.float32(PROBABILITIES), (n, 1)),
+        class_probabilities=np.float32(probabilities or [PROBABILITIES] * n).reshape(n, 2),
         classes=CLASSES,
     )
     pose = Pose(frame.T_world_camera)

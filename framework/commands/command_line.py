@@ -65,7 +65,8 @@ def show_traceback(error: BaseException) -> None:
 
 def quiet_when_cut_off() -> None:
     """Lets `| head` end this process without a word."""
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)
+    if hasattr(signal, "SIGPIPE"):  # not on Windows
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:

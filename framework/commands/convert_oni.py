@@ -19,7 +19,7 @@ from framework.datasets.scenenn.oni import read_frames
 from framework.datasets.scenenn.oni_records import Contents, Stream, read_contents
 from framework.datasets.scenenn.timestamps import MICROSECONDS, write_timestamps
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 
 PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # what a better one saves takes longer than playing
 

@@ -37,13 +37,12 @@ def convert(source: Path, target: Path, kind: str | None, classes: str | None, n
     from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network
     from framework.detection.mask_rcnn.network_file import save_network
     from framework.detection.mask_rcnn.published_weights import find_network
-    from framework.files.whole_files import file_hash
+    from framework.files.hashing import path_hash
 
     path = find_network(source)
     names = tuple(name.strip() for name in classes.split(",")) if classes else None
     network = read_network(path, CheckpointKind(kind) if kind else None, names, norm_eps)
-    origin = {"converted_from": path.name, "converted_from_sha256": file_hash(path)}
-    save_network(network, target, origin, half)
+    save_network(network, target, {"converted_from": path.name, "converted_from_sha256": path_hash(path)}, half)
     architecture = network.architecture
     print(
         f"{target}: {architecture.backbone.name}, {len(architecture.classes)} classes,"

@@ -104,7 +104,7 @@ def _written(
 
 def write_labels(path: Path, classes: tuple[str, ...]) -> Path:
     """Writes the classes beside a result file, one a line: what its probabilities are over."""
-    from framework.files.atomic_files import written_whole
+    from framework.files.whole_files import written_whole
 
     labels = path.with_suffix(".labels.txt")
     with written_whole(labels) as temporary:

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from framework.commands.command_line import arguments, one_line_errors, quiet_when_cut_off
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
-from framework.registry import STAGES, find_class, plugin_fields
+from framework.registry import STAGES, find_class, parameter_fields, plugin_fields
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -84,8 +84,7 @@ def _option(loader: Any, stage: str, name: str) -> Option:
             default=nested.get(field.name) or str(given.get(field.name, _default(field))),
             comment=comments.get(field.name, ""),
         )
-        for field in dataclasses.fields(plugin_class)
-        if field.init
+        for field, _ in parameter_fields(plugin_class).values()
     )
     documentation = (inspect.getdoc(plugin_class) or "").partition("\n\n")[0].replace("\n", " ")
     change = _HEAD.match(_text(own.path, f"{stage}/{name}.yaml"))

@@ -8,10 +8,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-import numpy as np
-
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
-from framework.files.whole_files import file_hash
+from framework.files.hashing import add_array, path_hash
 from framework.rendering import rasterizer
 from framework.rendering.rasterizer import Rasterizer
 
@@ -54,8 +52,7 @@ class LabeledMesh:
         """SHA-256 (hex) of what is rendered, and of the code that does."""
         digest = hashlib.sha256()
         for array in (self.vertices, self.triangles, self.instance_ids):
-            digest.update(f"{array.dtype.str}{array.shape}".encode())
-            digest.update(np.ascontiguousarray(array).data)
+            add_array(digest, array)
         for source in (__file__, rasterizer.__file__):
-            digest.update(file_hash(Path(source)).encode())
+            digest.update(path_hash(Path(source)).encode())
         return digest.hexdigest()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -42,24 +43,34 @@ def fuse_scene_truth(
     return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
 
 
+class _Slots(NamedTuple):
+    """A hash table with linear probing, (S,) each. A slot without votes is empty."""
+
+    keys: Int64  # packed voxel
+    ids: Int32
+    votes: Int64
+    sums: Float64  # (S, 3) of the points' coordinates, m
+    first: Int64  # order of first sight
+
+    @classmethod
+    def empty(cls, capacity: int) -> _Slots:
+        kinds = (np.int64, np.int32, np.int64, (np.float64, 3), np.int64)
+        return cls(*(np.zeros(capacity, kind) for kind in kinds))
+
+
 class _VoteTable:
-    """Votes for (voxel, instance id) in a hash table with linear probing. A slot without votes is empty."""
+    """Votes for (voxel, instance id)."""
 
     def __init__(self) -> None:
         self.taken = 0
-        self._allocate(INITIAL_CAPACITY)
-
-    def _allocate(self, capacity: int) -> None:
-        self.keys = np.zeros(capacity, np.int64)  # packed voxel
-        self.ids = np.zeros(capacity, np.int32)
-        self.votes = np.zeros(capacity, np.int64)
-        self.sums = np.zeros((capacity, 3))  # of the points' coordinates, m
-        self.first = np.zeros(capacity, np.int64)  # order of first buffer
+        self.slots = _Slots.empty(INITIAL_CAPACITY)
 
     def add(self, view: LabeledDepth, truth_voxel: float) -> None:
         pixels = view.depth.size
-        while 2 * (self.taken + pixels) > len(self.keys):  # a view can at worst bring one new slot a pixel
-            self._grow()
+        while 2 * (self.taken + pixels) > len(self.slots.keys):  # a view can at worst bring one new slot a pixel
+            larger = _Slots.empty(2 * len(self.slots.keys))
+            _move(self.slots, larger)
+            self.slots = larger
         camera = view.camera
         self.taken = _vote(
             np.ascontiguousarray(view.depth),
@@ -67,40 +78,33 @@ class _VoteTable:
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
             np.ascontiguousarray(view.T_world_camera),
             1.0 / truth_voxel,
-            self.keys,
-            self.ids,
-            self.votes,
-            self.sums,
-            self.first,
+            self.slots,
             self.taken,
         )
         if self.taken < 0:
             raise DataError(f"ground truth: a point lies more than {KEY_OFFSET * truth_voxel:.0f} m from the origin")
 
-    def _grow(self) -> None:
-        old = self.keys, self.ids, self.votes, self.sums, self.first
-        self._allocate(2 * len(self.keys))
-        _move(*old, self.keys, self.ids, self.votes, self.sums, self.first)
-
     def elect(self) -> tuple[Float32, Int32]:
-        """Each voxel's mean point (V, 3) and majority id (V,), in the order of first buffer."""
-        slots = np.flatnonzero(self.votes)
-        best_first = slots[np.lexsort((self.ids[slots], -self.votes[slots], self.keys[slots]))]
-        voxel = self.keys[best_first]
+        """Each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
+        keys, ids, votes, sums, first = self.slots
+        taken = np.flatnonzero(votes)
+        best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]
+        voxel = keys[best_first]
         is_best = np.ones(len(voxel), np.bool_)
         is_best[1:] = voxel[1:] != voxel[:-1]
         winners = best_first[is_best]
         voxel_of_entry = np.cumsum(is_best) - 1
         seen = np.full(len(winners), np.iinfo(np.int64).max)
-        np.minimum.at(seen, voxel_of_entry, self.first[best_first])
+        np.minimum.at(seen, voxel_of_entry, first[best_first])
         winners = winners[np.argsort(seen, kind="stable")]
-        points = self.sums[winners] / self.votes[winners, None]
-        return points.astype(np.float32), self.ids[winners]
+        points = sums[winners] / votes[winners, None]
+        return points.astype(np.float32), ids[winners]
 
 
 @njit(cache=True, nogil=True)
-def _slot(keys: Int64, ids: Int32, votes: Int64, key: np.int64, instance: np.int32) -> np.int64:
+def _slot(slots: _Slots, key: np.int64, instance: np.int32) -> np.int64:
     """The slot that holds (key, instance), or the empty one where it belongs."""
+    keys, ids, votes, _, _ = slots
     mask = len(keys) - 1
     mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(instance) * np.uint64(0xC2B2AE3D27D4EB4F)
     mixed ^= mixed >> np.uint64(29)
@@ -113,19 +117,10 @@ def _slot(keys: Int64, ids: Int32, votes: Int64, key: np.int64, instance: np.int
 
 @njit(cache=True, nogil=True)
 def _vote(
-    depth: Float32,
-    instance_ids: Int32,
-    intrinsics: Float64,
-    T: Float64,
-    scale: float,
-    keys: Int64,
-    ids: Int32,
-    votes: Int64,
-    sums: Float64,
-    first: Int64,
-    taken: int,
+    depth: Float32, instance_ids: Int32, intrinsics: Float64, T: Float64, scale: float, slots: _Slots, taken: int
 ) -> int:
     """Adds one view's pixels; returns the number of slots taken, -1 when a point is too far away."""
+    keys, ids, votes, sums, first = slots
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
     height, width = depth.shape
     for v in range(height):
@@ -144,7 +139,7 @@ def _vote(
             if (i | j | k) < 0 or (i | j | k) >= 2 * KEY_OFFSET:
                 return -1
             key = (i << (2 * KEY_BITS)) | (j << KEY_BITS) | k
-            slot = _slot(keys, ids, votes, key, instance_ids[v, u])
+            slot = _slot(slots, key, instance_ids[v, u])
             if votes[slot] == 0:
                 keys[slot] = key
                 ids[slot] = instance_ids[v, u]
@@ -158,21 +153,10 @@ def _vote(
 
 
 @njit(cache=True, nogil=True)
-def _move(
-    keys: Int64,
-    ids: Int32,
-    votes: Int64,
-    sums: Float64,
-    first: Int64,
-    to_keys: Int64,
-    to_ids: Int32,
-    to_votes: Int64,
-    to_sums: Float64,
-    to_first: Int64,
-) -> None:
+def _move(slots: _Slots, to: _Slots) -> None:
     """Puts all entries into a larger table."""
-    for s in range(len(keys)):
-        if votes[s] > 0:
-            slot = _slot(to_keys, to_ids, to_votes, keys[s], ids[s])
-            to_keys[slot], to_ids[slot], to_votes[slot], to_first[slot] = keys[s], ids[s], votes[s], first[s]
-            to_sums[slot] = sums[s]
+    for s in range(len(slots.keys)):
+        if slots.votes[s] > 0:
+            slot = _slot(to, slots.keys[s], slots.ids[s])
+            to.keys[slot], to.ids[slot] = slots.keys[s], slots.ids[s]
+            to.votes[slot], to.sums[slot], to.first[slot] = slots.votes[s], slots.sums[s], slots.first[s]

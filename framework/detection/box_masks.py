@@ -23,6 +23,7 @@ import numpy as np
 from numba import njit
 
 from framework.data import Bool, Camera, Float32
+from framework.sensor_noise import axial_sigma
 
 BIN = 0.02  # of log depth: 2 % of the depth
 FARTHEST = 100.0  # m, the end of the histogram
@@ -157,7 +158,7 @@ def _grow(window, weight_x, weight_y, near, far, step, mask):
 @njit(cache=True, nogil=True)
 def _largest_step(z, step):
     """The largest difference in depth, m, between neighbours of one surface at z m."""
-    return step * z + NOISE * (0.0012 + 0.0019 * (z - 0.4) ** 2)  # Nguyen et al., 3DIMPVT 2012: sigma of a Kinect
+    return step * z + NOISE * axial_sigma(z)
 
 
 @njit(cache=True, nogil=True)

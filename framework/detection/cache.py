@@ -13,11 +13,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from omegaconf import DictConfig
 
-from framework.data import Array, Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
+from framework.data import Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
 from framework.detection.fingerprint import fingerprint
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_files import written_whole
+from framework.files.hashing import add_array
+from framework.files.whole_files import written_whole
 from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)
@@ -170,23 +171,19 @@ def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
     digest = hashlib.sha256()
     for name in sorted(reads):
         value = getattr(frame, name)
+        digest.update(f"{name}=".encode())
         if isinstance(value, FrameTruth):
             if isinstance(value, DeferredTruth):
-                digest.update(f"{name} of {value.origin};".encode())
+                digest.update(f"of {value.origin};".encode())
             else:
-                _tell(digest, name, value.instance_ids)
+                add_array(digest, value.instance_ids)
             # repr tells None from "None", and no order of insertion
             digest.update(repr(sorted(value.class_names.items())).encode())
         elif isinstance(value, np.ndarray):
-            _tell(digest, name, value)
+            add_array(digest, value)
         else:  # numbers, the camera and None: Python writes floats so that they read back exactly
-            digest.update(f"{name}={value!r};".encode())
+            digest.update(f"{value!r};".encode())
     return digest.hexdigest()
-
-
-def _tell(digest: hashlib._Hash, name: str, array: Array) -> None:
-    digest.update(f"{name}={array.dtype.str}{array.shape};".encode())
-    digest.update(np.ascontiguousarray(array).data)
 
 
 def pack(detections: Detections) -> bytes:

@@ -1,6 +1,7 @@
 """COCO's result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
 
-Beside COCO's own keys an entry may have `category_name`, and `class_probabilities`: the whole distribution.
+Beside COCO's own keys an entry may have `category_name`, and `class_probabilities`: the whole distribution. pycocotools
+reads such a file only beside the annotations of its images, and trusts its entries.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from framework.detection.stored_detection import (
     read_score,
 )
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.label_spaces import COCO
 
 _UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's annotation files: 91 were planned, 80 were annotated

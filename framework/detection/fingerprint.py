@@ -11,8 +11,8 @@ from enum import Enum
 from pathlib import Path
 
 from framework.errors import ConfigError
+from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
-from framework.files.whole_files import file_hash
 
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Another version may give other last digits."""
@@ -45,11 +45,11 @@ def _code(kind: type) -> Iterator[str]:
         source = getattr(sys.modules.get(module), "__file__", None)
         if source is None:
             raise ConfigError(f"{kind.__qualname__} has no source file to identify it by: give it a fingerprint()")
-        yield file_hash(Path(source))
+        yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[1]
     for pattern in SHARED_SOURCES:
         for source in sorted(framework.glob(pattern)):
-            yield file_hash(source)
+            yield path_hash(source)
     for library in LIBRARIES:
         try:
             yield f"{library} {importlib.metadata.version(library)}"
@@ -93,17 +93,11 @@ def _device() -> str:
 
 
 def content_hash(path: Path) -> str:
-    """SHA-256 of a file, or of the names and the bytes of all files below a folder; "" for a path that is not given."""
+    """`path_hash` of where a path leads; "" for one that is not given."""
     if path == NOT_GIVEN:
         return ""
     found = next((candidate for candidate in candidates(path) if candidate.exists()), None)
     if found is None:
         looked = " and ".join(str(candidate) for candidate in candidates(path))
         raise ConfigError(f"there is no {looked}, by which the detector would be identified: give it a fingerprint()")
-    if found.is_file():
-        return file_hash(found)
-    digest = hashlib.sha256()
-    for file in sorted(file for file in found.rglob("*") if file.is_file()):
-        name = file.relative_to(found).as_posix()
-        digest.update(f"{len(name)}:{name}:{file_hash(file)}".encode())
-    return digest.hexdigest()
+    return path_hash(found)

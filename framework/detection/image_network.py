@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import UInt8
 from framework.detection.letterbox import Letterbox, Placement, network_input
-from framework.detection.onnx_network import OnnxNetwork, Outputs, Runtime
+from framework.detection.onnx_network import OnnxNetwork, Outputs
 from framework.parameters import require
 
 
@@ -23,7 +23,6 @@ class ImageNetwork:
         *,
         path: Path,
         sha256: str,
-        runtime: Runtime,
         device: str,
         input_size: int,
         placement: Placement,
@@ -37,8 +36,8 @@ class ImageNetwork:
         require(0 <= padding <= 255, "detector.padding", padding, "in [0, 255]")
         require(bool(np.isfinite([black, white]).all()) and black != white, "detector.white", white, f"not {black}")
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
-        self._network = OnnxNetwork(path, sha256, runtime, device, input_size)
-        whole = self._network.input.dtype != "uint8" or (black, white) == (0, 255)
+        self._network = OnnxNetwork(path, sha256, device, input_size)
+        whole = self._network.dtype != "uint8" or (black, white) == (0, 255)
         require(whole, "detector.black and white", f"{black} and {white}", "0 and 255 for a network of whole numbers")
         self.shape = self._network.shape  # (height, width) px
         self._placement, self._padding, self._bgr = placement, padding, bgr
@@ -48,9 +47,7 @@ class ImageNetwork:
         """The network's outputs by name for an image (h, w, 3) RGB, and where the image lies in its input."""
         letterbox = Letterbox.fit(color.shape[:2], self.shape, self._placement)
         canvas = letterbox.fill(color, self._padding)
-        return self._network(
-            network_input(canvas, self._network.input.dtype, self._bgr, self._black, self._white)
-        ), letterbox
+        return self._network(network_input(canvas, self._network.dtype, self._bgr, self._black, self._white)), letterbox
 
     def try_out(self) -> Outputs:
         """The outputs for a black image: a network of another form is found when the detector is built."""

@@ -1,4 +1,8 @@
-"""Greedy non-maximum suppression."""
+"""Greedy non-maximum suppression.
+
+Hand-written, for OpenCV's moves the boxes to tell classes apart, which rounds their IoU, and torchvision's extension
+loads only beside its own build of torch.
+"""
 
 from __future__ import annotations
 

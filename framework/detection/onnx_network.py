@@ -1,37 +1,26 @@
-"""A network in an ONNX file, run by onnxruntime or by OpenCV."""
+"""A network in an ONNX file, run by onnxruntime."""
 
 from __future__ import annotations
 
-import hashlib
-import importlib.util
-import logging
-from collections.abc import Callable
-from enum import Enum
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
 
 from framework.data import Float32
-from framework.detection.onnx_file import Signature, TensorType, read_signature
 from framework.errors import ConfigError, DataError
+from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
-INPUT_DTYPES = ("float32", "float16", "uint8")
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession, NodeArg
 
-log = logging.getLogger(__name__)
+INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # numpy's names
 
 Array = np.ndarray[Any, Any]
 Outputs = dict[str, Float32]
-
-
-class Runtime(Enum):
-    """What runs a network."""
-
-    auto = "auto"  # onnxruntime where it is installed, else OpenCV
-    onnxruntime = "onnxruntime"
-    opencv = "opencv"
 
 
 class OnnxNetwork:
@@ -41,7 +30,7 @@ class OnnxNetwork:
     threads sleep, because the map is built at the same time.
     """
 
-    def __init__(self, path: Path, sha256: str, runtime: Runtime, device: str, input_size: int) -> None:
+    def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
         """Loads the network of the file `path`; see `find_file` for a relative one.
 
         sha256: what the file must have, "" = whatever it is. device: auto, cpu or cuda. input_size: px, the side of
@@ -49,26 +38,16 @@ class OnnxNetwork:
 
         Raises:
             DataError: the file is missing, damaged, not the expected one, or cannot be run.
-            ConfigError: the runtime or the device is not there, or `input_size` does not fit the network.
+            ConfigError: onnxruntime or the device is not there, or `input_size` does not fit the network.
         """
         self.path = find_file(path)
-        self.sha256, self.signature = _read_checked(self.path, sha256)
-        self.input = _image_input(self.path, self.signature)
-        self.shape = _input_shape(self.path, self.input, self.channels_last, input_size)
-        chosen = _choose(runtime)
-        load = _with_onnxruntime if chosen is Runtime.onnxruntime else _with_opencv
-        try:
-            self._run = load(self.path, self.signature, device)
-        except ConfigError:
-            raise
-        except Exception as error:  # each runtime has its own
-            raise DataError(f"{self.path} cannot be loaded by {chosen.value}: {_one_line(error)}") from error
-        self.runtime = chosen
-
-    @property
-    def channels_last(self) -> bool:
-        """Whether the input is (1, H, W, 3), as in networks from TensorFlow, and not (1, 3, H, W)."""
-        return self.input.shape[3] == 3 and self.input.shape[1] != 3
+        self.sha256 = _checked_hash(self.path, sha256)
+        self._session = _loaded(self.path, device)
+        image = _image_input(self.path, self._session.get_inputs())
+        self._name = image.name
+        self.dtype = INPUT_DTYPES[image.type]
+        self.channels_last = image.shape[3] == 3 and image.shape[1] != 3  # (1, H, W, 3), as in networks from TensorFlow
+        self.shape = _input_shape(self.path, image, self.channels_last, input_size)
 
     def __call__(self, image: Array) -> Outputs:
         """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
@@ -76,11 +55,12 @@ class OnnxNetwork:
         Raises DataError when the network fails or computes numbers that are not finite.
         """
         blob = image[None] if self.channels_last else image.transpose(2, 0, 1)[None]
+        names = [output.name for output in self._session.get_outputs()]
         try:
-            outputs = self._run(np.ascontiguousarray(blob))
-        except Exception as error:  # each runtime has its own
-            raise DataError(f"{self.path} failed in {self.runtime.value}: {_one_line(error)}") from error
-        arrays = {name: np.asarray(output, np.float32) for name, output in outputs.items()}
+            outputs = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
+        except Exception as error:  # onnxruntime has no base of its own
+            raise DataError(f"{self.path} failed in onnxruntime: {_one_line(error)}") from error
+        arrays = {name: np.asarray(output, np.float32) for name, output in zip(names, outputs, strict=True)}
         for name, array in arrays.items():
             if not np.isfinite(array).all():
                 raise DataError(f"{self.path}: the output {name} holds values that are not finite")
@@ -97,60 +77,21 @@ def find_file(path: Path) -> Path:
     raise DataError(f"detector.weights: there is no file {looked}; put the network there, or name another")
 
 
-def _read_checked(path: Path, sha256: str) -> tuple[str, Signature]:
+def _checked_hash(path: Path, sha256: str) -> str:
     try:
-        content = path.read_bytes()
+        found = path_hash(path)
     except OSError as error:
         raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
-    found = hashlib.sha256(content).hexdigest()
     if sha256 and found != sha256.lower():
         raise DataError(f"detector.weights: {path} has the sha256 {found}, expected {sha256}")
-    return found, read_signature(path, content)
+    return found
 
 
-def _image_input(path: Path, signature: Signature) -> TensorType:
-    described = ", ".join(str(tensor) for tensor in signature.inputs)
-    wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
-    if len(signature.inputs) != 1:
-        raise DataError(f"{path}: {wanted}, found {len(signature.inputs)} inputs: {described}")
-    (image,) = signature.inputs
-    if len(image.shape) != 4 or image.shape[0] > 1 or 3 not in (image.shape[1], image.shape[3]):
-        raise DataError(f"{path}: {wanted}, found {described}")
-    if image.dtype not in INPUT_DTYPES:
-        raise DataError(f"{path}: the input must be one of {', '.join(INPUT_DTYPES)}, found {described}")
-    return image
-
-
-def _input_shape(path: Path, image: TensorType, channels_last: bool, input_size: int) -> tuple[int, int]:
-    """(height, width) in px."""
-    height, width = image.shape[1:3] if channels_last else image.shape[2:]
-    if height and width:
-        if input_size and (height, width) != (input_size, input_size):
-            raise ConfigError(
-                f"detector.input_size must be 0 or the network's own, found {input_size}: {path} takes {image}"
-            )
-        return height, width
-    if not input_size:
-        raise ConfigError(f"detector.input_size must be given in px: {path} takes any size: {image}")
-    return height or input_size, width or input_size
-
-
-def _choose(runtime: Runtime) -> Runtime:
-    installed = importlib.util.find_spec("onnxruntime") is not None
-    if runtime is Runtime.onnxruntime and not installed:
-        raise ConfigError(
-            "detector.runtime: onnxruntime is not installed: pip install instancemap[onnx], or choose opencv"
-        )
-    if runtime is not Runtime.auto:
-        return runtime
-    chosen = Runtime.onnxruntime if installed else Runtime.opencv
-    log.info("runtime: %s%s", chosen.value, "" if installed else ", for onnxruntime is not installed")
-    return chosen
-
-
-def _with_onnxruntime(path: Path, signature: Signature, device: str) -> Callable[[Array], dict[str, Array]]:
-    import onnxruntime
-
+def _loaded(path: Path, device: str) -> InferenceSession:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ConfigError("onnxruntime, which runs ONNX files, is not there: pip install instancemap[onnx]") from error
     cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
     if device == "cuda" and not cuda:
         raise ConfigError("detector.device must be cpu or auto without onnxruntime-gpu and a GPU, found cuda")
@@ -160,26 +101,51 @@ def _with_onnxruntime(path: Path, signature: Signature, device: str) -> Callable
     options.log_severity_level = 3  # errors
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     providers = ["CUDAExecutionProvider"] * (cuda and device != "cpu") + ["CPUExecutionProvider"]
-    session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:  # onnxruntime has no base of its own
+        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {_one_line(error)}") from error
     if device == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
         raise ConfigError("detector.device must be cpu or auto where CUDA cannot be started, found cuda")
-    (image,) = signature.inputs
-    names = [output.name for output in signature.outputs]
-    return lambda blob: dict(zip(names, session.run(names, {image.name: blob}), strict=True))
+    return session
 
 
-def _with_opencv(path: Path, signature: Signature, device: str) -> Callable[[Array], dict[str, Array]]:
-    if device == "cuda":
-        raise ConfigError("detector.device must be cpu or auto with the runtime opencv, found cuda")
-    network = cv2.dnn.readNetFromONNX(str(path))
-    (image,) = signature.inputs
-    names = [output.name for output in signature.outputs]
+def _image_input(path: Path, inputs: Sequence[NodeArg]) -> NodeArg:
+    found = ", ".join(map(_described, inputs))
+    wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
+    if len(inputs) != 1:
+        raise DataError(f"{path}: {wanted}, found {len(inputs)} inputs: {found}")
+    (image,) = inputs
+    if len(image.shape) != 4 or _length(image.shape[0]) > 1 or 3 not in (image.shape[1], image.shape[3]):
+        raise DataError(f"{path}: {wanted}, found {found}")
+    if image.type not in INPUT_DTYPES:
+        raise DataError(f"{path}: the input must be one of {', '.join(INPUT_DTYPES.values())}, found {found}")
+    return image
 
-    def run(blob: Array) -> dict[str, Array]:
-        network.setInput(blob, image.name)
-        return dict(zip(names, network.forward(names), strict=True))
 
-    return run
+def _input_shape(path: Path, image: NodeArg, channels_last: bool, input_size: int) -> tuple[int, int]:
+    """(height, width) in px."""
+    height, width = map(_length, image.shape[1:3] if channels_last else image.shape[2:])
+    if height and width:
+        if input_size and (height, width) != (input_size, input_size):
+            raise ConfigError(
+                f"detector.input_size must be 0 or the network's own, found {input_size}: {path} takes"
+                f" {_described(image)}"
+            )
+        return height, width
+    if not input_size:
+        raise ConfigError(f"detector.input_size must be given in px: {path} takes any size: {_described(image)}")
+    return height or input_size, width or input_size
+
+
+def _described(tensor: NodeArg) -> str:
+    shape = ", ".join(str(_length(n) or "any") for n in tensor.shape)
+    return f"{tensor.name} ({shape}) {INPUT_DTYPES.get(tensor.type, tensor.type)}"
+
+
+def _length(dimension: int | str | None) -> int:
+    """0 = any: such a dimension has a name, or none."""
+    return dimension if isinstance(dimension, int) else 0
 
 
 def _one_line(error: Exception) -> str:

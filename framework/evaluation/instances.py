@@ -1,9 +1,9 @@
 """3D instance segmentation: average precision and overlap of a map's instances against the true ones.
 
-The protocol is the one of protocol.md: labels are carried between map vertices and true surface points by nearest
-neighbor, predictions are matched to truth greedily in order of confidence, and a class's AP is the area under its
-precision-recall curve with all-point interpolation (the precision at a recall is the largest precision at that or any
-higher recall, as in Pascal VOC from 2010 on), averaged over the classes that have a true instance.
+The paper's figure is AP at IoU 0.5, averaged over classes. Labels are carried between map vertices and true surface
+points by nearest neighbor, predictions are matched to truth greedily in order of confidence, and a class's AP is the
+area under its precision-recall curve with all-point interpolation (the precision at a recall is the largest precision
+at that or any higher recall, as in Pascal VOC from 2010 on), averaged over the classes that have a true instance.
 
 **What is evaluated.** A true instance counts when its class is known and it has at least `min_points` points. The other
 true instances (class None, or too few points) are *ignored* ones: something is there, but nobody can say whether a
@@ -39,7 +39,7 @@ IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # those 
 class Transfer(Enum):
     """Which way labels are carried; tables name it."""
 
-    TO_TRUTH = "to_truth"  # each true point takes the instance of the nearest map vertex: protocol.md, the default
+    TO_TRUTH = "to_truth"  # each true point takes the instance of the nearest map vertex: the default
     TO_MAP = "to_map"  # each map vertex takes the instance of the nearest true point
 
 
@@ -205,7 +205,7 @@ class _Overlaps:
     """K predictions, best first, against T true instances."""
 
     iou: Float64  # (K, T)
-    untold: Bool  # (K,) more than half of the points on ignored instances, or of a class that nobody looked for
+    ignorable: Bool  # (K,) more than half of the points on ignored instances, or of a class that nobody looked for
     predicted_ids: Int64  # (K,)
     predicted_classes: npt.NDArray[np.object_]  # (K,)
     truth_ids: Int64  # (T,)
@@ -224,7 +224,7 @@ class _Overlaps:
         truth_ids, truth_sizes = np.unique(truth.instance_ids[truth.instance_ids > 0], return_counts=True)
         ranks = np.lexsort((predictions.ids, -predictions.confidences))
         ids = predictions.ids[ranks]
-        predicted, true = _paired(predictions, truth, transfer, max_distance)
+        predicted, true = _transferred(predictions, truth, transfer, max_distance)
         points = _contingency(predicted, true, ids, truth_ids)
         intersection = points[1:, 1:]
         union = points[1:].sum(axis=1)[:, None] + points[:, 1:].sum(axis=0)[None, :] - intersection
@@ -235,7 +235,7 @@ class _Overlaps:
         looked_for = truth.classes is None or np.isin(predicted_classes, truth.classes)
         return cls(
             iou=intersection / np.maximum(union, 1),
-            untold=mostly_ignored | np.logical_not(looked_for),
+            ignorable=mostly_ignored | np.logical_not(looked_for),
             predicted_ids=ids,
             predicted_classes=predicted_classes,
             truth_ids=truth_ids.astype(np.int64),
@@ -246,7 +246,7 @@ class _Overlaps:
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
         """Matches the chosen predictions (K,) in order of confidence with true instances that are `allowed` (K, T)."""
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
-        unknown = self.untold | (ignored_iou >= threshold)
+        unknown = self.ignorable | (ignored_iou >= threshold)
         free = np.ones(len(self.truth_ids), np.bool_)
         hits: list[bool] = []  # of the predictions that count, best first
         ignored, matched_iou = 0, 0.0
@@ -294,27 +294,29 @@ def average_precision(hits: Bool, truths: int) -> float:
     return float(envelope[hits].sum() / truths)
 
 
-def _paired(
+def _transferred(
     predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, max_distance: float
 ) -> tuple[Int32, Int32]:
     """Predicted and true instance ids at the same points, after the transfer."""
     if transfer is Transfer.TO_TRUTH:
-        carried = carry(predictions.points_world, predictions.instance_ids, truth.points_world, max_distance)
+        carried = transfer_labels(predictions.points_world, predictions.instance_ids, truth.points_world, max_distance)
         return carried, truth.instance_ids
-    carried = carry(truth.points_world, truth.instance_ids, predictions.points_world, max_distance)
+    carried = transfer_labels(truth.points_world, truth.instance_ids, predictions.points_world, max_distance)
     return predictions.instance_ids, carried
 
 
-def carry(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
+def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
     """The label of the nearest of `points` for each target, 0 where none is within `max_distance`."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
+    import numba  # here: commands that only read figures are answered before it loads
+
     # Meshes come in an order that differs between runs: sorted, equally near points give the same label each time.
     order = np.lexsort((labels, points[:, 2], points[:, 1], points[:, 0]))
     points, labels = points[order], labels[order]
     tree = cKDTree(points, balanced_tree=False)
-    # the bound is exclusive in SciPy
-    _, nearest = tree.query(targets, distance_upper_bound=np.nextafter(max_distance, np.inf), workers=-1)
+    bound = np.nextafter(max_distance, np.inf)  # exclusive in SciPy
+    _, nearest = tree.query(targets, distance_upper_bound=bound, workers=numba.get_num_threads())
     carried: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy answers "none" with the index after the last
     return carried
 

@@ -13,6 +13,7 @@ from scipy.sparse import csr_array
 from framework.data import Bool, Detections, Float64, Frame, FrameTruth, Int32, PointClusters, Pose
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
+from framework.refinement.refine import refine
 
 TIMED = 5  # calls, of which the median counts; the one before them may have to compile
 
@@ -31,11 +32,11 @@ class Refinement:
         """Lifts the detections at the frame's true pose, or else in the camera's own frame, and refines them."""
         pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
         before = lift(detections, frame, pose)
-        after = refiner.refine(before, frame)
+        after = refine(refiner, before, frame)
         times = []
         for _ in range(TIMED):
             started = time.perf_counter()
-            refiner.refine(before, frame)
+            refine(refiner, before, frame)
             times.append(1e3 * (time.perf_counter() - started))
         return cls(frame, before, after, statistics.median(times))
 
@@ -121,8 +122,8 @@ def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
 def membership(clusters: PointClusters, frame: Frame) -> csr_array:
     """(N, H * W) 1 where a cluster has a point at the pixel."""
     held = clusters.cluster >= 0
-    places = clusters.cluster[held], pixel_index(clusters, frame)[held]
-    return csr_array((np.ones(held.sum(), np.int32), places), (len(clusters), frame.depth.size))
+    entries = clusters.cluster[held], pixel_index(clusters, frame)[held]
+    return csr_array((np.ones(held.sum(), np.int32), entries), (len(clusters), frame.depth.size))
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:

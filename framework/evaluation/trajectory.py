@@ -33,7 +33,7 @@ class TrajectoryError:
     pairs: int  # that RPE compares
 
     def metrics(self) -> dict[str, float]:
-        """Flat metric names as in design.md; an error that is not defined is left out."""
+        """By their names in metrics.json; an error that is not defined is left out."""
         flat: dict[str, float] = {}
         if self.frames:
             flat["trajectory.ate_rmse_m"] = self.ate_rmse_m

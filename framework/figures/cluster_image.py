@@ -15,7 +15,7 @@ from framework.figures.drawing import (
     PANEL_WIDTH,
     SUPERSAMPLING,
     TAG_PX,
-    developed,
+    downsampled,
     draw_heading,
     font_of,
     rgb_of,
@@ -54,7 +54,7 @@ def image_panel(frame: Frame, column: ClusterMarks) -> UInt8:
         cv2.polylines(canvas, border, True, WHITE, 3 * SUPERSAMPLING, cv2.LINE_AA)
     for k, border in borders.items():
         cv2.polylines(canvas, border, True, rgb_of(0.62 * column.colors[k]), round(1.6 * SUPERSAMPLING), cv2.LINE_AA)
-    picture = Image.fromarray(developed(canvas, size))
+    picture = Image.fromarray(downsampled(canvas, size))
     panel = Image.new("RGB", (PANEL_WIDTH, size[0]), PAPER)
     left = (PANEL_WIDTH - size[1]) // 2
     _tag_clusters(picture, column)
@@ -148,6 +148,6 @@ def _key(panel: Image.Image, column: ClusterMarks, left: int) -> None:
     for (text, ground, color, falling), width in zip(shown, widths, strict=True):
         swatch = np.tile(np.array(ground, np.float32), (16 * SUPERSAMPLING, 22 * SUPERSAMPLING, 1))
         _hatch(swatch, np.ones(swatch.shape[:2], np.bool_), color, 1.0, falling)
-        panel.paste(Image.fromarray(developed(swatch, (16, 22))), (round(x), bottom - 22))
+        panel.paste(Image.fromarray(downsampled(swatch, (16, 22))), (round(x), bottom - 22))
         canvas.text((x + 28, bottom - 14), text, INK, font, anchor="lm")
         x += width

@@ -74,11 +74,11 @@ def _colors(count: int) -> UInt8:
 def _colors_after(refinement: Refinement) -> UInt8:
     """(M, 3) the largest part of a cluster keeps its colour; further parts, and clusters from nowhere, get new ones."""
     n, m = len(refinement.before), len(refinement.after)
-    place = np.full(m, -1)
+    color_index = np.full(m, -1)
     known = np.flatnonzero(refinement.main_part >= 0)
-    place[refinement.main_part[known]] = known
-    place[place < 0] = n + np.arange((place < 0).sum())
-    return np.asarray(_colors(n + m)[place])
+    color_index[refinement.main_part[known]] = known
+    color_index[color_index < 0] = n + np.arange((color_index < 0).sum())
+    return np.asarray(_colors(n + m)[color_index])
 
 
 def _owner(clusters: PointClusters, frame: Frame, sizes: Int32) -> Int32:

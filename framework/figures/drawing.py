@@ -42,7 +42,7 @@ def draw_heading(panel: Image.Image, text: str, left: int = 0) -> None:
     canvas.text((left + 18, 22), text, INK, font, anchor="lm")
 
 
-def developed(drawn: Array, size: tuple[int, int]) -> UInt8:
+def downsampled(drawn: Array, size: tuple[int, int]) -> UInt8:
     """What was drawn too large, (h, w, 3), at its height and width in the picture."""
     return np.asarray(cv2.resize(drawn, size[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 

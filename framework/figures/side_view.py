@@ -16,7 +16,7 @@ from framework.figures.drawing import (
     SUPERSAMPLING,
     TAG_PX,
     TEXT_PX,
-    developed,
+    downsampled,
     draw_heading,
     font_of,
 )
@@ -144,7 +144,7 @@ def side_panel(frame: Frame, column: ClusterMarks, side: SideView | None) -> UIn
         lit = shading(buffer) ** contrast
         there = nearest >= 0
         drawn[there] = np.clip(color[nearest[there]] * lit[there, None], 0, 255)
-    panel = Image.fromarray(developed(drawn, (HEIGHT, PANEL_WIDTH)))
+    panel = Image.fromarray(downsampled(drawn, (HEIGHT, PANEL_WIDTH)))
     draw_heading(panel, f"{column.heading}, from the side")
     _scale_bar(panel, side)
     return np.asarray(panel)

@@ -11,6 +11,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
+from scipy.optimize import isotonic_regression
 
 from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, say_inside
@@ -97,20 +98,13 @@ def running_median(values: Float64, window: int) -> Float64:
 def spread(positions: Sequence[float], gap: float) -> list[float]:
     """The positions moved apart, as little as can be, until neighbours are `gap` or more from each other.
 
-    Those that would touch become a group, evenly spaced about its own mean, as often as groups touch.
+    Least squares: those that would touch become a group, evenly spaced about its own mean, as often as groups touch.
     """
     order = np.argsort(positions, kind="stable")
-    groups: list[list[float]] = []  # of the positions wished for
-    for k in order:
-        groups.append([positions[k]])
-        while len(groups) > 1 and _end(groups[-2], gap) + gap > _begin(groups[-1], gap):
-            last = groups.pop()
-            groups[-1] += last
-    placed = [_begin(group, gap) + gap * k for group in groups for k in range(len(group))]
-    result = [0.0] * len(positions)
-    for k, position in zip(order, placed, strict=True):
-        result[k] = position
-    return result
+    steps = gap * np.arange(len(order))
+    result = np.empty(len(order))
+    result[order] = isotonic_regression(np.asarray(positions)[order] - steps).x + steps
+    return result.tolist()
 
 
 def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
@@ -132,14 +126,6 @@ def _of_stage(run: StageTimes, stage: str) -> Float64:
     if stage == SUM:
         return np.asarray(np.sum([run.milliseconds.get(one, nothing) for one in STAGES], axis=0), np.float64)
     return run.milliseconds.get(stage, nothing)
-
-
-def _begin(group: list[float], gap: float) -> float:
-    return sum(group) / len(group) - gap * (len(group) - 1) / 2
-
-
-def _end(group: list[float], gap: float) -> float:
-    return _begin(group, gap) + gap * (len(group) - 1)
 
 
 def _draw(axes: Axes, times: MeanTimes) -> None:

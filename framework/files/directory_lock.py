@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TextIO
+
+from filelock import FileLock, Timeout
 
 from framework.errors import DataError
 
-LOCK = ".lock"  # the file that is locked; it stays, since who removes it could take it from under another's lock
+LOCK, HOLDER = ".lock", ".lock_holder"  # what is locked, and who has it: on Windows a locked file cannot be read
 
 log = logging.getLogger(__name__)
 
@@ -26,25 +26,26 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
     there is a warning, and nobody is kept out.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    with (directory / LOCK).open("a+") as file:
-        try:
-            _lock(file, directory, wait)
-        except OSError as error:
-            log.warning("%s cannot be locked (%s): start nothing else there meanwhile", directory, error.strerror)
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        file.flush()
-        yield
-
-
-def _lock(file: TextIO, directory: Path, wait: bool) -> None:
+    lock = FileLock(directory / LOCK, fallback_to_soft=False)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError as error:
-        file.seek(0)
-        holder = file.read().strip() or "another process"
+        _acquire(lock, directory, wait)
+    except OSError as error:
+        log.warning("%s cannot be locked (%s): start nothing else there meanwhile", directory, error.strerror)
+    try:
+        (directory / HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+        yield
+    finally:
+        lock.release()
+
+
+def _acquire(lock: FileLock, directory: Path, wait: bool) -> None:
+    try:
+        lock.acquire(blocking=False)
+    except Timeout as error:
+        file = directory / HOLDER
+        holder = (file.read_text().strip() if os.access(file, os.R_OK) else "") or "another process"
         if not wait:
             message = f"{directory} is in use by {holder}; wait until it has ended, or end it"
             raise DataError(message) from error
         log.warning("waiting for %s, which is at work in %s", holder, directory)
-        fcntl.flock(file, fcntl.LOCK_EX)
+        lock.acquire()

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -1,4 +1,7 @@
-"""Trajectories in the TUM format: a line a pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, metres, seconds."""
+"""Trajectories in the TUM format: a line a pose, `timestamp tx ty tz qx qy qz qw`, T_world_camera, metres, seconds.
+
+Hand-written, for evo, which reads them too, is GPL.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
 from framework.files.number_lines import numbers, read_lines
+from framework.files.whole_files import written_whole
 
 COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is what Microsoft's C library prints for NaN
 COLUMNS = "timestamp tx ty tz qx qy qz qw"

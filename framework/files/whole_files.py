@@ -1,13 +1,36 @@
-"""Files that are read whole, up to the size that files of their kind can have."""
+"""Files that are written whole or not at all, and read whole, up to the size that files of their kind can have."""
 
 from __future__ import annotations
 
-import hashlib
+import os
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from framework.errors import DataError
 
 MOST_TEXT = 2**28  # bytes, of text and JSON; an hour of poses has 10 MB
+
+
+@contextmanager
+def written_whole(path: Path) -> Iterator[Path]:
+    """Yields a temporary path beside `path` to write to; on success it becomes `path`, else nothing is left behind.
+
+    The temporary name keeps the suffix, because image and mesh writers choose their format by it. Raises DataError when
+    the disk does not take the file.
+    """
+    # a process id is not enough: containers that share a folder have the same ones
+    temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
+    try:
+        yield temporary
+        with temporary.open("rb+") as file:  # to be written to, else Windows does not let it be synced
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        raise DataError(f"{path} could not be written: {error.strerror or error}") from error
+    finally:
+        temporary.unlink(missing_ok=True)
 
 
 def read_bytes(path: Path, most: int) -> bytes:
@@ -19,12 +42,6 @@ def read_bytes(path: Path, most: int) -> bytes:
         return path.read_bytes()
     except OSError as error:
         raise DataError(f"{path} could not be read: {error.strerror or error}") from error
-
-
-def file_hash(path: Path) -> str:
-    """SHA-256 (hex) of a file's bytes."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_text(path: Path, most: int = MOST_TEXT) -> str:

@@ -8,20 +8,27 @@ lies on it.
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass
 from enum import Enum
-from typing import NamedTuple
+from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Int32, PointClusters
+from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance
-from framework.mapping.sensor import Pinhole, seen_point
-from framework.mapping.voxel_grid import Grid, find_block
-from framework.mapping.voxel_walk import voxel_number
+from framework.mapping.instance_table import InstanceTable
+from framework.mapping.pixel_lists import PixelLists, cover_another
+from framework.mapping.raycasting import voxel_seen
+from framework.mapping.sensor import Pinhole
+from framework.mapping.voxel_grid import Grid
+from framework.parameters import check_bounds
+
+VOTES_ACROSS = 320  # pixels of an image row that vote: more cost time and tell the same
 
 
 class OverlapRule(Enum):
@@ -61,51 +68,6 @@ class Overlaps:
         return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), least)
 
 
-def require_pixels_inside(clusters: PointClusters, shape: tuple[int, int]) -> None:
-    """Raises DataError when a cluster's pixel lies outside the (height, width) image.
-
-    A refiner made it up then, and kernels do not check bounds.
-    """
-    u, v = clusters.pixels.T
-    if len(u) and not (u.min() >= 0 and u.max() < shape[1] and v.min() >= 0 and v.max() < shape[0]):
-        raise DataError(
-            f"the clusters' pixels must lie in the image of {shape[1]}x{shape[0]}, found u in [{u.min()}, {u.max()}], "
-            f"v in [{v.min()}, {v.max()}]"
-        )
-
-
-class PixelLists(NamedTuple):
-    """The cluster points of each pixel as linked lists: a pixel under overlapping masks has several."""
-
-    first: Int32  # (H, W) the first point, -1 = under no cluster
-    next: Int32  # (P,) the next point of the same pixel, -1 = last
-
-
-@njit(cache=True, nogil=True)
-def _link_points(pixels, cluster, first, following):
-    """Whether all pixels lie in the image; links the points up to the one that does not."""
-    first[:] = -1
-    for p in range(pixels.shape[0] - 1, -1, -1):
-        u, v = pixels[p, 0], pixels[p, 1]
-        if not (0 <= u < first.shape[1] and 0 <= v < first.shape[0]):
-            return False
-        if cluster[p] >= 0:
-            following[p] = first[v, u]
-            first[v, u] = p
-    return True
-
-
-def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """The points of `clusters` by the pixel of the (height, width) image that they were seen at, in order.
-
-    Raises DataError when a pixel lies outside the image.
-    """
-    lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
-    if not _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next):
-        require_pixels_inside(clusters, shape)
-    return lists
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def look_up_instances(
     grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
@@ -116,23 +78,16 @@ def look_up_instances(
     This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
     that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
     """
-    scale = np.float32(1.0) / grid.voxel_size
-    half = np.float32(0.5)
     for row in prange(instance_ids.shape[0]):
         key = np.int64(-2)
         region = np.int32(-1)
         for column in range(instance_ids.shape[1]):
             instance_ids[row, column] = 0
             z = depth[row * stride, column * stride]
-            if z <= np.float32(0.0):
-                continue
-            x, y, w = seen_point(view, column * stride, row * stride, z)
-            i = int(np.floor(x * scale + half))
-            j = int(np.floor(y * scale + half))
-            k = int(np.floor(w * scale + half))
-            block, key, region = find_block(grid, i >> 3, j >> 3, k >> 3, key, region)
-            if block >= 0 and grid.label_row[block] >= 0:
-                instance_ids[row, column] = best_instance(evidence, grid.label_row[block], voxel_number(i, j, k))
+            if z > np.float32(0.0):
+                block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
+                if block >= 0 and grid.label_row[block] >= 0:
+                    instance_ids[row, column] = best_instance(evidence, grid.label_row[block], n)
 
 
 @njit(cache=True, nogil=True)
@@ -211,69 +166,146 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
     return match
 
 
-@njit(cache=True, nogil=True)
-def _count_shared(first_point, next_point, cluster, shared):
-    """Adds to shared (N, N) the pixels that each two clusters have in common, itself on the diagonal."""
-    for pixel in range(first_point.size):
-        p = first_point.flat[pixel]
-        while p >= 0:
-            q = first_point.flat[pixel]
-            while q >= 0:
-                shared[cluster[p], cluster[q]] += 1
-                q = next_point[q]
-            p = next_point[p]
+def vote_stride(camera: Camera) -> int:
+    """Every so many pixels of every so many rows vote."""
+    return max(1, camera.width // VOTES_ACROSS)
 
 
-def cover_another(clusters: PointClusters, points: PixelLists, threshold: float) -> Bool:
-    """(N,) clusters that share more than `threshold` of the smaller one's pixels with a cluster of a better score.
+class LabeledMap(Protocol):
+    """What association needs of a map: a table of its instances, and voxels that know to which of them they belong."""
 
-    Such a cluster is most likely the same object found twice and must not become an instance of its own.
+    table: InstanceTable
+
+    def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
+        """(ceil(H / stride), ceil(W / stride)) the instance that the map has at the measured surface, 0 = none.
+
+        Looked up at every stride-th reading of every stride-th row of `frame.depth`. Unlike a ray-cast, this cannot see
+        an instance behind an object that is new.
+        """
+
+    def merge(self, kept: int, dropped: int) -> None:
+        """Makes instance `dropped` a part of `kept`, in the table and in every voxel."""
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Which instances a frame's N clusters are."""
+
+    frame_index: int
+    clusters: PointClusters
+    overlaps: Overlaps  # with the instances that the map had before
+    instance_ids: Int32  # (N,) an old or a new one, 0 = none
+
+
+def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, least: int) -> None:
+    """Brings the table up to date: `class_evidence` (N, C) is what the clusters say, combined as the table does it.
+
+    An instance is in view where at least `least` pixels see it, or where it was detected.
     """
-    n = len(clusters)
-    shared = np.zeros((n, n), np.int32)
-    _count_shared(points.first, points.next, clusters.cluster, shared)
-    sizes = shared.diagonal()
-    over_smaller = shared / np.maximum(np.minimum(sizes[:, None], sizes[None, :]), 1)
-    rank = np.lexsort((np.arange(n), -clusters.scores)).argsort()
-    better = rank[None, :] < rank[:, None]
-    return np.asarray((better & (over_smaller > threshold)).any(axis=1))
+    instance_ids, scores = matches.instance_ids, matches.clusters.scores
+    for k in np.flatnonzero(instance_ids):
+        table.observe(int(instance_ids[k]), class_evidence[k], float(scores[k]), matches.frame_index)
+    in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= least].tolist())
+    for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
+        table.records[instance_id].in_view.add(matches.frame_index)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _keep_on_top(first, following, cluster, sizes, share, kept_first, kept_following):
-    """Copies each pixel's list without the points of clusters that one of less than `share` of their size lies on."""
-    for v in prange(first.shape[0]):
-        for u in range(first.shape[1]):
-            p = first[v, u]
-            smallest = np.float64(np.inf)
-            while p >= 0:
-                size = sizes[cluster[p]]
-                if size > 0:
-                    smallest = min(smallest, size)
-                p = following[p]
-            kept_first[v, u] = -1
-            last = np.int32(-1)
-            p = first[v, u]
-            while p >= 0:
-                if smallest >= share * sizes[cluster[p]]:
-                    if last < 0:
-                        kept_first[v, u] = p
-                    else:
-                        kept_following[last] = p
-                    kept_following[p] = -1
-                    last = p
-                p = following[p]
+@dataclass
+class Association:
+    """A frame's clusters update the instances that the map has, or make new ones; instances seen as one are merged."""
+
+    overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
+    overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
+    class_gate: float = 0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
+    create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
+    create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
+    duplicate_overlap: float = 0.6  # in [0, 1]: a cluster that shares this with a better one creates nothing
+    split: bool = True  # whether two clusters on one instance split it: the better one keeps it, the other is new
+    merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
+    merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
+    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate)
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            overlap=(0.0, 1.0),
+            class_gate=(0.0, 1.0),
+            create_score=(0.0, 1.0),
+            create_points=(1, 2**31),
+            duplicate_overlap=(0.0, 1.0),
+            merge_overlap=(0.0, 1.0),
+            merge_frames=(1, 2**31),
+            merge_agreement=(0.0, 1.0),
+        )
+        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that see two as one, less those that do not
+
+    def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
+        """How the clusters lie on the instances that the map has at the measured surface."""
+        stride = vote_stride(frame.camera)
+        return count_overlaps(clusters, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
+
+    def associate(
+        self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame_index: int
+    ) -> Matches:
+        """Matches each cluster with an instance that overlaps enough, or creates one where it is good enough."""
+        allowed = overlaps.by(self.overlap_rule, self.create_points) > self.overlap
+        allowed &= self._agree(table, clusters, overlaps.instance_ids)
+        match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
+        instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
+        may_create = (
+            (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
+        )
+        if not self.split:
+            may_create &= ~allowed.any(axis=1)
+        if may_create.any():
+            may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
+        for k in np.flatnonzero(may_create):
+            instance_ids[k] = table.create(len(clusters.classes), frame_index).id
+        return Matches(frame_index, clusters, overlaps, instance_ids)
+
+    def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
+        """(N, M) whether a cluster may be the same thing as an instance, by their classes."""
+        if self.class_gate == 0 or not len(instance_ids):
+            return np.ones((len(clusters), len(instance_ids)), np.bool_)
+        known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
+        return class_agreement(clusters.class_probabilities, known) >= self.class_gate
+
+    def observe(self, table: InstanceTable, matches: Matches, class_evidence: Float64) -> None:
+        """Brings the table of instances up to date with what this frame saw."""
+        observe(table, matches, class_evidence, self.create_points)
+
+    def merge(self, scene: LabeledMap, matches: Matches) -> None:
+        """Merges two instances that keep lying under one cluster and are hardly ever seen as two (after Voxblox++)."""
+        matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
+        self._merge_votes.subtract(combinations(matched, 2))
+        for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
+            kept = int(matches.instance_ids[k])
+            covered = matches.overlaps.instance_ids[row > self.merge_overlap].tolist() if kept else []
+            for other in set(covered) - set(matched):
+                pair = (min(kept, other), max(kept, other))
+                self._merge_votes[pair] += 1
+                if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
+                    scene.merge(*pair)
+                    self._forget(pair[1])
+                    return  # overlaps are out of date now; what else is to be merged will be seen again
+
+    def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
+        """Whether two instances may be one thing, by their classes: a book is not the table that it lies on."""
+        known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
+        return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
+
+    def _forget(self, instance_id: int) -> None:
+        self._merge_votes = Counter({pair: n for pair, n in self._merge_votes.items() if instance_id not in pair})
 
 
-def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32, share: float) -> PixelLists:
-    """`points` where small clusters have for themselves what large ones claim as well.
+def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
+    """The map's label space, which is that of its first frame: `known` is () before.
 
-    A network draws a large mask coarsely, over the small thing that lies on the object: a book on a couch. Under
-    overlapping clusters a pixel is left to those that are not more than 1 / `share` times as large as the smallest
-    there. Clusters without an instance (`instance_ids` (N,) 0) take nothing from others.
+    Raises DataError unless a frame's clusters have that of the map.
     """
-    sizes = np.bincount(clusters.cluster[clusters.cluster >= 0], minlength=len(clusters))
-    sizes = np.where(instance_ids > 0, sizes, 0)
-    kept = PixelLists(np.empty_like(points.first), np.empty_like(points.next))
-    _keep_on_top(points.first, points.next, clusters.cluster, sizes, share, kept.first, kept.next)
-    return kept
+    if known and known != found:
+        raise DataError(
+            f"the map has {len(known)} classes and this frame's clusters have {len(found)} "
+            "others; use one detector, or map them to one label space"
+        )
+    return found

@@ -86,7 +86,7 @@ def solid_blocks_in_view(grid, region_count, block_count, camera, near, far, sha
 def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: Float64, near: float) -> Int32:
     """(N, 4) u0, v0, u1, v1: the pixels, from the first to before the last, that can see boxes of the world.
 
-    `low` and `high` (N, 3) m are the boxes' corners, `near` the depth (m) where buffer begins. A box out of view has
+    `low` and `high` (N, 3) m are the boxes' corners, `near` the depth (m) where sight begins. A box out of view has
     u1 <= u0 or v1 <= v0.
     """
     T_camera_world = inverse(T_world_camera)

@@ -10,6 +10,7 @@ import open3d as o3d
 
 from framework.data import Bool, Box, Float32, Instance, InstanceMesh, Int32
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
+from framework.parameters import check_bounds
 
 LEAST_VERTICES = 4  # that span a box
 
@@ -18,9 +19,12 @@ LEAST_VERTICES = 4  # that span a box
 class Confirmation:
     """What makes an instance count, in a map's `mesh` and `instances`. Before, it is tentative."""
 
-    min_observations: int  # frames in which it was detected
-    min_confidence: float  # InstanceRecord.confidence
-    min_area: float  # m^2 of its surface in the mesh
+    min_observations: int = 3  # frames in which it was detected, >= 1
+    min_confidence: float = 0.1  # in [0, 1]: InstanceRecord.confidence
+    min_area: float = 0.01  # m^2 of its surface in the mesh, >= 0: voxel_size^2 a vertex
+
+    def __post_init__(self) -> None:
+        check_bounds(self, min_observations=(1, 2**31), min_confidence=(0.0, 1.0), min_area=(0.0, 1000.0))
 
     def counts(self, table: InstanceTable) -> Bool:
         """(ids + 1,) whether an instance has been observed often enough and is trusted enough, by id."""
@@ -30,6 +34,10 @@ class Confirmation:
                 record.observations >= self.min_observations and record.confidence >= self.min_confidence
             )
         return counts
+
+    def count(self, table: InstanceTable) -> int:
+        """How many count, whatever their area."""
+        return int(self.counts(table).sum())
 
     def min_vertices(self, voxel_size: float) -> int:
         """The vertices that an instance of `min_area` has."""

@@ -2,82 +2,117 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float64, Frame, InstanceMesh, Int32, View
-from framework.mapping.association import look_up_instances
-from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
-from framework.mapping.instance_list import Confirmation
+from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
+from framework.interfaces import SceneMap
+from framework.mapping.association import agreed_classes, look_up_instances
+from framework.mapping.evidence import INSTANCE_SLOTS, Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.labeled_map import LabeledMap
-from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_classes,
+    check_instances,
+    check_like,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
+from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import render
-from framework.mapping.sensor import Sensor, pinhole
-from framework.mapping.tsdf_map import BLOCK_ARRAYS, TsdfMap, saved_sensor
+from framework.mapping.sensor import pinhole
+from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
+from framework.mapping.voxel_grid import BLOCK_VOXELS
 
-FORMAT = 4  # of the saved file; a change of meaning counts it up
-NO_BLOCKS = np.zeros(0, np.int32)
-ARRAYS = (*BLOCK_ARRAYS, *Evidence._fields)
+FORMAT = 5  # of the saved file; a change of meaning counts it up
 
 
-class InstanceMap(TsdfMap, LabeledMap):
-    """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads."""
+class InstanceMap(SceneMap):
+    """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads.
+
+    `mesh` and `instances` have the instances that count; `render` and `instances_seen` the tentative ones too.
+    """
 
     def __init__(
         self,
-        voxel_size: float,
-        sensor: Sensor,
-        max_blocks: int,
+        volume: TsdfVolume,
         confirmation: Confirmation,
         combine: Combine = Combine.SUM,
         logarithmic: bool = True,
         storage: Storage = Storage.COMPACT,
     ) -> None:
-        TsdfMap.__init__(self, voxel_size, sensor, max_blocks)
-        LabeledMap.__init__(self, InstanceTable(combine, logarithmic), confirmation)
-        self.labels = EvidenceRows(self.voxels, combine, storage)
+        self.classes: tuple[str, ...] = ()
+        self.volume = volume
+        self.labels = EvidenceRows(volume.voxels, combine, storage)
+        self.table = InstanceTable(combine, logarithmic)
+        self.confirmation = confirmation
+
+    @property
+    def voxel_count(self) -> int:
+        return self.volume.voxel_count
 
     @property
     def byte_count(self) -> int:
-        return self.voxels.byte_count + self.labels.byte_count
+        return self.volume.voxels.byte_count + self.labels.byte_count
 
     @property
     def evictions(self) -> int:
         return self.labels.evicted
 
+    @property
+    def instance_count(self) -> int:
+        """Without the condition on their area, which takes a mesh."""
+        return self.confirmation.count(self.table)
+
     def begin(self, classes: tuple[str, ...]) -> None:
-        super().begin(classes)
-        self.labels.begin(len(classes))
+        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
+        if not self.classes:
+            self.labels.begin(len(classes))
+        self.classes = agreed_classes(self.classes, classes)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
+        """See LabeledMap."""
         instance_ids = np.empty(tuple(-(-side // stride) for side in frame.depth.shape), np.int32)
         view = pinhole(frame.camera, T_world_camera)
-        look_up_instances(self.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
+        look_up_instances(self.volume.voxels.grid, self.labels.evidence, frame.depth, view, stride, instance_ids)
         return instance_ids
 
     def merge(self, kept: int, dropped: int) -> None:
+        """See LabeledMap."""
         self.table.merge(kept, dropped)
         self.labels.merge_instances(kept, dropped)
-        self.changed(NO_BLOCKS)
+        self.volume.changed(NO_BLOCKS)
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        return render(self.voxels, self.labels.evidence, self.sensor, camera, T_world_camera)
+        volume = self.volume
+        return render(volume.voxels, self.labels.evidence, volume.sensor, camera, T_world_camera)
 
-    def labeled_mesh(self) -> InstanceMesh:
-        surface = self._surface.extract()
-        counts = self.confirmation.counts(self.table)
-        colors, instance_ids, class_ids = vertex_labels(self.voxels.grid, self.labels.evidence, counts, surface)
-        too_small = self.confirmation.too_small(instance_ids, self.voxel_size)
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        return self.volume.render_near(camera, T_world_camera, depth)
+
+    def mesh(self) -> InstanceMesh:
+        return self.volume.mesh(self._labeled)
+
+    def _labeled(self, surface: Surface) -> InstanceMesh:
+        grid, counts = self.volume.voxels.grid, self.confirmation.counts(self.table)
+        colors, instance_ids, class_ids = vertex_labels(grid, self.labels.evidence, counts, surface)
+        too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)
         instance_ids[too_small] = 0
         class_ids[too_small] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
+    def instances(self) -> Mapping[int, Instance]:
+        return list_instances(self.mesh(), self.table)
+
     def save(self, path: Path) -> None:
-        voxels, arrays = self.saved_voxels()
+        voxels, arrays = self.volume.saved()
         header = {
             "format": FORMAT,
             **voxels,
@@ -93,21 +128,20 @@ class InstanceMap(TsdfMap, LabeledMap):
 
     @classmethod
     def load(cls, path: Path) -> InstanceMap:
-        header, arrays = read_map(path, FORMAT, ARRAYS)
-        table = table_of(header["table"])
-        scene = cls(
-            header["voxel_size"],
-            saved_sensor(header["sensor"]),
-            header["max_blocks"],
-            Confirmation(**header["confirmation"]),
-            table.combine,
-            table.logarithmic,
-            Storage[header["storage"]],
-        )
-        scene.begin(tuple(header["classes"]))
-        scene.fill_voxels(arrays)
-        scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
-        scene.labels.row_count = len(scene.labels.evidence.instance_ids)
-        scene.labels.evicted = header["evicted"]
-        scene.table = table
+        header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
+        with faults_of(path):
+            table, storage, classes = table_of(header["table"]), Storage[header["storage"]], tuple(header["classes"])
+            volume = TsdfVolume.load(header, arrays, len(arrays["instance_ids"]))
+            scene = cls(volume, Confirmation(**header["confirmation"]), table.combine, table.logarithmic, storage)
+            scene.begin(classes)
+            slots = arrays["instance_ids"].shape[-1] if storage is Storage.EXACT else INSTANCE_SLOTS
+            free = np.empty((0, BLOCK_VOXELS, slots), np.float32)
+            free_rows = scene.labels.evidence._replace(instance_ids=free.astype(np.int32), instance_value=free)
+            check_like(arrays, free_rows._asdict(), len(arrays["instance_ids"]))
+            check_classes(arrays["class_ids"], len(classes))
+            check_instances("instance_ids", arrays["instance_ids"], table)
+            scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
+            scene.labels.row_count = len(scene.labels.evidence.instance_ids)
+            scene.labels.evicted = header["evicted"]
+            scene.table = table
         return scene

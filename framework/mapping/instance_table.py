@@ -2,12 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.data import Float32, Float64
+from framework.data import Float32, Float64, Int32
 from framework.mapping.evidence import Combine
+
+
+class FrameSet:
+    """Numbers of frames as spans, which grow at their end: frames in a row are one, of some 120 bytes.
+
+    What is in view for an hour of 30 frames/s is one span, and where only every other frame is mapped 54,000, 6 MB.
+    """
+
+    def __init__(self, spans: Iterable[list[int]] = ()) -> None:
+        self.spans: list[list[int]] = []  # first and last frame of each, ascending, with a gap between any two
+        self._count = 0
+        for first, last in sorted(spans):
+            self._append(first, last)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def __or__(self, other: FrameSet) -> FrameSet:
+        return FrameSet(self.spans + other.spans)
+
+    def add(self, frame: int) -> None:
+        if self.spans and frame < self.spans[-1][0]:
+            merged = self | FrameSet([[frame, frame]])
+            self.spans, self._count = merged.spans, len(merged)
+        else:
+            self._append(frame, frame)
+
+    def _append(self, first: int, last: int) -> None:
+        """Adds a span that begins in the last one or after it."""
+        if not self.spans or first > self.spans[-1][1] + 1:
+            self.spans.append([first, first - 1])
+        self._count += max(last - self.spans[-1][1], 0)
+        self.spans[-1][1] = max(last, self.spans[-1][1])
 
 
 @dataclass
@@ -19,7 +53,7 @@ class InstanceRecord:
     first_frame: int = -1
     last_frame: int = -1
     observed_in: set[int] = field(default_factory=set)  # frames in which it was detected
-    visible: int = 0  # frames in which it was in view
+    in_view: FrameSet = field(default_factory=FrameSet)  # frames in which it could have been detected
     score_sum: float = 0.0  # over its detections
     detections: int = 0
 
@@ -27,6 +61,11 @@ class InstanceRecord:
     def observations(self) -> int:
         """Frames in which it was detected; a merged instance may have had two detections in one."""
         return len(self.observed_in)
+
+    @property
+    def visible(self) -> int:
+        """Frames in which it was in view."""
+        return len(self.in_view)
 
     @property
     def confidence(self) -> float:
@@ -69,7 +108,7 @@ class InstanceTable:
         earlier, later = (a, b) if a.last_frame <= b.last_frame else (b, a)
         a.class_evidence = _combined(earlier.class_evidence, later.class_evidence, self.combine)
         a.observed_in |= b.observed_in
-        a.visible = max(a.visible, b.visible)  # the two were in view together, or they would not cover each other
+        a.in_view |= b.in_view
         a.score_sum += b.score_sum
         a.detections += b.detections
         a.first_frame = min(a.first_frame, b.first_frame)
@@ -83,6 +122,13 @@ class InstanceTable:
         likelihood = np.exp(evidence - evidence.max()) if self.logarithmic else evidence
         total = likelihood.sum()
         return np.asarray(likelihood / total if total > 0 else np.full_like(evidence, 1 / len(evidence)), np.float32)
+
+    def class_ids(self) -> Int32:
+        """(ids + 1,) the most likely class of each instance, by id; -1 for none."""
+        class_ids = np.full(self.last_id + 1, -1, np.int32)
+        for record in self.records.values():
+            class_ids[record.id] = record.class_evidence.argmax()
+        return class_ids
 
 
 def _combined(old: Float64, new: Float64, combine: Combine) -> Float64:

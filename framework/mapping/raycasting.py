@@ -22,7 +22,7 @@ from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.row_interpolation import blend_colors, gather_corners, points_of_row, step_to_surface
-from framework.mapping.sensor import Sensor, depth_noise, pinhole, ray_direction, seen_point
+from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
 from framework.mapping.voxel_grid import (
     BLOCK_SIDE,
     REGION_SIDE,
@@ -32,6 +32,7 @@ from framework.mapping.voxel_grid import (
     find_block,
 )
 from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, voxel_number
+from framework.sensor_noise import axial_sigma_single
 
 TILE = 8  # px; one tile's rays share blocks in the cache
 REFINEMENTS = 4  # Newton steps of a ray at most: one meets a plane, two or three a curved surface
@@ -289,7 +290,7 @@ def cast_near(grid, view, tile_near, tile_far, limits, stride, readings, depth):
             if limits[v, u] > zero:
                 d, step = _ray(view, scale, u, v)
                 start = reading + shift
-                reach = np.float32(REACH) * voxel + np.float32(3.0) * depth_noise(reading)
+                reach = np.float32(REACH) * voxel + np.float32(3.0) * axial_sigma_single(reading)
                 if last_but_one > zero and last > zero:
                     ahead = one / max(last + last - last_but_one, np.float32(1e-3))
                     if abs(ahead - start) < reach:

@@ -50,12 +50,6 @@ def pinhole(camera: Camera, T: Float64) -> Pinhole:
 
 
 @device
-def depth_noise(z):
-    """Standard deviation (m) of a structured-light reading at depth z (m): Nguyen et al. 2012, eq. 3 (axial noise)."""
-    return np.float32(0.0012) + np.float32(0.0019) * (z - np.float32(0.4)) * (z - np.float32(0.4))
-
-
-@device
 def ray_direction(view, u, v):
     """(dx, dy, dz), in the world, m for each m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
     ray_x = (np.float32(u) - view.cx) / view.fx

@@ -72,28 +72,28 @@ def _stored(where: str, entry: Any) -> StoredInstance:
     if not isinstance(entry, dict):
         raise DataError(f"{where}: expected an object with id, class, confidence and vertices, found {entry!r:.40}")
     return StoredInstance(
-        id=_whole(where, entry, "id", 1),
-        class_name=_text(where, entry, "class"),
-        confidence=_share(where, entry, "confidence"),
-        vertices=_whole(where, entry, "vertices", 0),
+        id=_integer(where, entry, "id", 1),
+        class_name=_string(where, entry, "class"),
+        confidence=_fraction(where, entry, "confidence"),
+        vertices=_integer(where, entry, "vertices", 0),
     )
 
 
-def _whole(where: str, entry: Mapping[str, Any], key: str, lowest: int) -> int:
+def _integer(where: str, entry: Mapping[str, Any], key: str, lowest: int) -> int:
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int) or not lowest <= value <= LARGEST_ID:
         raise DataError(f"{where}: {key} must be a whole number from {lowest} to {LARGEST_ID}, found {value!r:.40}")
     return value
 
 
-def _text(where: str, entry: Mapping[str, Any], key: str) -> str:
+def _string(where: str, entry: Mapping[str, Any], key: str) -> str:
     value = entry.get(key)
     if not isinstance(value, str):
         raise DataError(f"{where}: {key} must be a name, found {value!r:.40}")
     return value
 
 
-def _share(where: str, entry: Mapping[str, Any], key: str) -> float:
+def _fraction(where: str, entry: Mapping[str, Any], key: str) -> float:
     value = entry.get(key)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value <= 1:  # NaN is neither
         raise DataError(f"{where}: {key} must be a number in [0, 1], found {value!r:.40}")

@@ -10,6 +10,7 @@ import numpy as np
 from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.evaluation import instances, trajectory
 from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.files.hashing import add_values
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
 
@@ -28,7 +29,7 @@ def run_metrics(result: RunResult) -> Metrics:
         "frames_skipped": result.frames_skipped,
         "fps": result.fps,
         "fps_median": result.fps_median,
-        "pose_source": pose_source(result),
+        "pose_source": result.pose_source,
         "map.voxels": result.scene.voxel_count,
         "map.bytes": result.scene.byte_count,
         "map.evictions": result.scene.evictions,
@@ -38,15 +39,6 @@ def run_metrics(result: RunResult) -> Metrics:
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
         metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
     return metrics
-
-
-def pose_source(result: RunResult) -> str:
-    """`ground_truth` where each pose is exactly the frame's true one, so that nothing was tracked; else `tracked`."""
-    exact = [
-        frame.T_world_camera_truth is not None and np.array_equal(frame.pose.T_world_camera, frame.T_world_camera_truth)
-        for frame in result.tracked
-    ]
-    return "ground_truth" if exact and all(exact) else "tracked"
 
 
 def trajectory_metrics(result: RunResult) -> Metrics:
@@ -84,7 +76,7 @@ def _sha256(truth: SceneTruth) -> str:
     """Of all that predictions are compared with."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):
-        digest.update(np.ascontiguousarray(array).data)
+        add_values(digest, array)
     return digest.hexdigest()
 
 

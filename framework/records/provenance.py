@@ -6,7 +6,7 @@ import hashlib
 import json
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,37 @@ WITHOUT_EFFECT = (
 )
 """Keys of the config that change no result."""
 
+OF_SPEED = ("threads", "ahead", "detection_cache")  # of these, what times depend on ...
+OF_MACHINE = ("environment.processor", "environment.cpus")  # ... like on these, of metrics.json
+
 
 def config_hash(resolved: Mapping[str, Any]) -> str:
     """SHA-256 of what a config says about results, whatever the order of its keys and wherever the run is written."""
-    relevant = {key: value for key, value in resolved.items() if key not in WITHOUT_EFFECT}
-    return hashlib.sha256(json.dumps(relevant, sort_keys=True, default=str).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(relevant(resolved), sort_keys=True, default=str).encode()).hexdigest()
+
+
+def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys that results depend on."""
+    return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
+
+
+def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a config by dotted key; a list is one value."""
+    for key, value in node.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def shows_speed(config: Mapping[str, Any]) -> bool:
+    """Whether a config is of an experiment whose table has a column of frames a second."""
+    return "fps" in (config.get("table") or {}).get("columns", ())
+
+
+def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """What the times of a run depend on and its results do not."""
+    return {key: config.get(key) for key in OF_SPEED} | {key: metrics.get(key) for key in OF_MACHINE}
 
 
 def code_version() -> dict[str, str | bool]:

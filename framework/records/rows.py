@@ -10,7 +10,7 @@ from typing import Any, TypeGuard
 
 import numpy as np
 
-from framework.records.provenance import WITHOUT_EFFECT
+from framework.records.provenance import leaves, relevant
 from framework.records.stored_runs import Record
 
 CHOICE = "choice."  # starts the keys of metrics.json that say which option was chosen of a config group
@@ -64,12 +64,12 @@ class Row:
 
     @property
     def pose_source(self) -> str:
-        return self._told("pose_source")
+        return self._distinct("pose_source")
 
     @property
     def poses(self) -> str:
         """The pose source in words, and the tracker where there was one."""
-        tracked = {"tracked": f"tracked ({self._told(f'{CHOICE}tracker')})"}
+        tracked = {"tracked": f"tracked ({self._distinct(f'{CHOICE}tracker')})"}
         return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
 
     @property
@@ -77,7 +77,7 @@ class Row:
         """The release of the true instances; "" = the dataset does not say."""
         return "/".join(sorted({record.annotation for record in self.records.values()}))
 
-    def _told(self, key: str) -> str:
+    def _distinct(self, key: str) -> str:
         return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
 
     def values(self, column: str) -> dict[Run, float]:
@@ -88,7 +88,7 @@ class Row:
     def mean(self, column: str) -> Mean:
         return Mean.of(self.values(column).values())
 
-    def less(self, base: Row, column: str) -> dict[Run, float]:
+    def differences(self, base: Row, column: str) -> dict[Run, float]:
         """This row's figure less the base's, for the runs that both rows have.
 
         Runs of one seed have the same room and the same detections: most of what varies between seeds cancels.
@@ -169,20 +169,12 @@ class _Variant:
 
     @classmethod
     def of(cls, record: Record, over: Sequence[str]) -> _Variant:
-        parameters = dict(_leaves({key: value for key, value in record.config.items() if key not in WITHOUT_EFFECT}))
+        parameters = dict(leaves(relevant(record.config)))
         choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
         choices["annotation"] = record.annotation or "not told"
         run = tuple(str(parameters.get(key)) for key in over)
         row = record.config.get("row")
         return cls(record, "" if row is None else str(row), run, choices, parameters)
-
-
-def _leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in node.items():
-        if isinstance(value, Mapping) and value:
-            yield from _leaves(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}", value
 
 
 def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import logging
-import resource
 import sys
 from collections import Counter
 from collections.abc import Mapping
@@ -16,11 +15,12 @@ from typing import Any
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
-from framework.files.atomic_files import written_whole
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
+from framework.files.whole_files import written_whole
 from framework.interfaces import RGBDSequence
 from framework.journal import RunResult
+from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
 from framework.records.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
@@ -39,6 +39,7 @@ class RunRecord:
     directory: Path
     config: Mapping[str, Any]  # resolved
     choices: Mapping[str, str | None]  # the option chosen of each config group
+    inputs: str  # inputs_sha256
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
@@ -51,7 +52,8 @@ class RunRecord:
         with written_whole(directory / CONFIG) as temporary:
             OmegaConf.save(OmegaConf.create(resolved), temporary)
         _reset_peak_memory()
-        return cls(directory, {str(key): value for key, value in resolved.items()}, choices)
+        asked = {str(key): value for key, value in resolved.items()}
+        return cls(directory, asked, choices, inputs_sha256(asked))
 
     def write(self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None) -> Metrics:
         """Writes everything that the run found, and says the main figures in the log.
@@ -79,6 +81,7 @@ class RunRecord:
             "peak_rss_bytes": peak_memory(),
             "seed": self.config.get("seed"),
             "config_hash": config_hash(self.config),
+            INPUTS: self.inputs,
             **code_version(),
             **environment(),
         }
@@ -131,8 +134,15 @@ def write_timings(path: Path, result: RunResult) -> None:
         writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)
 
 
-def peak_memory() -> int:
-    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so."""
+def peak_memory() -> int | None:
+    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so.
+
+    None on Windows, which has no `resource`.
+    """
+    try:
+        import resource
+    except ImportError:
+        return None
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
 

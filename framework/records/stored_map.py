@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import Float64, InstanceMesh, Int32, SceneTruth
 from framework.errors import DataError
-from framework.evaluation.instances import MAX_DISTANCE, carry
+from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
 from framework.files.tum_trajectory import read_tum
 from framework.records.instances_file import read_instances
 from framework.records.mesh_file import read_mesh
@@ -40,4 +40,4 @@ class StoredMap:
 
     def true_ids(self, truth: SceneTruth) -> Int32:
         """(V,) the true instance nearest to each vertex, 0 = none, or none as near as the evaluation asks."""
-        return carry(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
+        return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)

@@ -16,7 +16,8 @@ from yaml import YAMLError
 
 from framework.errors import DataError
 from framework.files.json_file import read_json
-from framework.records.provenance import code_version, config_hash
+from framework.records.inputs import INPUTS, inputs_sha256
+from framework.records.provenance import code_version, config_hash, environment, shows_speed, speed_settings
 
 CONFIG = "config.yaml"
 METRICS = "metrics.json"  # there exactly when the run completed
@@ -105,9 +106,10 @@ def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
 
 
 def is_recorded(directory: Path, config: DictConfig) -> bool:
-    """Whether `directory` holds the complete record of a run of this very config, and says so in the log.
+    """Whether `directory` holds the complete record of a run of this very config and inputs, and says so in the log.
 
-    The record may be of another commit: most commits change no result, and the tables name those of all their runs.
+    Where the experiment shows frames a second, its threads and the like must agree, too. The record may be of another
+    commit: most commits change no result, and the tables name those of all their runs.
     """
     if not (directory / METRICS).exists():
         return False
@@ -118,8 +120,17 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
         return False
     resolved = OmegaConf.to_container(config, resolve=True)
     assert isinstance(resolved, dict)
-    if record.metrics["config_hash"] != config_hash({str(key): value for key, value in resolved.items()}):
+    asked = {str(key): value for key, value in resolved.items()}
+    if record.metrics["config_hash"] != config_hash(asked):
         log.info("run again: the record in %s is of another config", directory)
+        return False
+    if record.metrics.get(INPUTS) not in (None, inputs_sha256(asked)):  # None: older records do not tell
+        log.info("run again: weights or data have changed since the record in %s", directory)
+        return False
+    settings = speed_settings(record.config, record.metrics)
+    if shows_speed(asked) and settings != speed_settings(asked, environment()):
+        said = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
+        log.info("run again: the times in %s are of other settings or another machine: %s", directory, said)
         return False
     now = commit_of(code_version())
     if record.commit == now and not now.endswith(WITH_CHANGES):  # two trees with changes may differ

@@ -1,1 +1,1 @@
-"""What cluster refiners share: the neighborhood of each mask, and mixtures fitted to it."""
+"""The algorithms of the cluster refiners; `plugins.refiners` are their parameters."""

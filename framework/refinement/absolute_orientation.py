@@ -1,4 +1,7 @@
-"""Where the camera stood that saw a frame's point clusters: what refiners need to add points of their own."""
+"""Where the camera stood that saw a frame's point clusters: what refiners need to add points of their own.
+
+SciPy's align_vectors finds the same rotation, but only warns where the points leave it open.
+"""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Int32
 from framework.refinement.union_find import root, unite
+from framework.sensor_noise import axial_sigma, axial_sigma_single
 
 SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
 FEWEST_CELLS = 6  # that a plane is fitted to: three would fit without telling anything
@@ -35,17 +36,20 @@ class Limits:
 
     noise_factor: float  # standard deviations of depth that count as noise
     min_noise: float  # m, least standard deviation of depth, where readings come in coarser steps than the sensor's
-    max_slope: float  # change of depth over the distance across the line of buffer, m per m
+    max_slope: float  # change of depth over the distance across the line of sight, m per m
     max_angle: float  # rad, by which a surface may bend towards the camera; what noise may bend it by comes on top
 
 
 Noise = tuple[float, float]  # noise_factor and min_noise of the limits, for kernels
 
 
+_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the fast math of the loop that it stands in
+
+
 @njit(cache=True, nogil=True)
 def _sigma(z: float, min_noise: float) -> float:
-    """Standard deviation (m) of a structured-light camera's depth z (m), Nguyen et al. 2012, eq. 2 for small angles."""
-    return max(0.0012 + 0.0019 * (z - 0.4) ** 2, min_noise)
+    """Standard deviation (m) of depth z (m)."""
+    return float(max(axial_sigma(z), min_noise))
 
 
 @njit(cache=True, nogil=True)
@@ -293,8 +297,7 @@ def _set_surface(
         length = one / np.sqrt(mx * mx + my * my + mz * mz)
         nx[c], ny[c], nz[c], distance[c] = mx * length, my * length, mz * length, length
         px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if there else zero
-        offset = z - np.float32(0.4)
-        sigma = np.float32(0.0012) + np.float32(0.0019) * offset * offset
+        sigma = _axial_sigma(z)
         gate[c] = k * (sigma if sigma > floor else floor)
         # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; an angle beyond it is no crease
         t = angle + gate[c] * angle_sigma / z

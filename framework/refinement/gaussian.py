@@ -1,4 +1,8 @@
-"""Gaussian densities and moments of blocks of points, in vector code: the inner loops of expectation maximization."""
+"""Gaussian densities and moments of blocks of points, in vector code: the inner loops of expectation maximization.
+
+The exponential and the eigenvalues are our own: a kernel calls NumPy's exp number by number (without Intel's SVML),
+and LAPACK for each 3x3 matrix.
+"""
 
 from __future__ import annotations
 

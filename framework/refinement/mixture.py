@@ -1,7 +1,8 @@
 """Gaussian mixtures with a uniform outlier component, one for each of many point sets, fitted at the same time.
 
 Equations are numbered as in the paper: [1] the mixture, [2] the E-step, [3, 4] the M-step. The uniform component is
-that of Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016.
+that of Eckart et al., "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016. scikit-learn's mixture has
+neither that nor evidence for single points, and is slower (tests/benchmarks/test_refiners.py compares them).
 """
 
 from __future__ import annotations

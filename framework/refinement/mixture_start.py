@@ -1,4 +1,4 @@
-"""Where expectation maximization starts: from the mask and the ring around it, each cut into groups by place."""
+"""Where expectation maximization and k-means start: from mask and ring, each cut into groups by place."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Float64, Int32, Int64
-from framework.refinement.lloyd import depth_groups_of, lloyd, nearest
+from framework.refinement.lloyd import depth_groups, depth_groups_of, lloyd, nearest
 from framework.refinement.neighborhood import Neighborhoods
 
 START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
@@ -30,6 +30,16 @@ def start_labels(around: Neighborhoods, log_odds: Float32, object_components: in
         labels,
     )
     return labels
+
+
+def start_centers(around: Neighborhoods, object_centers: int, background_centers: int) -> Float64:
+    """(N, object_centers + background_centers, 3) the means of mask and ring, each cut into equal parts by depth."""
+    of_ring = around.of_ring
+    mask_starts = np.concatenate([[0], np.cumsum(around.mask_counts)])
+    ring_starts = np.concatenate([[0], np.cumsum(around.ring_counts)])
+    objects = depth_groups(around.points_camera[~of_ring], mask_starts, object_centers)
+    background = depth_groups(around.points_camera[of_ring], ring_starts, background_centers)
+    return np.concatenate([objects, background], axis=1)
 
 
 @njit(cache=True, nogil=True, parallel=True)

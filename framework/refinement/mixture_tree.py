@@ -20,7 +20,6 @@ from framework.refinement.gaussian import (
     constant_exponential,
     exponentials,
     log_densities,
-    raise_to,
     set_coefficients,
 )
 from framework.refinement.mixture import BLOCK, MIN_SUPPORT
@@ -65,47 +64,6 @@ class MixtureTree:
     """The trees of N point sets."""
 
     levels: tuple[Level, ...]  # from the coarsest; at least one
-
-    def leaves(self, depth: int) -> list[tuple[int, Int64]]:
-        """The leaves of the trees cut off below `depth` levels: for each level its index and its leaves' rows."""
-        rows = []
-        for k in range(min(depth, len(self.levels))):
-            last = k + 1 in (depth, len(self.levels))
-            childless = np.ones(len(self.levels[k]), bool) if last else np.diff(self.levels[k + 1].firsts) == 0
-            rows.append((k, np.nonzero(childless)[0]))
-        return rows
-
-    def owners(self, k: int) -> Int64:
-        """(M,) the tree that each node of level `k` is in."""
-        owners = self.levels[0].parents
-        for level in self.levels[1 : k + 1]:
-            owners = owners[level.parents]
-        return owners
-
-    def log_likelihoods(self, points: Float32, starts: Int64, depth: int | None = None) -> Float64:
-        """(N,) mean log p(x), in nats, of the points of each set under the first `depth` levels, None = all of them.
-
-        p is the sum over the leaves, whatever branch a point would go down, with the uniform components. A set without
-        points gets 0; points where a tree has no density, -inf.
-        """
-        depth = len(self.levels) if depth is None else depth
-        n = len(starts) - 1
-        leaves = self.leaves(depth)
-        gaussian_owners = np.concatenate([self.owners(k)[rows] for k, rows in leaves])
-        by_tree, firsts = grouped(gaussian_owners.astype(np.int32), n)
-        coefficients = np.concatenate([_coefficients_of(self.levels[k])[rows] for k, rows in leaves])[by_tree]
-        uniform_owners = np.concatenate([np.arange(n), *(self.owners(k) for k in range(depth - 1))])
-        uniform_by_tree, uniform_firsts = grouped(uniform_owners.astype(np.int32), n)
-        levels = self.levels[:depth]
-        log_uniforms = np.concatenate([_log_outliers(level) for level in levels])[uniform_by_tree]
-        boxes = np.concatenate([level.outlier_boxes for level in levels])[uniform_by_tree]
-        sets, begins, ends = _blocks(starts)
-        sums = np.zeros(len(sets))
-        _sum_log_densities(
-            points, sets, begins, ends, coefficients, firsts, log_uniforms, boxes, uniform_firsts, sums
-        )  # fmt: skip
-        totals = np.bincount(sets, sums, n)  # in the order of the blocks, whatever thread came first
-        return np.asarray(totals / np.maximum(np.diff(starts), 1), np.float64)
 
     def passed(self, k: int, points: Float32, starts: Int64) -> Int64:
         """(S,) the best node of level `k` for each point; -1 = the uniform component is likelier than each of them.
@@ -420,43 +378,3 @@ def _likeliest_share(ratios: Float32, above: float, above_points: float) -> floa
             ours += share * ratio / (share * ratio + 1.0 - share)
         share = ours / (len(ratios) + above_points)
     return share
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _sum_log_densities(
-    points: Float32, sets: Int64, begins: Int64, ends: Int64, rows: Float32, firsts: Int64, log_uniforms: Float32,
-    boxes: Float64, uniform_firsts: Int64, sums: Float64,
-) -> None:  # fmt: skip
-    for b in prange(len(sets)):
-        k = sets[b]
-        sums[b] = _log_density_of_block(
-            points[begins[b] : ends[b]], rows[firsts[k] : firsts[k + 1]],
-            log_uniforms[uniform_firsts[k] : uniform_firsts[k + 1]], boxes[uniform_firsts[k] : uniform_firsts[k + 1]],
-        )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def _log_density_of_block(points: Float32, rows: Float32, log_uniforms: Float32, boxes: Float64) -> float:
-    n, gaussians = len(points), len(rows)
-    xyz, densities = np.empty((3, n), np.float32), np.empty((gaussians, n), np.float32)
-    for i in range(n):
-        for a in range(3):
-            xyz[a, i] = points[i, a]
-    largest = np.full(n, ABSENT)
-    for j in range(gaussians):
-        log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
-        raise_to(largest, densities[j], n)
-    evidence = np.zeros(n, np.float32)
-    for j in range(gaussians):
-        exponentials(densities[j], largest, evidence, n)
-    total = 0.0
-    for i in range(n):
-        density = float(evidence[i]) * np.exp(float(largest[i]))
-        for u in range(len(log_uniforms)):
-            inside = log_uniforms[u] > ABSENT
-            for a in range(3):
-                inside &= boxes[u, 0, a] <= points[i, a] <= boxes[u, 1, a]
-            if inside:
-                density += np.exp(float(log_uniforms[u]))
-        total += np.log(density) if density > 0 else (np.log(float(evidence[i])) + largest[i] if gaussians else -np.inf)
-    return total

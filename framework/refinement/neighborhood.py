@@ -1,4 +1,8 @@
-"""Each mask's points together with a ring of points around the mask: what tells an object from its background."""
+"""Each mask's points together with a ring of points around the mask: what tells an object from its background.
+
+Distances to a mask's border are our own, as OpenCV's distance transform goes over each mask twice, inside and outside,
+and takes twice as long (20 masks of redkitchen, one core).
+"""
 
 from __future__ import annotations
 

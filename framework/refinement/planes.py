@@ -5,7 +5,8 @@ Hierarchical Clustering", ICRA 2014) and CAPE (Proenca and Gao, "Fast Cylinder a
 for Visual Odometry", IROS 2018), with fits in inverse depth. Of a plane n . p = d a camera reads the inverse depth
 q = 1 / z = m . r, where r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d. That is linear in the pixel: a fit is a
 3x3 system, the fit of a union of cells comes from the sum of their moments, and the noise of stereo and
-structured-light sensors, which grows with z^2, is the same everywhere.
+structured-light sensors, which grows with z^2, is the same everywhere. Open3D's RANSAC finds one plane at a time, by
+chance, in a cloud that has forgotten the image.
 """
 
 from __future__ import annotations

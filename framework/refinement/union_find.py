@@ -1,4 +1,7 @@
-"""Which cells hang together, as a forest: `parents[cell]` is a cell of the same piece, a root its own parent."""
+"""Which cells hang together, as a forest: `parents[cell]` is a cell of the same piece, a root its own parent.
+
+SciPy's DisjointSet is a Python object, which kernels cannot call.
+"""
 
 from __future__ import annotations
 

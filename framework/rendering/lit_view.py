@@ -25,7 +25,7 @@ class LitView:
         R_world_camera = T_world_camera[:3, :3]
         sides = FrontSides(surface, T_world_camera[:3, 3])
         self._fine = sides.seen_by(camera.scaled(SUPERSAMPLING), R_world_camera)
-        self.hits = self._fine.every(SUPERSAMPLING)  # of camera.shape
+        self.hits = self._fine.subsampled(SUPERSAMPLING)  # of camera.shape
         normals = self._fine.interpolated(surface.vertex_normals)
         self._light = np.empty(self._fine.depth.shape, np.float32)
         _light_up(normals, np.ascontiguousarray(R_world_camera), self._fine.camera.K, self._light)
@@ -55,7 +55,8 @@ class LitView:
 
     def _developed(self, color: Float32) -> UInt8:
         """The lit picture on paper, scaled down to the camera's size; `color` is used up."""
-        _develop(color, self._light, self._fine.depth, np.array(NOTHING, np.float32))
+        np.clip(color * self._light[..., None], 0, 255, out=color)
+        color[self._fine.depth <= 0] = NOTHING
         return np.asarray(cv2.resize(color, self.hits.depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
 
@@ -83,25 +84,15 @@ def _paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> Non
     height, width = ids.shape
     for v in range(height):
         for u in range(width):
-            one = ids[v, u]
+            instance = ids[v, u]
             border = (
-                (u > 0 and ids[v, u - 1] != one)
-                or (u < width - 1 and ids[v, u + 1] != one)
-                or (v > 0 and ids[v - 1, u] != one)
-                or (v < height - 1 and ids[v + 1, u] != one)
+                (u > 0 and ids[v, u - 1] != instance)
+                or (u < width - 1 and ids[v, u + 1] != instance)
+                or (v > 0 and ids[v - 1, u] != instance)
+                or (v < height - 1 and ids[v + 1, u] != instance)
             )
             dim = np.float32(0.45 if border else 1)  # where an instance meets another one or the background
             background = np.float32(0.22) * gray[v, u] + np.float32(178)  # pale, so that the instances stand out
             texture = np.float32(0.84) + np.float32(0.16 / 140) * gray[v, u]
             for k in range(3):
-                painted[v, u, k] = dim * (palette[one, k] * texture if one > 0 else background)
-
-
-@njit(cache=True, nogil=True)
-def _develop(color: Float32, light: Float32, depth: Float32, nothing: Float32) -> None:
-    """Lights the colours (H, W, 3), and puts `nothing` (3,) where nothing is seen."""
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            for k in range(3):
-                lit = min(max(color[v, u, k] * light[v, u], np.float32(0)), np.float32(255))
-                color[v, u, k] = lit if depth[v, u] > 0 else nothing[k]
+                painted[v, u, k] = dim * (palette[instance, k] * texture if instance > 0 else background)

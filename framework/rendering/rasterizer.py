@@ -46,8 +46,8 @@ class Rasterizer:
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
         """vertices (V, 3) m, world; triangles (F, 3), seen from both sides."""
         self._vertices = np.ascontiguousarray(vertices, np.float32)
-        # neighbours in space one after the other, so that they are in buffer, and in the processor's caches, together
-        self._order = np.argsort(_curve(self._vertices, triangles), kind="stable").astype(np.int32)
+        # neighbours in space one after the other, so that they are in sight, and in the processor's caches, together
+        self._order = np.argsort(_morton_codes(self._vertices, triangles), kind="stable").astype(np.int32)
         self._triangles = triangles.astype(np.int32, copy=False)[self._order]
         self._spheres = _bounding_spheres(self._vertices, self._triangles)
 
@@ -73,7 +73,7 @@ class Rasterizer:
 
 
 @njit(cache=True, nogil=True)
-def _curve(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
+def _morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
     """The place (F,) of each triangle's middle on Morton's curve through the mesh's bounding cube, 10 bits an axis."""
     middle = np.empty((len(triangles), 3), np.float32)
     for f in range(len(triangles)):
@@ -87,14 +87,14 @@ def _curve(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]:
         if len(middle):
             low[axis] = middle[:, axis].min()
             side = max(side, middle[:, axis].max() - low[axis])
-    places = np.zeros(len(triangles), np.uint32)
+    codes = np.zeros(len(triangles), np.uint32)
     if side > 0:
         for f in range(len(triangles)):
             for axis in range(3):
                 cell = np.uint32((middle[f, axis] - low[axis]) / side * CELLS)
                 for bit in range(10):
-                    places[f] |= ((cell >> np.uint32(bit)) & np.uint32(1)) << np.uint32(3 * bit + axis)
-    return places
+                    codes[f] |= ((cell >> np.uint32(bit)) & np.uint32(1)) << np.uint32(3 * bit + axis)
+    return codes
 
 
 @njit(cache=True, nogil=True)

@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
-from framework.data import Array, Bool, Camera, Float32, Float64, Int32
+from framework.data import Bool, Camera, Float32, Float64, Int32
 from framework.rendering.rasterizer import NO_TRIANGLE, Rasterizer, VisibilityBuffer
 
 VOTES = 20000  # triangles that are asked which of their sides was seen
@@ -39,7 +39,7 @@ class Hits:
         """(H, W, 3) m, 0 where nothing is seen."""
         return self.interpolated(self.vertices)
 
-    def every(self, n: int) -> Hits:
+    def subsampled(self, n: int) -> Hits:
         """The picture of each n-th pixel."""
         seen, c = self.buffer, self.camera
         triangle, depth = np.ascontiguousarray(seen.triangle[::n, ::n]), np.ascontiguousarray(seen.depth[::n, ::n])
@@ -86,16 +86,16 @@ class Surface:
     @cached_property
     def face_normals(self) -> Float32:
         """(F, 3), length = twice the area, so that sums of them weigh by area."""
-        normals = np.empty(self.triangles.shape, np.float32)
-        _face_normals(self.vertices, self.triangles, normals)
-        return normals
+        a, b, c = self.vertices[self.triangles].transpose(1, 0, 2)
+        return np.cross(b - a, c - a)
 
     @cached_property
     def vertex_normals(self) -> Float32:
         """(V, 3) unit length, averaged over the triangles around each vertex by area."""
-        normals = np.empty(self.vertices.shape, np.float32)
-        _vertex_normals(self.face_normals, self.triangles, normals)
-        return normals
+        corners, weights = self.triangles.ravel(), np.repeat(self.face_normals, 3, axis=0)
+        x, y, z = (np.bincount(corners, weights[:, k], minlength=len(self.vertices)) for k in range(3))
+        length = np.maximum(np.sqrt(x**2 + y**2 + z**2), 1e-12)
+        return np.stack([x / length, y / length, z / length], axis=1).astype(np.float32)
 
 
 class FrontSides:
@@ -104,8 +104,9 @@ class FrontSides:
     def __init__(self, surface: Surface, eye_world: Float64) -> None:
         self._eye_world = eye_world  # (3,) m
         self._vertices = surface.vertices
-        facing = _facing(surface.vertices, surface.triangles, surface.face_normals, eye_world.astype(np.float32))
-        self._triangles = surface.triangles[facing]
+        rays = surface.vertices[surface.triangles[:, 0]] - eye_world.astype(np.float32)
+        x, y, z = (surface.face_normals * rays).T
+        self._triangles = surface.triangles[x + y + z < 0]
         self._rasterizer = Rasterizer(self._vertices, self._triangles)
 
     def seen_by(self, camera: Camera, R_world_camera: Float64) -> Hits:
@@ -127,43 +128,3 @@ def _interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32
             wa = np.float32(1) - wb - wc
             for k in range(values.shape[1]):
                 image[v, u, k] = wa * values[a, k] + wb * values[b, k] + wc * values[c, k]
-
-
-@njit(cache=True, nogil=True)
-def _face_normals(vertices: Float32, triangles: Int32, normals: Float32) -> None:
-    for f in range(len(triangles)):
-        a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
-        px, py, pz = _edge(vertices, a, b)
-        qx, qy, qz = _edge(vertices, a, c)
-        normals[f, 0], normals[f, 1], normals[f, 2] = py * qz - pz * qy, pz * qx - px * qz, px * qy - py * qx
-
-
-@njit(cache=True, nogil=True, inline="always")
-def _edge(vertices, a, b):  # type: ignore[no-untyped-def]
-    return vertices[b, 0] - vertices[a, 0], vertices[b, 1] - vertices[a, 1], vertices[b, 2] - vertices[a, 2]
-
-
-@njit(cache=True, nogil=True)
-def _vertex_normals(face_normals: Float32, triangles: Int32, normals: Float32) -> None:
-    sums = np.zeros(normals.shape)
-    for f in range(len(triangles)):
-        for corner in range(3):
-            for k in range(3):
-                sums[triangles[f, corner], k] += face_normals[f, k]
-    for i in range(len(normals)):
-        length = max(np.sqrt(sums[i, 0] ** 2 + sums[i, 1] ** 2 + sums[i, 2] ** 2), 1e-12)
-        for k in range(3):
-            normals[i, k] = sums[i, k] / length
-
-
-@njit(cache=True, nogil=True)
-def _facing(vertices: Float32, triangles: Int32, normals: Float32, eye: Float32) -> Array:
-    """(F,) whether a triangle turns its front to the eye."""
-    facing = np.empty(len(triangles), np.bool_)
-    for f in range(len(triangles)):
-        a = triangles[f, 0]
-        towards = np.float32(0)
-        for k in range(3):
-            towards += normals[f, k] * (vertices[a, k] - eye[k])
-        facing[f] = towards < 0
-    return facing

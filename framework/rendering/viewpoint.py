@@ -1,4 +1,4 @@
-"""From where to look at a map: obliquely from above, into the room, with as many objects in buffer as there can be."""
+"""From where to look at a map: obliquely from above, into the room, with as many objects in sight as there can be."""
 
 from __future__ import annotations
 

@@ -24,9 +24,10 @@ from numba import njit, prange
 
 from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
-from framework.mapping.association import PixelLists
 from framework.mapping.evidence import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS, best_first, named_classes
 from framework.mapping.integration import SeenBlocks
+from framework.mapping.map_file import check_classes, check_like
+from framework.mapping.pixel_lists import PixelLists
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
 MOST_FRAMES = np.uint16(65535)  # that a voxel counts
@@ -214,8 +215,12 @@ class ClassRows:
         rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
         return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
 
-    def fill(self, arrays: dict[str, npt.NDArray[Any]]) -> None:
-        """Takes the arrays that `saved` gave."""
+    def fill(self, arrays: dict[str, npt.NDArray[Any]], classes: int) -> None:
+        """Takes the arrays that `saved` gave, of a map with so many classes. Raises DataError where they do not fit."""
+        free = self.evidence._asdict()
+        check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
+        check_like(arrays, free, len(arrays["rest"]))
+        check_classes(arrays["class_ids"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
 

@@ -79,7 +79,7 @@ def connected_components(triangles: Int32, class_ids: Int32, least: int) -> Int3
     return np.where((class_ids >= 0) & counts[pieces], np.cumsum(counts)[pieces], 0).astype(np.int32)
 
 
-class Opinions(NamedTuple):
+class ComponentStatistics(NamedTuple):
     """What the voxels of each of K components, by id, say together; entry 0 is of what is in no component."""
 
     vertices: npt.NDArray[np.int64]  # (K + 1,) how many
@@ -126,12 +126,12 @@ def _collect(grid, evidence, log_missed, voxels, instance_ids, sums, masked, fir
             sums[k, c] = max(sums[k, c] + rest_sums[k], 0.0)  # a difference of sums may be a hair below 0
 
 
-def opinions(
+def component_statistics(
     grid: Grid, evidence: ClassEvidence, log_missed: np.float32, surface: Surface, instance_ids: Int32, classes: int
-) -> Opinions:
+) -> ComponentStatistics:
     """What the map says of each of the components that `instance_ids` (V,) name."""
     vertices = np.bincount(instance_ids, minlength=1)
-    found = Opinions(
+    found = ComponentStatistics(
         vertices,
         np.zeros((len(vertices), classes)),
         np.zeros(len(vertices), np.int32),

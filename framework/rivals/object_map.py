@@ -25,48 +25,55 @@ from framework.data import (
     Instance,
     InstanceMesh,
     Int32,
+    SurfaceView,
     UInt8,
     View,
 )
 from framework.errors import MapFullError
+from framework.interfaces import SceneMap
+from framework.mapping.association import agreed_classes
 from framework.mapping.evidence import Combine
 from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.integration import Integrator
-from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_instances,
+    check_like,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
 from framework.mapping.meshing import Surface
-from framework.mapping.raycasting import render_surface
-from framework.mapping.sensor import Sensor, pinhole
-from framework.mapping.tsdf_map import BLOCK_ARRAYS, TsdfMap, saved_sensor
+from framework.mapping.sensor import pinhole
+from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_colors
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
-from framework.rivals.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume
+from framework.rivals.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume, look_up_object
 
-FORMAT = "object_volumes 1"  # of the saved file; a change of meaning counts it up
+FORMAT = "object_volumes 2"  # of the saved file; a change of meaning counts it up
 OBJECT = "object_"  # before the names of the arrays that hold all objects' volumes, one after the other
-NO_BLOCKS = np.zeros(0, np.int32)
 
 
-class ObjectMap(TsdfMap):
+class ObjectMap(SceneMap):
     """The background, the objects' volumes by id, and the table of what is known of the objects beside them.
 
     An object's classes are the mean of its detections' distributions. `mesh` and `instances` have the objects that
     count; `render` and `instances_seen` the tentative ones too.
     """
 
-    def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int, confirmation: Confirmation) -> None:
-        super().__init__(voxel_size, sensor, max_blocks)
+    def __init__(self, background: TsdfVolume, confirmation: Confirmation) -> None:
         self.classes: tuple[str, ...] = ()
+        self.background = background  # voxels of everything
         self.confirmation = confirmation
         self.table = InstanceTable(Combine.SUM, logarithmic=False)
         self.volumes: dict[int, ObjectVolume] = {}
-        self._integrator = Integrator(self.voxels, sensor)
 
     @property
     def block_count(self) -> int:
         """Of the background and of all objects."""
-        return self.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
+        return self.background.voxels.block_count + sum(volume.block_count for volume in self.volumes.values())
 
     @property
     def voxel_count(self) -> int:
@@ -74,12 +81,16 @@ class ObjectMap(TsdfMap):
 
     @property
     def byte_count(self) -> int:
-        return self.voxels.byte_count + sum(volume.byte_count for volume in self.volumes.values())
+        return self.background.voxels.byte_count + sum(volume.byte_count for volume in self.volumes.values())
 
     @property
     def instance_count(self) -> int:
         """Without the condition on their area, which takes a mesh."""
-        return int(self.confirmation.counts(self.table).sum())
+        return self.confirmation.count(self.table)
+
+    def begin(self, classes: tuple[str, ...]) -> None:
+        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
+        self.classes = agreed_classes(self.classes, classes)
 
     def create(self, frame_index: int) -> int:
         """The id of a new object, whose volume is empty."""
@@ -88,12 +99,12 @@ class ObjectMap(TsdfMap):
         return record.id
 
     def _empty_volume(self) -> ObjectVolume:
-        return ObjectVolume(self.voxel_size, self.sensor, self.voxels.max_blocks)
+        return ObjectVolume(self.background.voxel_size, self.background.sensor, self.background.voxels.max_blocks)
 
     def remove(self, instance_id: int) -> None:
         """Forgets an object."""
         del self.table.records[instance_id], self.volumes[instance_id]
-        self.changed(NO_BLOCKS)
+        self.background.changed(NO_BLOCKS)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, masks: Mapping[int, Bool], band: float) -> None:
         """Adds `frame` to the background, and to the volumes of the objects whose `masks` (H, W) it has, by id.
@@ -101,13 +112,12 @@ class ObjectMap(TsdfMap):
         Voxels within `band` m of the measured surface count whether they are under their object's mask. Raises
         MapFullError when the block budget is reached.
         """
-        seen = self._integrator.integrate(frame, T_world_camera, band)
-        self.changed(seen.blocks)
+        self.background.integrate(frame, T_world_camera, band)
         for instance_id, mask in masks.items():
             self._integrate_object(self.volumes[instance_id], frame, T_world_camera, mask, band)
-            if self.block_count > self.voxels.max_blocks:
+            if self.block_count > self.background.voxels.max_blocks:
                 raise MapFullError(
-                    f"the map is full: more than {self.voxels.max_blocks} blocks in the background and "
+                    f"the map is full: more than {self.background.voxels.max_blocks} blocks in the background and "
                     f"{len(self.volumes)} objects; raise fuser.max_blocks or fuser.voxel_size"
                 )
 
@@ -127,7 +137,7 @@ class ObjectMap(TsdfMap):
     def _boxes(self, camera: Camera, T_world_camera: Float64, volumes: list[ObjectVolume]) -> Int32:
         """(M, 4) u0, v0, u1, v1: see boxes_in_view()."""
         low, high = (np.array([getattr(volume, side) for volume in volumes]) for side in ("low", "high"))
-        return boxes_in_view(camera, T_world_camera, low, high, float(self.sensor.min_depth))
+        return boxes_in_view(camera, T_world_camera, low, high, float(self.background.sensor.min_depth))
 
     def instances_seen(self, camera: Camera, T_world_camera: Float64, depth: Float32, stride: int) -> Int32:
         """(ceil(H / stride), ceil(W / stride)) the object at every stride-th reading of every stride-th row of `depth`
@@ -144,23 +154,23 @@ class ObjectMap(TsdfMap):
         for (key, volume), (u0, v0, u1, v1) in zip(self.volumes.items(), boxes.tolist(), strict=True):
             if u0 < u1 and v0 < v1:
                 window = -(-v0 // stride), -(-u0 // stride), -(-v1 // stride), -(-u1 // stride)
-                volume.look_up(depth, view, stride, window, key, instance_ids, best)
+                grid, counts = volume.voxels.grid, volume.counts
+                look_up_object(grid, counts, depth, view, stride, window, key, instance_ids, best)
         return instance_ids
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """The background's surface, which is also that of the objects, with the objects that it belongs to."""
-        surface = render_surface(self.voxels, self.sensor, camera, T_world_camera)
+        surface = self.background.render(camera, T_world_camera)
         instance_ids = self.instances_seen(camera, T_world_camera, surface.depth, stride=1)
-        return View(**vars(surface), instance_ids=instance_ids, class_ids=self._class_of_ids()[instance_ids])
+        return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
 
-    def _class_of_ids(self) -> Int32:
-        """(ids + 1,) the most likely class of each object; -1 for none."""
-        class_ids = np.full(self.table.last_id + 1, -1, np.int32)
-        for record in self.table.records.values():
-            class_ids[record.id] = record.class_evidence.argmax()
-        return class_ids
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        return self.background.render_near(camera, T_world_camera, depth)
 
-    def labeled_mesh(self) -> InstanceMesh:
+    def mesh(self) -> InstanceMesh:
+        return self.background.mesh(self._labeled)
+
+    def _labeled(self, background: Surface) -> InstanceMesh:
         """The background's surface, with the object that it most probably belongs to, and the objects' own surfaces.
 
         Both were measured by the same readings and nearly coincide: were the background's without a label there, which
@@ -168,16 +178,15 @@ class ObjectMap(TsdfMap):
         an object's volume has seen too little. Where objects overlap, each has its surface.
         """
         counts = self.confirmation.counts(self.table)
-        background = self._surface.extract()
         instance_ids = np.zeros(len(background.vertices), np.int32)
         best = np.full(len(background.vertices), np.float32(FOREGROUND))
         objects: list[_Part] = []
         for key, volume in self.volumes.items():
             if not counts[key]:
                 continue
-            surface = volume.surface()
+            surface = volume.volume.surface()
             chosen = volume.foreground_at(surface.vertices) > FOREGROUND
-            if chosen.sum() < self.confirmation.min_vertices(self.voxel_size):
+            if chosen.sum() < self.confirmation.min_vertices(self.background.voxel_size):
                 continue
             objects.append(_part(surface, volume.voxels, chosen, np.full(len(chosen), key, np.int32)))
             inside = np.flatnonzero(volume.encloses(background.vertices))
@@ -185,7 +194,7 @@ class ObjectMap(TsdfMap):
             better = probability > best[inside]
             best[inside[better]], instance_ids[inside[better]] = probability[better], key
         everything = np.ones(len(best), np.bool_)
-        return self._joined([_part(background, self.voxels, everything, instance_ids), *objects])
+        return self._joined([_part(background, self.background.voxels, everything, instance_ids), *objects])
 
     def _joined(self, parts: list[_Part]) -> InstanceMesh:
         firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
@@ -197,7 +206,7 @@ class ObjectMap(TsdfMap):
             ),
             colors=np.concatenate([part.colors for part in parts]),
             instance_ids=instance_ids,
-            class_ids=self._class_of_ids()[instance_ids],
+            class_ids=self.table.class_ids()[instance_ids],
             classes=self.classes,
         )
 
@@ -205,7 +214,7 @@ class ObjectMap(TsdfMap):
         return list_instances(self.mesh(), self.table)
 
     def save(self, path: Path) -> None:
-        voxels, arrays = self.saved_voxels()
+        voxels, arrays = self.background.saved()
         header = {
             "format": FORMAT,
             **voxels,
@@ -221,16 +230,18 @@ class ObjectMap(TsdfMap):
     @classmethod
     def load(cls, path: Path) -> ObjectMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
-        confirmation = Confirmation(**header["confirmation"])
-        scene = cls(header["voxel_size"], saved_sensor(header["sensor"]), header["max_blocks"], confirmation)
-        scene.classes = tuple(header["classes"])
-        scene.table = table_of(header["table"])
-        scene.fill_voxels(arrays)
-        first = 0
-        for key, blocks in header["objects"].items():
-            volume = scene.volumes[int(key)] = scene._empty_volume()
-            volume.fill({name: arrays[OBJECT + name][first : first + blocks] for name in VOLUME_ARRAYS})
-            first += blocks
+        with faults_of(path):
+            scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation(**header["confirmation"]))
+            scene.classes = tuple(header["classes"])
+            scene.table = table_of(header["table"])
+            counts = {int(key): blocks for key, blocks in header["objects"].items()}
+            check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
+            check_instances("objects", np.array([*counts], np.int32), scene.table)
+            first = 0
+            for key, blocks in counts.items():
+                volume = scene.volumes[key] = scene._empty_volume()
+                volume.fill({name: arrays[OBJECT + name][first : first + blocks] for name in VOLUME_ARRAYS})
+                first += blocks
         return scene
 
 

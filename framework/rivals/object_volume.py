@@ -13,31 +13,20 @@ The blocks are those of a VoxelGrid, aligned with all others, and counts take 4 
 
 from __future__ import annotations
 
-from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Array, Bool, Float32, Float64, Frame, Int32
-from framework.mapping.integration import Integrator
-from framework.mapping.meshing import Surface, SurfaceNets
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import Pinhole, Sensor
+from framework.mapping.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.mapping.vertex_labels import CHUNK, CORNERS, corner_voxels, keep_near
-from framework.mapping.voxel_grid import (
-    BLOCK_SIDE,
-    BLOCK_VOXELS,
-    Grid,
-    VoxelGrid,
-    device,
-    find_solid_blocks,
-    grown,
-)
+from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, Grid, device, grown
 
 FOREGROUND = 0.5  # probability above which a voxel is the object's
-GRID_ARRAYS = ("block_coords", "tsdf", "weight", "color")  # of a grid, that are saved
 
 
 class MaskCounts(NamedTuple):
@@ -47,7 +36,7 @@ class MaskCounts(NamedTuple):
     observed: npt.NDArray[np.uint16]  # (B, 512) all of those in frames that had a mask of it; 65535 at most
 
 
-VOLUME_ARRAYS = (*GRID_ARRAYS, *MaskCounts._fields)
+VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # that are saved
 
 
 @device
@@ -129,9 +118,9 @@ class ObjectVolume:
     """One object's TSDF and mask counts."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
-        self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
-        self._integrator = Integrator(self.voxels, sensor)
-        self._counts = MaskCounts(np.zeros((0, BLOCK_VOXELS), np.uint16), np.zeros((0, BLOCK_VOXELS), np.uint16))
+        self.volume = TsdfVolume(voxel_size, sensor, max_blocks)
+        self.voxels = self.volume.voxels
+        self.counts = MaskCounts(np.zeros((0, BLOCK_VOXELS), np.uint16), np.zeros((0, BLOCK_VOXELS), np.uint16))
         self.low = np.full(3, np.inf)  # m: the corners of the box around its blocks
         self.high = np.full(3, -np.inf)
 
@@ -141,7 +130,7 @@ class ObjectVolume:
 
     @property
     def byte_count(self) -> int:
-        return self.voxels.byte_count + sum(counts[: self.block_count].nbytes for counts in self._counts)
+        return self.voxels.byte_count + sum(counts[: self.block_count].nbytes for counts in self.counts)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> None:
         """Adds what `frame` measures in the volume, which grows where `mask` (H, W) shows the object.
@@ -149,37 +138,23 @@ class ObjectVolume:
         Voxels within `band` m of the measured surface count whether they are under the mask. Raises MapFullError when
         the volume's block budget is reached; nothing is added then.
         """
-        seen = self._integrator.integrate_object(frame, T_world_camera, band, mask)
+        seen = self.volume.integrator.integrate_object(frame, T_world_camera, band, mask)
         self._grow()
-        _count_masks(seen.near, seen.near_pixel, mask, self._counts)
+        _count_masks(seen.near, seen.near_pixel, mask, self.counts)
         self._measure()
-        if "_nets" in self.__dict__:
-            self._nets.changed(seen.blocks)
+        self.volume.changed(seen.blocks)
 
     def _grow(self) -> None:
         """Makes room for the counts of new blocks, which are 0."""
         capacity = len(self.voxels.grid.block_coords)
-        if len(self._counts.observed) < capacity:
-            self._counts = MaskCounts(*(grown(counts, capacity, 0) for counts in self._counts))
+        if len(self.counts.observed) < capacity:
+            self.counts = MaskCounts(*(grown(counts, capacity, 0) for counts in self.counts))
 
     def _measure(self) -> None:
         coords = self.voxels.grid.block_coords[: self.block_count]
         if len(coords):
             side = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
-
-    def look_up(
-        self,
-        depth: Float32,
-        view: Pinhole,
-        stride: int,
-        window: tuple[int, int, int, int],
-        instance_id: int,
-        instance_ids: Int32,
-        best: Float32,
-    ) -> None:
-        """Enters the object into `instance_ids`: see look_up_object()."""
-        look_up_object(self.voxels.grid, self._counts, depth, view, stride, window, instance_id, instance_ids, best)
 
     def encloses(self, points_world: Float32) -> Bool:
         """(P,) whether points (P, 3) m lie in the box around the volume's blocks."""
@@ -188,32 +163,18 @@ class ObjectVolume:
     def foreground_at(self, points_world: Float32) -> Float32:
         """(P,) the probability that points (P, 3) m of a surface are the object's."""
         probability = np.empty(len(points_world), np.float32)
-        _foreground_at(self.voxels.grid, self._counts, points_world, probability)
+        _foreground_at(self.voxels.grid, self.counts, points_world, probability)
         return probability
-
-    @cached_property
-    def _nets(self) -> SurfaceNets:
-        return SurfaceNets(self.voxels)
-
-    def surface(self) -> Surface:
-        """All the surface in its blocks, whether the object's or not."""
-        return self._nets.extract()
 
     def arrays(self) -> dict[str, Array]:
         """What is saved of it."""
-        b = self.block_count
-        return {
-            **{name: getattr(self.voxels.grid, name)[:b] for name in GRID_ARRAYS},
-            **{name: counts[:b] for name, counts in self._counts._asdict().items()},
-        }
+        arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
+        return {name: arrays[name] for name in VOLUME_ARRAYS}
 
-    def fill(self, arrays: dict[str, Array]) -> None:
+    def fill(self, arrays: dict[str, Any]) -> None:
         """Takes over what `arrays` of another volume gave, into one that is empty."""
-        self.voxels.allocate(np.asarray(arrays["block_coords"], np.int32))
-        for name in GRID_ARRAYS:
-            getattr(self.voxels.grid, name)[: self.block_count] = arrays[name]
-        find_solid_blocks(self.voxels.grid, self.block_count)
+        self.volume.fill(arrays)
         self._grow()
-        for name, counts in self._counts._asdict().items():
+        for name, counts in self.counts._asdict().items():
             counts[: self.block_count] = arrays[name]
         self._measure()

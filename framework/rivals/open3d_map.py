@@ -2,31 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
+from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.geometry import back_project, transform
-from framework.mapping.instance_list import Confirmation
+from framework.interfaces import SceneMap
+from framework.mapping.association import agreed_classes
+from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.labeled_map import LabeledMap
-from framework.mapping.map_file import plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_instances,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
 from framework.rivals.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
 
-FORMAT = "open3d_vbg 2"  # of the saved file; a change of meaning counts it up
+FORMAT = "open3d_vbg 3"  # of the saved file; a change of meaning counts it up
 
 
-class Open3DMap(LabeledMap):
+class Open3DMap(SceneMap):
     """Open3D's voxel blocks and the table of instances as one map.
 
-    An instance's class is that of the table, the same for all its voxels.
+    An instance's class is that of the table, the same for all its voxels. `mesh` and `instances` have the instances
+    that count; `render` and `instances_seen` the tentative ones too.
     """
 
     def __init__(self, settings: BlockGridSettings, confirmation: Confirmation) -> None:
-        super().__init__(InstanceTable(), confirmation)
+        self.classes: tuple[str, ...] = ()
+        self.table = InstanceTable()
+        self.confirmation = confirmation
         self.grid = BlockGrid(settings)
 
     @property
@@ -36,6 +48,15 @@ class Open3DMap(LabeledMap):
     @property
     def byte_count(self) -> int:
         return self.grid.byte_count
+
+    @property
+    def instance_count(self) -> int:
+        """Without the condition on their area, which takes a mesh."""
+        return self.confirmation.count(self.table)
+
+    def begin(self, classes: tuple[str, ...]) -> None:
+        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
+        self.classes = agreed_classes(self.classes, classes)
 
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
         """Adds the depth and the colour of `frame`. Raises MapFullError, and adds nothing, at the end of the budget."""
@@ -59,6 +80,7 @@ class Open3DMap(LabeledMap):
         self.changed()
 
     def merge(self, kept: int, dropped: int) -> None:
+        """See LabeledMap."""
         self.table.merge(kept, dropped)
         instance = self.grid.flat("instance")
         instance[instance == dropped] = kept
@@ -74,6 +96,7 @@ class Open3DMap(LabeledMap):
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
+        """See LabeledMap."""
         v, u = np.nonzero(frame.depth[::stride, ::stride])
         pixels = np.stack([u * stride, v * stride], axis=1).astype(np.int32)
         points_camera = back_project(frame.camera, pixels, frame.depth[pixels[:, 1], pixels[:, 0]])
@@ -86,7 +109,7 @@ class Open3DMap(LabeledMap):
         seen = surface.depth > 0
         instance_ids = np.zeros(camera.shape, np.int32)
         instance_ids[seen] = self.instances_at(points_of(surface)[seen])
-        return View(**vars(surface), instance_ids=instance_ids, class_ids=self._class_of_ids()[instance_ids])
+        return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
         """The surface without its labels; Open3D has no use for `depth`."""
@@ -101,14 +124,10 @@ class Open3DMap(LabeledMap):
         ids = self.instances_at(vertices)
         ids[~self.confirmation.counts(self.table)[ids]] = 0
         ids[self.confirmation.too_small(ids, self.grid.settings.voxel_size)] = 0
-        return InstanceMesh(vertices, triangles, colors, ids, self._class_of_ids()[ids], self.classes)
+        return InstanceMesh(vertices, triangles, colors, ids, self.table.class_ids()[ids], self.classes)
 
-    def _class_of_ids(self) -> Int32:
-        """(ids + 1,) the most likely class of each instance; -1 for none."""
-        class_ids = np.full(self.table.last_id + 1, -1, np.int32)
-        for record in self.table.records.values():
-            class_ids[record.id] = record.class_evidence.argmax()
-        return class_ids
+    def instances(self) -> Mapping[int, Instance]:
+        return list_instances(self.mesh(), self.table)
 
     def save(self, path: Path) -> None:
         header = {
@@ -124,9 +143,11 @@ class Open3DMap(LabeledMap):
     @classmethod
     def load(cls, path: Path) -> Open3DMap:
         header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
-        scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
-        scene.classes = tuple(header["classes"])
-        scene.grid.frames = header["frames"]
-        scene.grid.fill(arrays)
-        scene.table = table_of(header["table"])
+        with faults_of(path):
+            scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
+            scene.classes = tuple(header["classes"])
+            scene.table = table_of(header["table"])
+            scene.grid.frames = header["frames"]
+            scene.grid.fill(arrays)
+            check_instances("instance", arrays["instance"], scene.table)
         return scene

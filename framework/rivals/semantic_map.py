@@ -8,14 +8,17 @@ from pathlib import Path
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Camera, Float64, Instance, InstanceMesh, View
+from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, SurfaceView, View
+from framework.interfaces import SceneMap
+from framework.mapping.association import agreed_classes
 from framework.mapping.instance_list import aligned_box, oriented_box, vertices_by_id, vertices_of_area
-from framework.mapping.map_file import read_map, write_map
-from framework.mapping.raycasting import render_surface, voxel_seen
-from framework.mapping.sensor import Sensor, pinhole
-from framework.mapping.tsdf_map import BLOCK_ARRAYS, TsdfMap, saved_sensor
+from framework.mapping.map_file import faults_of, read_map, write_map
+from framework.mapping.meshing import Surface
+from framework.mapping.raycasting import voxel_seen
+from framework.mapping.sensor import pinhole
+from framework.mapping.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.rivals.class_evidence import ClassEvidence, ClassRows, best_class
-from framework.rivals.connected_components import connected_components, opinions, vertex_classes
+from framework.rivals.connected_components import component_statistics, connected_components, vertex_classes
 
 FORMAT = "semantic 1"  # of the saved file; a change of meaning counts it up
 
@@ -34,28 +37,33 @@ def _label_view(grid, evidence, log_missed, view, depth, class_ids):
                     class_ids[v, u] = best_class(grid, evidence, log_missed, block, n)
 
 
-class SemanticMap(TsdfMap):
+class SemanticMap(SceneMap):
     """A TSDF with a distribution over the classes and the background in its voxels.
 
     `missed` is the probability that a surface of any class lies under no mask of a frame that sees it. An instance has
     an id only in the mesh as it is now: more frames may give the same object another one.
     """
 
-    def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int, missed: float, min_area: float) -> None:
-        super().__init__(voxel_size, sensor, max_blocks)
+    def __init__(self, volume: TsdfVolume, missed: float, min_area: float) -> None:
         self.classes: tuple[str, ...] = ()
+        self.volume = volume
         self.missed = missed
         self.min_area = min_area
-        self.labels = ClassRows(self.voxels)
+        self.labels = ClassRows(volume.voxels)
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Takes the first frame's label space for the map's."""
-        self.classes = classes
-        self.labels.begin(len(classes))
+        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
+        if not self.classes:
+            self.labels.begin(len(classes))
+        self.classes = agreed_classes(self.classes, classes)
+
+    @property
+    def voxel_count(self) -> int:
+        return self.volume.voxel_count
 
     @property
     def byte_count(self) -> int:
-        return self.voxels.byte_count + self.labels.byte_count
+        return self.volume.voxels.byte_count + self.labels.byte_count
 
     @property
     def evictions(self) -> int:
@@ -72,16 +80,21 @@ class SemanticMap(TsdfMap):
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """Surface and classes. Voxels know no instance, so that it shows none."""
-        surface = render_surface(self.voxels, self.sensor, camera, T_world_camera)
+        surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)
-        _label_view(self.voxels.grid, self.labels.evidence, self._log_missed, view, surface.depth, class_ids)
+        _label_view(self.volume.voxels.grid, self.labels.evidence, self._log_missed, view, surface.depth, class_ids)
         return View(**vars(surface), instance_ids=np.zeros(camera.shape, np.int32), class_ids=class_ids)
 
-    def labeled_mesh(self) -> InstanceMesh:
-        surface = self._surface.extract()
-        colors, class_ids = vertex_classes(self.voxels.grid, self.labels.evidence, self._log_missed, surface)
-        least = vertices_of_area(self.min_area, self.voxel_size)
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        return self.volume.render_near(camera, T_world_camera, depth)
+
+    def mesh(self) -> InstanceMesh:
+        return self.volume.mesh(self._labeled)
+
+    def _labeled(self, surface: Surface) -> InstanceMesh:
+        colors, class_ids = vertex_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface)
+        least = vertices_of_area(self.min_area, self.volume.voxel_size)
         instance_ids = connected_components(surface.triangles, class_ids, least)
         class_ids[instance_ids == 0] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
@@ -94,20 +107,25 @@ class SemanticMap(TsdfMap):
         believes to be of that class. Observations are the most frames in which one of these voxels was under a mask.
         """
         mesh = self.mesh()
-        surface = self._surface.extract()
-        said = opinions(
-            self.voxels.grid, self.labels.evidence, self._log_missed, surface, mesh.instance_ids, len(self.classes)
+        surface = self.volume.surface()
+        statistics = component_statistics(
+            self.volume.voxels.grid,
+            self.labels.evidence,
+            self._log_missed,
+            surface,
+            mesh.instance_ids,
+            len(self.classes),
         )
         instances = {}
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
-            sums, points = said.probability_sums[k], mesh.vertices[vertices]
+            sums, points = statistics.probability_sums[k], mesh.vertices[vertices]
             instances[k] = Instance(
                 id=k,
                 class_probabilities=(sums / sums.sum()).astype(np.float32),
-                confidence=float(sums[mesh.class_ids[vertices[0]]] / said.vertices[k]),
-                observations=int(said.masked[k]),
-                first_frame=int(said.first_frame[k]),
-                last_frame=int(said.last_frame[k]),
+                confidence=float(sums[mesh.class_ids[vertices[0]]] / statistics.vertices[k]),
+                observations=int(statistics.masked[k]),
+                first_frame=int(statistics.first_frame[k]),
+                last_frame=int(statistics.last_frame[k]),
                 vertices=vertices,
                 aabb=aligned_box(points),
                 obb=oriented_box(points),
@@ -115,7 +133,7 @@ class SemanticMap(TsdfMap):
         return instances
 
     def save(self, path: Path) -> None:
-        header, arrays = self.saved_voxels()
+        header, arrays = self.volume.saved()
         header |= {
             "format": FORMAT,
             "missed": self.missed,
@@ -128,10 +146,11 @@ class SemanticMap(TsdfMap):
     @classmethod
     def load(cls, path: Path) -> SemanticMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
-        sensor = saved_sensor(header["sensor"])
-        scene = cls(header["voxel_size"], sensor, header["max_blocks"], header["missed"], header["min_area"])
-        scene.begin(tuple(header["classes"]))
-        scene.fill_voxels(arrays)
-        scene.labels.fill(arrays)
-        scene.labels.evicted = header["evicted"]
+        with faults_of(path):
+            volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
+            scene = cls(volume, header["missed"], header["min_area"])
+            classes = tuple(header["classes"])
+            scene.begin(classes)
+            scene.labels.fill(arrays, len(classes))
+            scene.labels.evicted = header["evicted"]
         return scene

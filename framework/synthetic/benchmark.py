@@ -164,7 +164,7 @@ def _draw_scene(spec: SceneSpec, frames: int, rng: Rng) -> tuple[Scene, tuple[fl
     """A scene, and the shares of its classes and of its objects of a class that its walk shows well."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
-    caster = RayCaster(surfaces.vertices, surfaces.triangles, threads=1)
+    caster = RayCaster(surfaces.vertices, surfaces.triangles)
     wanted = {i: name for i, name in surfaces.class_names.items() if name is not None}
 
     def labels(T_world_camera: Float64) -> Int32:

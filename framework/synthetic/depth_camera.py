@@ -1,7 +1,6 @@
 """The depth errors of a structured-light camera of the Kinect v1's kind.
 
-- Axial noise grows with the square of depth and towards grazing angles: Nguyen, Izadi and Lovell, "Modeling Kinect
-  Sensor Noise for Improved 3D Reconstruction and Tracking", 3DIMPVT 2012, equation for sigma_z(z, theta).
+- Axial noise grows with the square of depth and towards grazing angles: see `framework.sensor_noise`.
 - Disparity is quantised to 1/8 px, so depth comes in steps of 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
   Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012.
 - A reading belongs to a place up to about a pixel aside (lateral noise, Nguyen et al.; applied as Handa et al.,
@@ -21,6 +20,7 @@ import numpy as np
 from numba import njit
 
 from framework.data import Bool, Camera, Float32, UInt8, UInt16
+from framework.sensor_noise import axial_sigma_at_angle
 
 BASELINE = 0.075  # m, between projector and camera
 DISPARITY_STEPS = 8.0  # per px
@@ -35,17 +35,6 @@ QUANTILE_BITS = 12  # a normal error is one of so many equally likely ones: up t
 SPARE_BITS = 16 - QUANTILE_BITS
 
 _SCALE = np.float32(DISPARITY_STEPS * FOCAL_KINECT * BASELINE)  # m, depth times steps of disparity
-_LARGEST_THETA = np.float32(np.deg2rad(80))  # the model of axial noise was fitted up to here and then diverges
-
-
-@njit(cache=True, nogil=True)
-def axial_sigma(z: np.float32, theta: np.float32) -> np.float32:
-    """The standard deviation (m) of depth z (m) at incidence angle theta (rad), Nguyen et al. 2012, eq. 2."""
-    theta = min(theta, _LARGEST_THETA)
-    beyond = z - np.float32(0.4)
-    upright = np.float32(np.pi / 2) - theta
-    slant = np.float32(0.0001) / np.sqrt(max(z, np.float32(0.1))) * (theta * theta) / (upright * upright)
-    return np.float32(np.float32(0.0012) + np.float32(0.0019) * (beyond * beyond) + slant)
 
 
 @njit(cache=True, nogil=True)
@@ -150,7 +139,7 @@ def _read(
             aside_u = lateral_sigma * normal[random[v, u, 2] >> SPARE_BITS]
             seen = _shifted(depth, v, u, aside_v, aside_u)
             # Gaussian noise which, together with the quantisation that follows, has the measured deviation
-            sigma, step = noise * axial_sigma(seen, theta[v, u]), depth_step(seen)
+            sigma, step = noise * axial_sigma_at_angle(seen, theta[v, u]), depth_step(seen)
             variance = sigma * sigma - step * step / np.float32(12)
             seen += np.sqrt(max(variance, np.float32(0))) * normal[random[v, u, 3] >> SPARE_BITS]
             steps = np.rint(_SCALE / max(seen, np.float32(0.1)))

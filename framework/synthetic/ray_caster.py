@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 import open3d as o3d
-from numba import njit
+from numba import get_num_threads
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
 
@@ -24,10 +24,9 @@ class Hits:
 
 
 class RayCaster:
-    """Casts rays at a fixed triangle mesh. Safe to call from several threads."""
+    """Casts rays at a fixed triangle mesh, by as many threads as numba has. Safe to call from several threads."""
 
-    def __init__(self, vertices: Float32, triangles: Int32, threads: int = 0) -> None:
-        self._threads = threads  # that cast rays, 0 = one for each core
+    def __init__(self, vertices: Float32, triangles: Int32) -> None:
         # One thread builds the tree, so that ties between triangles are always decided alike.
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
@@ -37,7 +36,7 @@ class RayCaster:
 
     def cast(self, rays: Float32) -> Hits:
         """The first hits of rays (..., 6), origin and direction."""
-        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), self._threads)
+        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
         return Hits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
@@ -45,7 +44,7 @@ class RayCaster:
         """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
         tensor = o3d.core.Tensor.from_numpy(rays)
-        return np.asarray(self._scene.test_occlusions(tensor, 1e-3, 0.999, self._threads).numpy())
+        return np.asarray(self._scene.test_occlusions(tensor, 1e-3, 0.999, get_num_threads()).numpy())
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:
@@ -54,24 +53,13 @@ def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) 
     The direction has length 1 along the optical axis, so that the distance of a hit is its depth.
     """
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
-    shape = np.broadcast_shapes(x.shape, y.shape)
-    rays = np.empty((*shape, 6), np.float32)
-    T_world_camera = np.ascontiguousarray(T_world_camera, np.float64)
-    _write_rays(np.broadcast_to(x, shape), np.broadcast_to(y, shape), T_world_camera, rays)
+    rays = np.empty((*np.broadcast_shapes(x.shape, y.shape), 6), np.float32)
+    for axis, (to_right, down, ahead, at) in enumerate(T_world_camera[:3]):  # BLAS might round by number of threads
+        rays[..., axis] = at
+        rays[..., 3 + axis] = to_right * x + (down * y + ahead)
     return rays
 
 
 def image_rays(camera: Camera, T_world_camera: Float64) -> Float32:
     """The rays (H, W, 6) through all pixel centres."""
     return pixel_rays(camera, T_world_camera, np.arange(camera.width)[None, :], np.arange(camera.height)[:, None])
-
-
-@njit(cache=True, nogil=True)
-def _write_rays(x: Float64, y: Float64, T_world_camera: Float64, rays: Float32) -> None:
-    """Without BLAS: its rounding may depend on the number of threads."""
-    T = T_world_camera
-    for i in range(x.shape[0]):
-        for j in range(x.shape[1]):
-            for c in range(3):
-                rays[i, j, c] = T[c, 3]
-                rays[i, j, 3 + c] = T[c, 0] * x[i, j] + (T[c, 1] * y[i, j] + T[c, 2])

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32, UInt8
-from framework.rendering.rasterizer import NO_TRIANGLE, Rasterizer, VisibilityBuffer
+from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
 from framework.synthetic.lights import Lamp, bake
 from framework.synthetic.ray_caster import RayCaster, image_rays
 from framework.synthetic.shading import WHITE, lit, shade
@@ -29,9 +29,9 @@ class Rendering:
 class Renderer:
     """Renders `surfaces` under `lamps`, whose light is baked once. Safe to call from several threads."""
 
-    def __init__(self, surfaces: Surfaces, lamps: list[Lamp], casting_threads: int = 0) -> None:
+    def __init__(self, surfaces: Surfaces, lamps: list[Lamp]) -> None:
         self.surfaces = surfaces
-        self.caster = RayCaster(surfaces.vertices, surfaces.triangles, casting_threads)
+        self.caster = RayCaster(surfaces.vertices, surfaces.triangles)
         self._lit = lit(surfaces, bake(surfaces, self.caster, lamps))
         self._rasterizer = Rasterizer(surfaces.vertices, surfaces.triangles)
 
@@ -48,25 +48,17 @@ class Renderer:
         return buffer.depth, self._ids(buffer)
 
     def _ids(self, buffer: VisibilityBuffer) -> Int32:
-        return np.asarray(_looked_up(buffer.triangle, self.surfaces.instance_ids), np.int32)
+        return _of_triangles(self.surfaces.instance_ids, buffer.triangle)
 
 
 def ids_met(surfaces: Surfaces, caster: RayCaster, camera: Camera, T_world_camera: Float64) -> Int32:
     """The instance ids (H, W) by ray-casting: for small pictures cheaper than a Renderer, and without its light."""
-    return np.asarray(
-        _looked_up(caster.cast(image_rays(camera, T_world_camera)).triangle, surfaces.instance_ids), np.int32
-    )
+    return _of_triangles(surfaces.instance_ids, caster.cast(image_rays(camera, T_world_camera)).triangle)
 
 
-@njit(cache=True, nogil=True)
-def _looked_up(triangle: Int32, instance_ids: Int32) -> Int32:
-    """The instances (H, W) that triangles (H, W) belong to, 0 where nothing was met."""
-    ids = np.zeros(triangle.shape, np.int32)
-    for v in range(triangle.shape[0]):
-        for u in range(triangle.shape[1]):
-            if triangle[v, u] != NO_TRIANGLE:
-                ids[v, u] = instance_ids[triangle[v, u]]
-    return ids
+def _of_triangles(instance_ids: Int32, triangle: Int32) -> Int32:
+    """The instances (H, W) that triangles (H, W) belong to, 0 where nothing was met: NO_TRIANGLE is -1."""
+    return np.append(instance_ids, np.int32(0))[triangle]
 
 
 def to_srgb(light: Float32) -> UInt8:

@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
 from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
@@ -92,41 +91,24 @@ def seen_from(
 ) -> Bool:
     """(V,) Which vertices lie in the picture of one of the poses, at a depth within `reach` and with nothing before."""
     seen = np.zeros(len(vertices), np.bool_)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     for T_world_camera in poses:
-        candidates = _in_view(vertices, seen, T_world_camera, intrinsics, *camera.shape, *reach)
+        candidates = _in_view(vertices, seen, camera, T_world_camera, reach)
         ends = vertices[candidates]
         origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), ends.shape)
         seen[candidates[~caster.occluded(origins, ends)]] = True
     return seen
 
 
-@njit(cache=True, nogil=True)
 def _in_view(
-    vertices: Float32,
-    skip: Bool,
-    T_world_camera: Float64,
-    intrinsics: Float64,
-    height: int,
-    width: int,
-    near: float,
-    far: float,
+    vertices: Float32, skip: Bool, camera: Camera, T_world_camera: Float64, reach: tuple[float, float]
 ) -> Int64:
     """The indices of the vertices, but for those to `skip`, that the picture would show if nothing stood before."""
-    R, t = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    found = np.empty(len(vertices), np.int64)
-    count = 0
-    for i in range(len(vertices)):
-        if skip[i]:
-            continue
-        dx, dy, dz = vertices[i, 0] - t[0], vertices[i, 1] - t[1], vertices[i, 2] - t[2]
-        z = R[0, 2] * dx + R[1, 2] * dy + R[2, 2] * dz
-        if z <= near or z > far:
-            continue
-        u = fx * (R[0, 0] * dx + R[1, 0] * dy + R[2, 0] * dz) / z + cx
-        v = fy * (R[0, 1] * dx + R[1, 1] * dy + R[2, 1] * dz) / z + cy
-        if -0.5 <= u < width - 0.5 and -0.5 <= v < height - 0.5:
-            found[count] = i
-            count += 1
-    return found[:count]
+    index = np.flatnonzero(~skip)
+    dx, dy, dz = vertices[index].T - T_world_camera[:3, 3:]
+    x, y, z = (R[0] * dx + R[1] * dy + R[2] * dz for R in T_world_camera[:3, :3].T)
+    near, far = reach
+    ahead = (z > near) & (z <= far)
+    index, x, y, z = index[ahead], x[ahead], y[ahead], z[ahead]
+    u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    height, width = camera.shape
+    return np.asarray(index[(u >= -0.5) & (u < width - 0.5) & (v >= -0.5) & (v < height - 0.5)])

@@ -21,12 +21,13 @@ from multiprocessing.connection import wait as wait_for_end
 from pathlib import Path
 
 import cv2
+import numba
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.errors import ConfigError, DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 
@@ -163,6 +164,7 @@ def _write_walk(scene: SceneNNScene) -> int:
 def _begin_process() -> None:
     """One thread for each process, Ctrl-C only while it works, and an end when its parent has ended."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    numba.set_num_threads(1)
     cv2.setNumThreads(1)
     threadpool_limits(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()

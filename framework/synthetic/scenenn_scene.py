@@ -16,8 +16,8 @@ from framework.data import Array, Box, Camera, Float32, Int32
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.datasets.scenenn.trajectory_log import write_trajectory_log
 from framework.errors import ConfigError
-from framework.files.atomic_files import written_whole
 from framework.files.ply import write_ply
+from framework.files.whole_files import written_whole
 from framework.geometry import transform
 from framework.label_spaces import SCENENN_TO_COCO
 from framework.synthetic.benchmark import SceneSpec, plan_scene
@@ -99,7 +99,7 @@ class SceneNNScene:
         self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
         scene = plan_scene(spec, self._stream, recording.frames)
         self.room, self.path = scene.room, scene.path
-        self.renderer = Renderer(self.room.surfaces, list(self.room.lamps), casting_threads=1)
+        self.renderer = Renderer(self.room.surfaces, list(self.room.lamps))
         self._sensor = DepthSensor(NOISE, MAX_RANGE)
         ids = 1 + scene.rng.choice(LARGEST_ID, len(self.room.objects), replace=False)
         ids[0] = 0  # the shell is no instance

@@ -48,8 +48,8 @@ class TableChoice:
             raise ConfigError(
                 f"table.across={self.across} and table.by={self.by} are two layouts: one of them must be null"
             )
-        if self.apart in self.over:
-            raise ConfigError(f"table.over has {self.apart}, whose values table.{self.layout} shows one by one")
+        if self.split_key in self.over:
+            raise ConfigError(f"table.over has {self.split_key}, whose values table.{self.layout} shows one by one")
         if self.across and len(self.columns) > 1:
             raise ConfigError(
                 f"table.columns must name one figure, the one that stands across {self.across}, found "
@@ -67,7 +67,7 @@ class TableChoice:
         return "across" if self.across else "by" if self.by else "rows"
 
     @property
-    def apart(self) -> str | None:
+    def split_key(self) -> str | None:
         """The key whose values are shown one by one, as columns or as groups of lines."""
         return self.across or self.by
 
@@ -105,7 +105,7 @@ class Comparison:
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
             raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
-        keys = [*choice.over, choice.apart] if choice.apart else choice.over
+        keys = [*choice.over, choice.split_key] if choice.split_key else choice.over
         rows = rows_of(records, keys, overrides)
         asked = asked_runs(sweep, keys)
         superseded = len(records) - sum(len(row.records) for row in rows)
@@ -114,7 +114,7 @@ class Comparison:
     @property
     def judged(self) -> bool:
         """Whether a figure depends on the true instances, of whose annotation there may be several releases."""
-        annotated = self.choice.apart or any(record.annotation for record in self.records)
+        annotated = self.choice.split_key or any(record.annotation for record in self.records)
         return bool(annotated) and any(map(is_evaluation, self.choice.columns))
 
     @property
@@ -128,7 +128,7 @@ class Comparison:
     @property
     def noun(self) -> str:
         """What is shown one by one, in a word: `scene` for dataset.scene."""
-        return (self.choice.apart or "").rpartition(".")[2]
+        return (self.choice.split_key or "").rpartition(".")[2]
 
     def base_of(self, row: Row) -> Row | None:
         """The row that `row` is compared with, of the same poses and the like; None for that one, and without it."""
@@ -157,7 +157,7 @@ class Comparison:
     @cached_property
     def sequences(self) -> list[str]:
         """The values that are shown one by one: those of published tables first, and those of the runs."""
-        found = {run[-1] for run in self._runs} if self.choice.apart else set()
+        found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
@@ -170,7 +170,7 @@ class Comparison:
     def missing(self) -> Iterator[tuple[Row, list[Run]]]:
         """The runs that a row should have: they were asked for, or other rows have their seeds and sequences."""
         runs = self._runs
-        if self.choice.apart:
+        if self.choice.split_key:
             seeds, sequences = (dict.fromkeys(run[:-1] for run in runs), dict.fromkeys(run[-1] for run in runs))
             runs = [(*seed, sequence) for seed in seeds for sequence in sequences]
         for row in self.rows:

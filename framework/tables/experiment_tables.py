@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.tables.comparison import Comparison
 from framework.tables.grid import Grid, latex_grid, markdown_grid
 from framework.tables.layouts import difference_grid, row_grid
@@ -24,7 +24,7 @@ def write_tables(directory: Path) -> str:
     """
     comparison = Comparison.below(directory)
     text = markdown(comparison)
-    separated = comma_separated_runs if comparison.choice.apart else comma_separated_rows
+    separated = comma_separated_runs if comparison.choice.split_key else comma_separated_rows
     for name, content in (("md", text), ("tex", latex(comparison)), ("csv", separated(comparison))):
         with written_whole(directory / f"table.{name}") as temporary:
             temporary.write_text(content, "utf-8")
@@ -71,9 +71,9 @@ def comma_separated_rows(comparison: Comparison) -> str:
         line: list[float] = []
         base = row if comparison.base_name in (row.name, row.system) else comparison.base_of(row)
         for column in comparison.choice.columns:
-            mean, less = row.mean(column), row.less(base, column) if base else {}
-            difference = mean_difference(less)
-            line += [mean.value, mean.deviation, mean.count, difference.value, difference.error, len(less)]
+            mean, differences = row.mean(column), row.differences(base, column) if base else {}
+            difference = mean_difference(differences)
+            line += [mean.value, mean.deviation, mean.count, difference.value, difference.error, len(differences)]
         figures = ["" if math.isnan(x) else repr(x) for x in line]
         records = list(row.records.values())
         code = counted(record.code for record in records)
@@ -83,14 +83,14 @@ def comma_separated_rows(comparison: Comparison) -> str:
 
 def comma_separated_runs(comparison: Comparison) -> str:
     """One line a run and figure, all digits, for pandas; a figure that is not defined has no line."""
-    apart = comparison.choice.apart
-    assert apart
+    split_key = comparison.choice.split_key
+    assert split_key
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     origins = ["poses", "tracker", "annotation", "code", "config"]
-    writer.writerow(["system", "variant", *comparison.choice.over, apart, "figure", "value", *origins])
+    writer.writerow(["system", "variant", *comparison.choice.over, split_key, "figure", "value", *origins])
     for row in comparison.rows:
-        told_of = {
+        origins_of = {
             run: [
                 *(record.metrics.get(key) for key in ("pose_source", "choice.tracker", "annotation_release")),
                 *(record.code, record.metrics["config_hash"]),
@@ -100,5 +100,5 @@ def comma_separated_runs(comparison: Comparison) -> str:
         for column in comparison.choice.columns:
             for run, value in row.values(column).items():
                 variant = ", ".join(row.variant)
-                writer.writerow([row.system or row.name, variant, *run, column, repr(value), *told_of[run]])
+                writer.writerow([row.system or row.name, variant, *run, column, repr(value), *origins_of[run]])
     return text.getvalue()

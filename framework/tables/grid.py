@@ -13,7 +13,7 @@ class Grid:
 
     heads: list[str]
     body: list[list[str]]
-    words: int = 1  # how many columns, from the left, hold words; the others hold figures
+    label_columns: int = 1  # how many columns, from the left, hold words; the others hold figures
     bold: frozenset[tuple[int, int]] = frozenset()  # (line, column)
     groups: frozenset[int] = frozenset()  # lines that begin another group than the line above
 
@@ -24,10 +24,10 @@ def decimals(values: Iterable[float]) -> int:
     return next((3 - k for k, limit in enumerate((2, 20, 200)) if largest < limit), 0)
 
 
-def figure(value: float, spread: float, places: int, signed: bool = False) -> str:
+def figure(value: float, spread: float, digits: int, signed: bool = False) -> str:
     """Value ± spread, the spread only where it is known."""
-    text = f"{round(value, places) + 0.0:{'+' if signed else ''}.{places}f}"  # + 0.0: no -0.000
-    return text if math.isnan(spread) else f"{text} ± {spread:.{places}f}"
+    text = f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # + 0.0: no -0.000
+    return text if math.isnan(spread) else f"{text} ± {spread:.{digits}f}"
 
 
 def markdown_grid(grid: Grid) -> str:
@@ -36,19 +36,22 @@ def markdown_grid(grid: Grid) -> str:
     for line, column in grid.bold:
         cells[line + 1][column] = f"**{cells[line + 1][column]}**"
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    first, *lines = ["| " + " | ".join(_padded(line, widths, grid.words)) + " |" for line in cells]
-    rules = ["-" * width if k < grid.words else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
+    first, *lines = ["| " + " | ".join(_padded(line, widths, grid.label_columns)) + " |" for line in cells]
+    rules = ["-" * width if k < grid.label_columns else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
     return "\n".join([first, "| " + " | ".join(rules) + " |", *lines])
 
 
-def _padded(line: list[str], widths: list[int], words: int) -> list[str]:
+def _padded(line: list[str], widths: list[int], label_columns: int) -> list[str]:
     pairs = enumerate(zip(line, widths, strict=True))
-    return [cell.ljust(width) if k < words else cell.rjust(width) for k, (cell, width) in pairs]
+    return [cell.ljust(width) if k < label_columns else cell.rjust(width) for k, (cell, width) in pairs]
 
 
 def latex_grid(grid: Grid) -> list[str]:
     """The lines of a tabular for `\\usepackage{booktabs}`."""
-    lines = [f"\\begin{{tabular}}{{{'l' * grid.words}{'r' * (len(grid.heads) - grid.words)}}}", "\\toprule"]
+    lines = [
+        f"\\begin{{tabular}}{{{'l' * grid.label_columns}{'r' * (len(grid.heads) - grid.label_columns)}}}",
+        "\\toprule",
+    ]
     lines += [_latex_line(map(_escaped, grid.heads)), "\\midrule"]
     for k, cells in enumerate(grid.body):
         if k in grid.groups:

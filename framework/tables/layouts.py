@@ -75,7 +75,8 @@ def difference_grid(comparison: Comparison) -> Grid:
     """Each row's mean difference to the base with its standard error."""
     compared = comparison.compared
     columns = [
-        _Column([mean_difference(row.less(base, key)) for row, base in compared]) for key in comparison.choice.columns
+        _Column([mean_difference(row.differences(base, key)) for row, base in compared])
+        for key in comparison.choice.columns
     ]
     body = []
     for k, (row, base) in enumerate(compared):
@@ -111,11 +112,11 @@ def published_name(published: PublishedRow) -> str:
     return f"{published.system} (published)"
 
 
-def published_cell(published: PublishedRow, key: Key, places: int) -> str:
+def published_cell(published: PublishedRow, key: Key, digits: int) -> str:
     """The number in a cell; told apart: what nobody has looked up, and what the source does not have."""
     if published.values is None:
         return NOT_KNOWN
     value = published.values.get(key, math.nan)
     if value is None:
         return NOT_KNOWN
-    return NOTHING if math.isnan(value) else figure(value, math.nan, min(places, published.decimals))
+    return NOTHING if math.isnan(value) else figure(value, math.nan, min(digits, published.decimals))

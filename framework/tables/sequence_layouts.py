@@ -22,7 +22,7 @@ MISSING = "missing"  # a figure that a run would have, of which there is no comp
 
 @dataclass(frozen=True)
 class _Line:
-    words: list[str]
+    labels: list[str]
     cells: list[str]
     variant: tuple[str, ...] | None = None  # lines that share it compete for the highest; None = competes with none
     figures: Sequence[float] = ()  # for each cell; NaN = does not compete
@@ -34,14 +34,14 @@ def across_grid(comparison: Comparison) -> Grid:
     sequences, seeds = comparison.sequences, _seeds(comparison)
     means = {row.name: mean_by_sequence(row.values(key)) for row in comparison.rows}
     overall = {row.name: mean_over_sequences(row.values(key)) for row in comparison.rows}
-    places = decimals(mean.value for found in means.values() for mean in found.values())
+    digits = decimals(mean.value for found in means.values() for mean in found.values())
     sections = [
         [
             _Line(
-                _words(comparison, row),
+                _row_labels(comparison, row),
                 [
-                    *(_cell(row, means[row.name], sequence, seeds, places) for sequence in sequences),
-                    _mean_cell(overall[row.name], len(sequences), seeds, places),
+                    *(_cell(row, means[row.name], sequence, seeds, digits) for sequence in sequences),
+                    _mean_cell(overall[row.name], len(sequences), seeds, digits),
                 ],
                 row.variant,
                 [*(_comparable(row, rows, means, s) for s in sequences), _comparable_mean(row, rows, overall)],
@@ -52,15 +52,15 @@ def across_grid(comparison: Comparison) -> Grid:
     ]
     published = [
         _Line(
-            _published_words(comparison, one),
+            _published_labels(comparison, one),
             [
-                *(published_cell(one, (sequence,), places) for sequence in sequences),
+                *(published_cell(one, (sequence,), digits) for sequence in sequences),
                 NOT_KNOWN if one.values is None else NOTHING,  # a mean that nobody has published
             ],
         )
         for one in comparison.published.rows
     ]
-    return _grid([*_heads(comparison, "system"), *sequences, "mean"], [*sections, published], places)
+    return _grid([*_label_heads(comparison, "system"), *sequences, "mean"], [*sections, published], digits)
 
 
 def by_grid(comparison: Comparison) -> Grid:
@@ -70,86 +70,88 @@ def by_grid(comparison: Comparison) -> Grid:
     means = {key: {row.name: mean_by_sequence(row.values(key)) for row in rows} for key in keys}
     overall = {key: {row.name: mean_over_sequences(row.values(key)) for row in rows} for key in keys}
     found_in = {key: len({sequence for found in means[key].values() for sequence in found}) for key in keys}
-    places = decimals(mean.value for of_key in means.values() for found in of_key.values() for mean in found.values())
+    digits = decimals(mean.value for of_key in means.values() for found in of_key.values() for mean in found.values())
     begun = {run[-1] for row in rows for run in row.records}
     sections: dict[str, list[_Line]] = {}
     for sequence in comparison.sequences:
         sections[sequence] = [
             _Line(
-                _words(comparison, row),
-                [_cell(row, means[key][row.name], sequence, seeds, places) for key in keys],
+                _row_labels(comparison, row),
+                [_cell(row, means[key][row.name], sequence, seeds, digits) for key in keys],
                 row.variant,
                 [_comparable(row, rows, means[key], sequence) for key in keys],
             )
             for row in (rows if sequence in begun else ())
         ] + [
-            _Line(_published_words(comparison, one), [published_cell(one, (sequence, key), places) for key in keys])
+            _Line(_published_labels(comparison, one), [published_cell(one, (sequence, key), digits) for key in keys])
             for one in comparison.published.rows
             if one.has(sequence)
         ]
     sections["mean"] = [
         _Line(
-            _words(comparison, row),
-            [_mean_cell(overall[key][row.name], found_in[key], seeds, places) for key in keys],
+            _row_labels(comparison, row),
+            [_mean_cell(overall[key][row.name], found_in[key], seeds, digits) for key in keys],
             row.variant,
             [_comparable_mean(row, rows, overall[key]) for key in keys],
         )
         for row in rows
     ] + [
-        _Line(_published_words(comparison, one), [NOT_KNOWN] * len(keys))
+        _Line(_published_labels(comparison, one), [NOT_KNOWN] * len(keys))
         for one in comparison.published.rows
         if one.values is None
     ]
     titled = [
-        [replace(line, words=[title if k == 0 else "", *line.words]) for k, line in enumerate(section)]
+        [replace(line, labels=[title if k == 0 else "", *line.labels]) for k, line in enumerate(section)]
         for title, section in sections.items()
     ]
-    return _grid([comparison.noun, *_heads(comparison, "system"), *map(head, keys)], titled, places)
+    return _grid([comparison.noun, *_label_heads(comparison, "system"), *map(head, keys)], titled, digits)
 
 
 def difference_across_grid(comparison: Comparison) -> Grid:
     """The base less each of the others, sequence by sequence, and the mean with its standard error."""
     [key] = comparison.choice.columns
-    less = {row.name: base.less(row, key) for row, base in comparison.compared}
-    paired = {run[-1] for runs in less.values() for run in runs}
+    differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
+    paired = {run[-1] for runs in differences.values() for run in runs}
     sequences = [sequence for sequence in comparison.sequences if sequence in paired]
-    places = decimals(value for runs in less.values() for value in runs.values())
+    digits = decimals(value for runs in differences.values() for value in runs.values())
     sections = []
     for rows in _by_variant([row for row, _ in comparison.compared]):
         section = []
         for row in rows:
-            means, mean = mean_by_sequence(less[row.name]), mean_difference(less[row.name])
-            cells = [figure(means[s].value, math.nan, places, True) if s in means else MISSING for s in sequences]
-            overall = figure(mean.value, mean.error, places, True) if mean.count else MISSING
-            cells += [f"{overall} *" if mean.is_not_zero else overall, str(len(less[row.name]))]
-            section.append(_Line(_words(comparison, row), cells))
+            means, mean = mean_by_sequence(differences[row.name]), mean_difference(differences[row.name])
+            cells = [figure(means[s].value, math.nan, digits, True) if s in means else MISSING for s in sequences]
+            overall = figure(mean.value, mean.error, digits, True) if mean.count else MISSING
+            cells += [f"{overall} *" if mean.is_not_zero else overall, str(len(differences[row.name]))]
+            section.append(_Line(_row_labels(comparison, row), cells))
         sections.append(section)
-    heads = [*_heads(comparison, f"{comparison.base_called} less"), *sequences, "mean", "pairs"]
-    return _grid(heads, sections, places)
+    heads = [*_label_heads(comparison, f"{comparison.base_called} less"), *sequences, "mean", "pairs"]
+    return _grid(heads, sections, digits)
 
 
-def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], places: int) -> Grid:
+def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) -> Grid:
     lines: list[_Line] = []
     bold: set[tuple[int, int]] = set()
     groups: set[int] = set()
     for section in sections:
         if lines:
             groups.add(len(lines))
-        bold |= {(len(lines) + k, len(line.words) + column) for k, line, column in _highest(section, places)}
+        bold |= {(len(lines) + k, len(line.labels) + column) for k, line, column in _highest(section, digits)}
         lines += section
-    words = len(lines[0].words)
-    return Grid(heads, [[*line.words, *line.cells] for line in lines], words, frozenset(bold), frozenset(groups))
+    label_columns = len(lines[0].labels)
+    return Grid(
+        heads, [[*line.labels, *line.cells] for line in lines], label_columns, frozenset(bold), frozenset(groups)
+    )
 
 
-def _highest(section: Sequence[_Line], places: int) -> Iterable[tuple[int, _Line, int]]:
-    """(place, line, column) of the figures that no rival's exceeds as it is printed; without a rival there is none."""
+def _highest(section: Sequence[_Line], digits: int) -> Iterable[tuple[int, _Line, int]]:
+    """(index, line, column) of the figures that no rival's exceeds as it is printed; without a rival there is none."""
     for k, line in enumerate(section):
         if line.variant is None:
             continue
         rivals = [other.figures for other in section if other.variant == line.variant]
         for column, value in enumerate(line.figures):
-            others = [round(figures[column], places) for figures in rivals if not math.isnan(figures[column])]
-            if len(others) > 1 and round(value, places) == max(others):
+            others = [round(figures[column], digits) for figures in rivals if not math.isnan(figures[column])]
+            if len(others) > 1 and round(value, digits) == max(others):
                 yield k, line, column
 
 
@@ -161,21 +163,21 @@ def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
     return list(groups.values())
 
 
-def _told(comparison: Comparison, name: str, poses: str, annotation: str) -> list[str]:
+def _labels(comparison: Comparison, name: str, poses: str, annotation: str) -> list[str]:
     """What a line, or the head, begins with: a name and what may not be averaged."""
     return [name, poses, annotation] if comparison.judged else [name, poses]
 
 
-def _words(comparison: Comparison, row: Row) -> list[str]:
-    return _told(comparison, comparison.called(row, without="tracker"), row.poses, row.annotation or NOTHING)
+def _row_labels(comparison: Comparison, row: Row) -> list[str]:
+    return _labels(comparison, comparison.called(row, without="tracker"), row.poses, row.annotation or NOTHING)
 
 
-def _published_words(comparison: Comparison, one: PublishedRow) -> list[str]:
-    return _told(comparison, published_name(one), one.poses, one.annotation)
+def _published_labels(comparison: Comparison, one: PublishedRow) -> list[str]:
+    return _labels(comparison, published_name(one), one.poses, one.annotation)
 
 
-def _heads(comparison: Comparison, name: str) -> list[str]:
-    return _told(comparison, name, "poses", "annotation")
+def _label_heads(comparison: Comparison, name: str) -> list[str]:
+    return _labels(comparison, name, "poses", "annotation")
 
 
 def _seeds(comparison: Comparison) -> int:
@@ -198,21 +200,21 @@ def _comparable_mean(row: Row, rows: Sequence[Row], means: Mapping[str, Sequence
     return mean.value if (mean.count, mean.runs) == most else math.nan
 
 
-def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, places: int) -> str:
+def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, digits: int) -> str:
     """Mean ± deviation over seeds; with their number where a run is missing or has no such figure."""
     if not any(run[-1] == sequence for run in row.records):
         return MISSING
     if sequence not in means:
         return NOTHING
     mean = means[sequence]
-    return _of(figure(mean.value, mean.deviation, places), mean.count, seeds)
+    return _of(figure(mean.value, mean.deviation, digits), mean.count, seeds)
 
 
-def _mean_cell(mean: SequenceMean, expected: int, seeds: int, places: int) -> str:
+def _mean_cell(mean: SequenceMean, expected: int, seeds: int, digits: int) -> str:
     """Mean ± deviation over seeds; with the number of sequences where some are missing, else of runs where some are."""
     if not mean.count:
         return NOTHING
-    text = figure(mean.value, mean.deviation, places)
+    text = figure(mean.value, mean.deviation, digits)
     if mean.count == expected and mean.runs < expected * seeds:
         return f"{text} ({mean.runs} of {expected * seeds} runs)"
     return _of(text, mean.count, expected)

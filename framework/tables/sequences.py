@@ -41,10 +41,10 @@ def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
     )
 
 
-def mean_difference(less: Mapping[Run, float]) -> Mean:
+def mean_difference(differences: Mapping[Run, float]) -> Mean:
     """The mean of paired differences, with a standard error over sequences: over the last words of runs.
 
     What is before that is averaged first: several seeds of a sequence are no further evidence of what another sequence
     would show.
     """
-    return Mean.of(mean.value for mean in mean_by_sequence(less).values())
+    return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

@@ -41,10 +41,10 @@ def _averaging(comparison: Comparison) -> Iterator[str]:
     choice, over = comparison.choice, ", ".join(comparison.choice.over)
     if others := following(comparison.records, choice.over):
         yield f"Averaged over with {over}, whose value they have in every run: {', '.join(others)}."
-    if choice.apart:
+    if choice.split_key:
         yield (
             f"Mean ± sample standard deviation over {over}, where there are several. The mean is over the sequences "
-            f"({choice.apart}), each of which counts as one; its deviation is over the runs that have all of them. "
+            f"({choice.split_key}), each of which counts as one; its deviation is over the runs that have all of them. "
             "In bold: the highest of the same poses, among means of as many runs. missing: no complete run."
         )
     else:
@@ -52,10 +52,10 @@ def _averaging(comparison: Comparison) -> Iterator[str]:
     if not comparison.has_base:
         yield f"No differences: {comparison.base_name} is no row with a complete run; table.base=ROW names another."
     elif len(comparison.rows) > 1:
-        keys = [*choice.over, *filter(None, [choice.apart])]
+        keys = [*choice.over, *filter(None, [choice.split_key])]
         error = "mean ± standard error"
         if len(keys) > 1:
-            kinds = "the sequences" if choice.apart else f"the values of {keys[-1]}"
+            kinds = "the sequences" if choice.split_key else f"the values of {keys[-1]}"
             error += f" over {kinds}, of each of which the runs are averaged first"
         yield (
             f"Differences are paired by {', '.join(keys)}: {error}; "
@@ -72,12 +72,12 @@ def _winners(comparison: Comparison) -> Iterator[str]:
         return
     [key] = comparison.choice.columns
     for row, base in comparison.compared:
-        less = mean_by_sequence(base.less(row, key))
-        lost = [sequence for sequence in comparison.sequences if sequence in less and less[sequence].value < 0]
-        won = sum(mean.value > 0 for mean in less.values())
+        means = mean_by_sequence(base.differences(row, key))
+        lost = [sequence for sequence in comparison.sequences if sequence in means and means[sequence].value < 0]
+        won = sum(mean.value > 0 for mean in means.values())
         yield (
             f"{comparison.base_called} against {comparison.called(row, without='tracker')}, {row.poses}: "
-            f"higher in {won} of {len(less)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
+            f"higher in {won} of {len(means)} sequences, lower in {len(lost)}{': ' + ', '.join(lost) if lost else ''}."
         )
 
 
@@ -104,25 +104,25 @@ def _published(comparison: Comparison) -> Iterator[str]:
 
 def _missing(comparison: Comparison) -> Iterator[str]:
     """The figures, rows, sequences and runs of which there is no record, and the runs that did not end well."""
-    keys_told = {key for record in comparison.records for key in record.metrics}
-    if absent := [key for key in comparison.choice.columns if key not in keys_told]:
+    known_keys = {key for record in comparison.records for key in record.metrics}
+    if absent := [key for key in comparison.choice.columns if key not in known_keys]:
         yield f"No run has a figure of this name: {', '.join(absent)}."
     begun = {row.system for row in comparison.rows}
     if absent := [name for name in comparison.overrides if name not in begun]:
         yield f"Without a complete run: {', '.join(absent)}."
     run_of = {run[-1] for row in comparison.rows for run in row.records}
     if absent := [sequence for sequence in comparison.sequences if sequence not in run_of]:
-        yield f"Without a complete run of any row: {comparison.choice.apart}={','.join(absent)}."
-    keys = [*comparison.choice.over, *filter(None, [comparison.choice.apart])]
+        yield f"Without a complete run of any row: {comparison.choice.split_key}={','.join(absent)}."
+    keys = [*comparison.choice.over, *filter(None, [comparison.choice.split_key])]
     for row, missing in comparison.missing():
-        yield f"Missing in {row.name}: {_runs_told(keys, missing)}."
+        yield f"Missing in {row.name}: {_as_overrides(keys, missing)}."
     if comparison.superseded:
         yield f"Left out, older records of the same runs: {comparison.superseded}."
     for one in comparison.incomplete:
         yield f"Not complete: {one.directory.relative_to(comparison.root)}: {one.reason.rstrip('.')}."
 
 
-def _runs_told(keys: Sequence[str], runs: Sequence[Run]) -> str:
+def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
     """As overrides that run them: seed=0 dataset.scene=011,030; seed=1 dataset.scene=011."""
     last: dict[Run, list[str]] = {}
     for run in runs:

@@ -1,4 +1,4 @@
-"""Aligning a frame to a view of the map: point-to-plane and photometric terms, eq. 2 of the method.
+"""Aligning a frame to a view of the map: point-to-plane and photometric terms, as ElasticFusion (Whelan et al. 2015).
 
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
@@ -20,8 +20,8 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, SurfaceView
-from framework.mapping.sensor import depth_noise
 from framework.mapping.voxel_grid import device, one_more
+from framework.sensor_noise import axial_sigma_single
 from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
@@ -237,7 +237,7 @@ def _add_geometry(model, R, weights, points, J):
             + ny * (R10 * fx + R11 * fy + R12 * fz)
             + nz * (R20 * fx + R21 * fy + R22 * fz)
         )
-        sigma = depth_noise(points[DEPTH + n])
+        sigma = axial_sigma_single(points[DEPTH + n])
         distance = nx * ex + ny * ey + nz * ez
         weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
         weight = weight if near & (dot > min_dot) else zero

@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 
 import cv2
+import numba
 import numpy as np
 from tqdm import tqdm
 
@@ -61,7 +62,7 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
     if not missing:
         return
     # not forked: threads of numba and OpenCV do not survive that
-    workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"))
+    workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), numba.set_num_threads, (1,))
     with workers, tqdm(total=len(missing), desc="rendering rooms", unit="room", disable=None) as bar:
         for _ in workers.map(partial(render_room, folder, views), missing):
             bar.update()

@@ -26,7 +26,7 @@ from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import Fact, load_network, save_network
 from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
 from framework.evaluation.mask_ap import MaskAp, mask_ap
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.interfaces import Detector
 from framework.label_spaces import COCO, SCENENN_TO_COCO
 from framework.parameters import require

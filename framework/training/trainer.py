@@ -20,7 +20,7 @@ from tqdm import tqdm
 from framework.detection.mask_rcnn.network import MaskRCNN
 from framework.detection.masks import tight_boxes
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.parameters import require
 from framework.training.augmentation import augmented
 from framework.training.losses import Budget, Objects, losses

@@ -12,7 +12,6 @@ from framework.detection.candidates import Layout, decode
 from framework.detection.image_network import ImageNetwork
 from framework.detection.letterbox import Placement
 from framework.detection.masks import suppress_duplicates, tight_boxes
-from framework.detection.onnx_network import Runtime
 from framework.interfaces import Detector
 from framework.label_spaces import read_labels, to_coco
 from framework.parameters import require
@@ -24,7 +23,7 @@ YOLOX_NANO = "d39bee73564e338080378b0ad567fbb40e818b55bbfaf971de82a0267ed16b8a"
 
 @dataclass
 class OnnxBoxes(Detector):
-    """Any box detector in an ONNX file: YOLO or SSD, by onnxruntime or by OpenCV; its masks come from depth.
+    """Any box detector in an ONNX file: YOLO or SSD, by onnxruntime; its masks come from depth.
 
     The class distribution of a detection is its class scores, times the objectness, divided by their sum; its score is
     the largest of them before the division. A mask is what stands in front in the box and holds together there, see
@@ -49,8 +48,7 @@ class OnnxBoxes(Detector):
     significance: float = 0.4  # share in [0, 1] of the box's readings, the centre's count most, for a foreground
     max_slant: float = 85.0  # degrees in (0, 90) to the image plane: a steeper surface is a gap between two objects
     min_readings: float = 0.1  # share in [0, 1] of the box's pixels with depth; with fewer it is dropped
-    runtime: Runtime = Runtime.auto  # auto = onnxruntime where installed, else OpenCV
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda where the runtime has it
+    device: str = "auto"  # auto, cpu or cuda; auto = cuda where onnxruntime has it
     reads = ("color", "depth", "camera")
 
     def __post_init__(self) -> None:
@@ -68,7 +66,6 @@ class OnnxBoxes(Detector):
         self._network = ImageNetwork(
             path=self.weights,
             sha256=self.sha256,
-            runtime=self.runtime,
             device=self.device,
             input_size=self.input_size,
             placement=self.placement,

@@ -10,7 +10,7 @@ from framework.detection.candidates import Candidates, decode_yolo, described, r
 from framework.detection.image_network import ImageNetwork
 from framework.detection.letterbox import Placement
 from framework.detection.masks import suppress_duplicates, tight_boxes
-from framework.detection.onnx_network import Outputs, Runtime
+from framework.detection.onnx_network import Outputs
 from framework.detection.prototype_masks import masks_from_prototypes
 from framework.errors import DataError
 from framework.interfaces import Detector
@@ -44,8 +44,7 @@ class OnnxSegmentation(Detector):
     bgr: bool = False  # channel order: True = BGR, False = RGB
     black: float = 0.0  # what the network gets for a channel of 0
     white: float = 1.0  # what it gets for 255
-    runtime: Runtime = Runtime.auto  # auto = onnxruntime where installed, else OpenCV
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda where the runtime has it
+    device: str = "auto"  # auto, cpu or cuda; auto = cuda where onnxruntime has it
     reads = ("color",)
 
     def __post_init__(self) -> None:
@@ -60,7 +59,6 @@ class OnnxSegmentation(Detector):
         self._network = ImageNetwork(
             path=self.weights,
             sha256=self.sha256,
-            runtime=self.runtime,
             device=self.device,
             input_size=self.input_size,
             placement=self.placement,

@@ -2,37 +2,55 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.data import Float32, Float64, PointClusters
-from framework.mapping.evidence_fuser import EvidenceFuser
-from framework.mapping.instance_fuser import floored_log
+from framework.data import Frame, PointClusters, Pose
+from framework.interfaces import MapFuser
+from framework.mapping.association import Association
+from framework.mapping.evidence import Combine
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
+from framework.mapping.pixel_lists import list_points_by_pixel
 from framework.parameters import check_bounds
+
+RULE = LabelRule(Combine.SUM, logarithmic=True)
 
 
 @dataclass
-class BayesianTsdf(EvidenceFuser):
+class BayesianTsdf(MapFuser):
     """Two independent Bayesian recursions a voxel, eqs. [7] and [8] of the paper, as sums of log-likelihoods.
 
     An instance's class distribution is the product of the distributions of all its detections.
     """
 
+    voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
+    association: Association = field(default_factory=Association)
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
     instance_floor: float = 0.05  # in (0, 1): P(O = another instance); the matched one has the detection's score
     absence: float = 0.7  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence=(1e-6, 1.0))
+        self.scene: InstanceMap = self.voxels.new_map(RULE)
 
-    def instance_evidence(self, clusters: PointClusters) -> Float32:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        self.scene.begin(clusters.classes)
+        points = list_points_by_pixel(clusters, frame.depth.shape)
+        overlaps = self.association.look_up(self.scene, frame, pose, clusters)
+        matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+        seen = self.voxels.integrate(self.scene, frame, pose)
+        evidence = self.evidence(clusters)
+        self.voxels.update(self.scene, seen, points, matches, evidence, RULE)
+        self.association.observe(self.scene.table, matches, evidence.classes)
+        self.association.merge(self.scene, matches)
+
+    def evidence(self, clusters: PointClusters) -> DetectionEvidence:
+        """Eqs. [7] and [8]: log P(O_u | I_t), that of the matched instance over any other's."""
         scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
-        return np.asarray(np.log(scores / self.instance_floor), np.float32)
-
-    def absence_evidence(self) -> float:
-        return float(np.log(self.absence))
-
-    def class_evidence(self, clusters: PointClusters) -> Float64:
-        return floored_log(clusters.class_probabilities, self.class_floor)
+        return DetectionEvidence(
+            instances=np.asarray(np.log(scores / self.instance_floor), np.float32),
+            classes=floored_log(clusters.class_probabilities, self.class_floor),
+            absence=float(np.log(self.absence)),
+        )

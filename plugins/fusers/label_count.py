@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.data import Float32, Float64, PointClusters
+from framework.data import Frame, PointClusters, Pose
+from framework.interfaces import MapFuser
+from framework.mapping.association import Association
 from framework.mapping.evidence import Combine
-from framework.mapping.evidence_fuser import EvidenceFuser, only_best
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.label_rule import LabeledVoxels, LabelRule, vote_for_best
+from framework.mapping.pixel_lists import list_points_by_pixel
+
+RULE = LabelRule(Combine.SUM, logarithmic=False, units=1)
 
 
 @dataclass
-class LabelCount(EvidenceFuser):
+class LabelCount(MapFuser):
     """Every detection counts as one for its instance and its best class, whatever its score (Grinvald et al. 2019).
 
     The label with the highest count wins; nothing counts against one.
     """
 
-    combine = Combine.SUM
-    logarithmic = False
-    units = 1
+    voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
+    association: Association = field(default_factory=Association)
 
-    def instance_evidence(self, clusters: PointClusters) -> Float32:
-        return np.ones(len(clusters), np.float32)
+    def __post_init__(self) -> None:
+        self.scene: InstanceMap = self.voxels.new_map(RULE)
 
-    def class_evidence(self, clusters: PointClusters) -> Float64:
-        return only_best(clusters, self.instance_evidence(clusters))
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        self.scene.begin(clusters.classes)
+        points = list_points_by_pixel(clusters, frame.depth.shape)
+        overlaps = self.association.look_up(self.scene, frame, pose, clusters)
+        matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
+        seen = self.voxels.integrate(self.scene, frame, pose)
+        evidence = vote_for_best(clusters, np.ones(len(clusters), np.float32))
+        self.voxels.update(self.scene, seen, points, matches, evidence, RULE)
+        self.association.observe(self.scene.table, matches, evidence.classes)
+        self.association.merge(self.scene, matches)

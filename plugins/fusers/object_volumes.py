@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
-from framework.mapping.association import OverlapRule, Overlaps, count_overlaps, require_pixels_inside
-from framework.mapping.instance_fuser import VOTES_ACROSS
+from framework.geometry import require_pixels_inside
+from framework.interfaces import MapFuser
+from framework.mapping.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceRecord
-from framework.mapping.tsdf_fuser import VoxelHashingFuser, require_same_classes
+from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
 from framework.rivals.object_map import ObjectMap
 
@@ -24,7 +25,7 @@ def existence(record: InstanceRecord) -> float:
 
 
 @dataclass
-class ObjectVolumes(VoxelHashingFuser):
+class ObjectVolumes(MapFuser):
     """A TSDF for each object, with the probability of each voxel to be of the object, before one of everything.
 
     A detection belongs to the object that it overlaps most with, several may belong to one, and an object's masks of a
@@ -32,6 +33,7 @@ class ObjectVolumes(VoxelHashingFuser):
     same_class=true`. How the maps differ from the originals': framework/rivals/object_map.py.
     """
 
+    hashing: VoxelHashing = field(default_factory=VoxelHashing)
     overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap
     overlap_rule: OverlapRule = OverlapRule.IOU  # what an overlap is counted over
     same_class: bool = False  # whether their likeliest classes must be the same
@@ -39,41 +41,39 @@ class ObjectVolumes(VoxelHashingFuser):
     create_points: int = 50  # pixels, >= 1: and this many; an object is seen, or missed, with this many in view
     min_existence: float = 0.1  # in [0, 1]: an object that exists with less probability is forgotten
     min_observations: int = 3  # frames, >= 1: before that an object is tentative, as in our own map
+    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0: likewise
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_bounds(
             self,
             overlap=(0.0, 1.0),
             create_score=(0.0, 1.0),
             create_points=(1, 2**31),
             min_existence=(0.0, 1.0),
-            min_observations=(1, 2**31),
         )
         confirmation = Confirmation(self.min_observations, min_confidence=0.0, min_area=self.min_area)
-        self.scene: ObjectMap = ObjectMap(self.voxel_size, self.sensor, self.max_blocks, confirmation)
+        self.scene: ObjectMap = ObjectMap(self.hashing.new_volume(), confirmation)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
-        self.scene.classes = self.scene.classes or clusters.classes
-        require_same_classes(self.scene.classes, clusters.classes)
+        self.scene.begin(clusters.classes)
         require_pixels_inside(clusters, frame.depth.shape)
         overlaps = self._look_up(frame, pose.T_world_camera, clusters)
-        instance_ids = self._associate(overlaps, clusters, frame)
-        masks = _masks(clusters, instance_ids, frame.depth.shape)
-        self.scene.integrate(frame, pose.T_world_camera, masks, self.label_band * self.voxel_size)
-        self._take_back_empty(instance_ids)
-        self._observe(overlaps, clusters, instance_ids, frame)
+        matches = self._associate(overlaps, clusters, frame)
+        masks = _masks(clusters, matches.instance_ids, frame.depth.shape)
+        self.scene.integrate(frame, pose.T_world_camera, masks, self.hashing.near)
+        self._take_back_empty(matches.instance_ids)
+        observe(self.scene.table, matches, clusters.class_probabilities.astype(np.float64), self.create_points)
         self._forget()
 
     def _look_up(self, frame: Frame, T_world_camera: Float64, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the objects that the map has at the measured surface."""
-        stride = max(1, frame.camera.width // VOTES_ACROSS)
+        stride = vote_stride(frame.camera)
         return count_overlaps(
             clusters, self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride), stride
         )
 
-    def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Int32:
-        """(N,) the object of each cluster, an old or a new one; 0 = none."""
+    def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:
+        """Gives each cluster the object that it overlaps most with, or creates one where it is good enough."""
         shares = overlaps.by(self.overlap_rule, self.create_points)
         shares[~self._agree(clusters, overlaps.instance_ids)] = 0
         instance_ids = np.zeros(len(clusters), np.int32)
@@ -83,7 +83,7 @@ class ObjectVolumes(VoxelHashingFuser):
         may_create = (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         for k in np.flatnonzero((instance_ids == 0) & may_create):
             instance_ids[k] = self.scene.create(frame.index)
-        return instance_ids
+        return Matches(frame.index, clusters, overlaps, instance_ids)
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """(N, M) whether a cluster may be an object, by their classes."""
@@ -98,16 +98,6 @@ class ObjectVolumes(VoxelHashingFuser):
             if not self.scene.volumes[instance_id].block_count:
                 self.scene.remove(instance_id)
                 instance_ids[instance_ids == instance_id] = 0
-
-    def _observe(self, overlaps: Overlaps, clusters: PointClusters, instance_ids: Int32, frame: Frame) -> None:
-        """Brings the table up to date with what this frame saw, and what it should have seen."""
-        table = self.scene.table
-        for k in np.flatnonzero(instance_ids):
-            evidence = clusters.class_probabilities[k].astype(np.float64)
-            table.observe(int(instance_ids[k]), evidence, float(clusters.scores[k]), frame.index)
-        expected = set(overlaps.instance_ids[overlaps.visible >= self.create_points].tolist())
-        for instance_id in expected | set(instance_ids[instance_ids > 0].tolist()):
-            table.records[instance_id].visible += 1
 
     def _forget(self) -> None:
         """Removes the objects that hardly exist."""

@@ -2,29 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.data import Float64, Frame, Int32, PointClusters, Pose
-from framework.mapping.association import PixelLists
-from framework.mapping.instance_fuser import InstanceFuser, floored_log
+from framework.data import Frame, Int32, PointClusters, Pose
+from framework.interfaces import MapFuser
+from framework.mapping.association import Association
+from framework.mapping.instance_list import Confirmation
+from framework.mapping.label_rule import floored_log
+from framework.mapping.pixel_lists import list_points_by_pixel
+from framework.mapping.tsdf import Tsdf
 from framework.parameters import check_bounds
 from framework.rivals.open3d_grid import BlockGridSettings
 from framework.rivals.open3d_map import Open3DMap
 
 
 @dataclass
-class Open3DVoxelBlockGrid(InstanceFuser):
+class Open3DVoxelBlockGrid(MapFuser):
     """Open3D's TSDF; a voxel keeps the instance that most frames gave it, an instance the product of its classes."""
 
+    tsdf: Tsdf = field(default_factory=Tsdf)
+    association: Association = field(default_factory=Association)
+    confirmation: Confirmation = field(default_factory=Confirmation)
     block_resolution: int = 8  # voxels a side, 2 to 64: 16, Open3D's, takes twice the voxels and half as long again
     max_blocks: int = 200_000  # blocks, > 0: 14 KiB each, and Open3D copies the map to make room: 5.7 GB at its end
     min_weight: float = 1.0  # frames, >= 1, that must have seen a voxel: Open3D's 3 loses what is seen briefly
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_bounds(
             self,
             block_resolution=(2, 64),
@@ -33,25 +39,27 @@ class Open3DVoxelBlockGrid(InstanceFuser):
             class_floor=(1e-6, 0.999),
         )
         settings = BlockGridSettings(
-            voxel_size=self.voxel_size,
+            voxel_size=self.tsdf.voxel_size,
             block_resolution=self.block_resolution,
-            truncation=self.truncation,
-            min_depth=self.min_depth,
-            max_depth=self.max_depth,
+            truncation=self.tsdf.truncation,
+            min_depth=self.tsdf.min_depth,
+            max_depth=self.tsdf.max_depth,
             max_blocks=self.max_blocks,
             min_weight=self.min_weight,
         )
         self.scene: Open3DMap = Open3DMap(settings, self.confirmation)
 
-    def class_evidence(self, clusters: PointClusters) -> Float64:
-        return floored_log(clusters.class_probabilities, self.class_floor)
-
-    def integrate(
-        self, frame: Frame, pose: Pose, clusters: PointClusters, points: PixelLists, instance_ids: Int32
-    ) -> None:
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        self.scene.begin(clusters.classes)
+        points = list_points_by_pixel(clusters, frame.depth.shape)
+        overlaps = self.association.look_up(self.scene, frame, pose, clusters)
+        matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
         self.scene.integrate(frame, pose.T_world_camera)
-        seen_ids = _paint(clusters, instance_ids, frame.depth.shape)
-        self.scene.vote(frame, pose.T_world_camera, seen_ids, self.label_band)
+        seen_ids = _paint(clusters, matches.instance_ids, frame.depth.shape)
+        self.scene.vote(frame, pose.T_world_camera, seen_ids, self.tsdf.label_band)
+        class_evidence = floored_log(clusters.class_probabilities, self.class_floor)
+        self.association.observe(self.scene.table, matches, class_evidence)
+        self.association.merge(self.scene, matches)
 
 
 def _paint(clusters: PointClusters, instance_ids: Int32, shape: tuple[int, int]) -> Int32:

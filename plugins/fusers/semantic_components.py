@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from framework.data import Float64, Frame, PointClusters, Pose
-from framework.mapping.association import list_points_by_pixel
-from framework.mapping.integration import Integrator
-from framework.mapping.tsdf_fuser import VoxelHashingFuser, require_same_classes
+from framework.interfaces import MapFuser
+from framework.mapping.pixel_lists import list_points_by_pixel
+from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
 from framework.rivals.class_evidence import mask_classes
 from framework.rivals.semantic_map import SemanticMap
 
 
 @dataclass
-class SemanticComponents(VoxelHashingFuser):
+class SemanticComponents(MapFuser):
     """Voxels keep a distribution over classes and background, and nothing else: there is no data association.
 
     A re-implementation after SemanticFusion (McCormac et al. 2017) and Pham et al. (2019). Theirs are distributions of
@@ -29,24 +29,21 @@ class SemanticComponents(VoxelHashingFuser):
     for masks as detected, and with refiner=chain 0.01 AP50 below the best.
     """
 
+    hashing: VoxelHashing = field(default_factory=VoxelHashing)
+    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0, for an instance to count: voxel_size^2 a vertex
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
     missed: float = 0.7  # in (0, 1]: P(no mask | surface of any class) over that of the background; 1 = says nothing
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        check_bounds(self, class_floor=(1e-6, 0.999), missed=(1e-6, 1.0))
-        self.scene: SemanticMap = SemanticMap(self.voxel_size, self.sensor, self.max_blocks, self.missed, self.min_area)
-        self._integrator = Integrator(self.scene.voxels, self.scene.sensor)
+        check_bounds(self, class_floor=(1e-6, 0.999), missed=(1e-6, 1.0), min_area=(0.0, 1000.0))
+        self.scene: SemanticMap = SemanticMap(self.hashing.new_volume(), self.missed, self.min_area)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
-        if not self.scene.classes:
-            self.scene.begin(clusters.classes)
-        require_same_classes(self.scene.classes, clusters.classes)
+        self.scene.begin(clusters.classes)
         points = list_points_by_pixel(clusters, frame.depth.shape)
         masks = mask_classes(self._log_ratio(clusters), clusters, points, frame.index)
-        seen = self._integrator.integrate(frame, pose.T_world_camera, self.label_band * self.voxel_size)
+        seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
         self.scene.labels.update(seen, masks)
-        self.scene.changed(seen.blocks)
 
     def _log_ratio(self, clusters: PointClusters) -> Float64:
         """(N, C) log P(O_u = c) / P(O_u = background) of a pixel under each mask, as eq. [7] takes it, with a floor.

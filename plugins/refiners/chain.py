@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from framework.data import Frame, PointClusters
 from framework.errors import ConfigError
 from framework.interfaces import ClusterRefiner
+from framework.refinement.refine import refine
 
 
 @dataclass
@@ -25,5 +26,5 @@ class Chain(ClusterRefiner):
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         for link in self.links.values():
-            clusters = link.refine(clusters, frame)
+            clusters = refine(link, clusters, frame)
         return clusters

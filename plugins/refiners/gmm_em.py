@@ -60,8 +60,6 @@ class GmmEm(ClusterRefiner):
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        if clusters.exact:
-            return clusters
         around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
         sample = around.sampled(self.max_points)
         log_odds = mask_log_odds(sample, self.mask_log_odds, self.expected_bleed)

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Bool, Float32, Frame, PointClusters
+from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement import mixture_tree
 from framework.refinement.mask_evidence import mask_log_odds
-from framework.refinement.mixture_tree import MixtureTree, own_shares
-from framework.refinement.neighborhood import Neighborhoods, grouped, ring_bounds, surroundings
+from framework.refinement.neighborhood import ring_bounds, surroundings
 from framework.refinement.selection import keep_points
+from framework.refinement.tree_evidence import claimed, object_shares
 
 
 @dataclass
@@ -70,8 +70,6 @@ class GmmTree(ClusterRefiner):
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        if clusters.exact:
-            return clusters
         around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
         sample = around.sampled(self.max_points)
         tree = mixture_tree.fit(
@@ -86,37 +84,10 @@ class GmmTree(ClusterRefiner):
             min_support=self.min_support,
             min_points=self.min_node,
         )
-        shares = self._object_shares(tree, sample)
+        odds = mask_log_odds(sample, self.mask_log_odds, self.expected_bleed)
+        shares = object_shares(tree, sample, odds, self.parent_points)
         judged = around.of_at_least(self.min_points)
         judged &= np.diff(tree.levels[0].firsts) > 0  # nothing is known against a mask whose tree has no node
-        return keep_points(clusters, around.kept(self._claimed(tree, shares, around.own()), judged))
-
-    def _object_shares(self, tree: MixtureTree, sample: Neighborhoods) -> list[Float32]:
-        """For each level (M,) how much of each node is the object's."""
-        points, odds, starts = sample.points_camera, self._evidence(sample), sample.starts
-        above, shares = np.full(len(sample), 0.5, np.float32), []
-        for k, level in enumerate(tree.levels):
-            child = tree.passed(k, points, starts)
-            order, starts = grouped(child.astype(np.int32), len(level))
-            points, odds = points[order], odds[order]
-            above = own_shares(odds, starts, above[level.parents], self.parent_points)
-            shares.append(above)
-        return shares
-
-    def _claimed(self, tree: MixtureTree, shares: list[Float32], own: Neighborhoods) -> Bool:
-        """(S,) which of the masks' points the object claims; each level overrules the one above."""
-        claimed, left = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
-        points, odds, starts = own.points_camera, self._evidence(own), own.starts
-        above = np.zeros(len(own), np.float32)
-        for k, level in enumerate(tree.levels):
-            child, share = tree.shared(k, points, starts, shares[k], above, odds)
-            claimed[left] = share > self.min_posterior
-            if k + 1 < len(tree.levels):
-                goes_on = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # -1, an outlier, ends here
-                key = np.where(goes_on[child], child, -1)
-                order, starts = grouped(key.astype(np.int32), len(level))
-                left, points, odds, above = left[order], points[order], odds[order], shares[k]
-        return claimed
-
-    def _evidence(self, around: Neighborhoods) -> Float32:
-        return mask_log_odds(around, self.mask_log_odds, self.expected_bleed)
+        own = around.own()
+        own_odds = mask_log_odds(own, self.mask_log_odds, self.expected_bleed)
+        return keep_points(clusters, around.kept(claimed(tree, shares, own, own_odds, self.min_posterior), judged))

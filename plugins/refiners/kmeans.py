@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Float64, Frame, PointClusters
+from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement import lloyd
-from framework.refinement.neighborhood import Neighborhoods, ring_bounds, surroundings
+from framework.refinement.mixture_start import start_centers
+from framework.refinement.neighborhood import ring_bounds, surroundings
 from framework.refinement.selection import keep_points
 
 
@@ -43,21 +44,11 @@ class KMeans(ClusterRefiner):
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        if clusters.exact:
-            return clusters
         around = surroundings(clusters, frame, self.ring_fraction, self.min_ring, self.max_ring)
         sample = around.sampled(self.max_points)
-        _, centers = lloyd.cluster(sample.points_camera, sample.starts, self._start(sample), self.max_iterations)
+        start = start_centers(sample, self.object_centers, self.background_centers)
+        _, centers = lloyd.cluster(sample.points_camera, sample.starts, start, self.max_iterations)
         own, judged = around.own(), around.of_at_least(self.min_points)
         ends = own.starts[:-1] + np.where(judged, own.mask_counts, 0)
         labels = lloyd.nearest_centers(own.points_camera, own.starts[:-1], ends, centers)
         return keep_points(clusters, around.kept(labels < self.object_centers, judged))
-
-    def _start(self, sample: Neighborhoods) -> Float64:
-        """(N, object_centers + background_centers, 3) the object's centers, then the background's."""
-        of_ring = sample.of_ring
-        mask_starts = np.concatenate([[0], np.cumsum(sample.mask_counts)])
-        ring_starts = np.concatenate([[0], np.cumsum(sample.ring_counts)])
-        objects = lloyd.depth_groups(sample.points_camera[~of_ring], mask_starts, self.object_centers)
-        background = lloyd.depth_groups(sample.points_camera[of_ring], ring_starts, self.background_centers)
-        return np.concatenate([objects, background], axis=1)

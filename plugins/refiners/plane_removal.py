@@ -5,13 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit, prange
 
-from framework.data import Bool, Frame, Int32, Int64, PointClusters, UInt8
+from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.parameters import check_bounds
 from framework.refinement.planes import Planes, find_planes, plane_image
-from framework.refinement.selection import PART, keep_points
+from framework.refinement.selection import keep_points
+from framework.refinement.structure import off_planes
 
 
 @dataclass
@@ -47,15 +47,13 @@ class PlaneRemoval(ClusterRefiner):
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        if clusters.exact or len(clusters.cluster) == 0:
+        if len(clusters.cluster) == 0:
             return clusters
         planes = self.structure(frame)
         if len(planes) == 0:
             return clusters
         on_plane = plane_image(frame, planes, self.distance)
-        kept, structure = _off_planes(
-            clusters.cluster, clusters.pixels, on_plane, len(clusters), len(planes), self.max_own
-        )
+        kept, structure = off_planes(clusters, on_plane, len(planes), self.max_own)
         return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
@@ -63,53 +61,3 @@ class PlaneRemoval(ClusterRefiner):
         planes = find_planes(frame, self.distance, self.noise, self.min_area)
         upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
         return planes.chosen((planes.shares >= self.min_share) & (planes.behind <= self.max_behind) & upright)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _off_planes(
-    cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float
-) -> tuple[Bool, Bool]:
-    """(P,) which points stay; (H, W) which pixels are on a plane, and not in a cluster that keeps it.
-
-    A pixel is in a cluster once, so its points on a plane are a part of the plane's.
-    """
-    parts = (len(cluster) + PART - 1) // PART
-    labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
-    counts = np.zeros((parts, clusters + 1, planes + 1), np.int64)  # the last row is for points of no cluster
-    for part in prange(parts):
-        own = slice(part * PART, (part + 1) * PART)
-        _count_on_planes(cluster[own], pixels[own], on_plane, labels[own], counts[part])
-    on_planes = counts.sum(axis=0)
-    stays = np.ones((clusters + 1, planes + 1), np.bool_)
-    for label in range(1, planes + 1):
-        stays[:clusters, label] = on_planes[:clusters, label] > max_own * _count(on_plane.ravel(), label)
-    structure = on_plane > 0
-    for i in prange(len(cluster)):
-        kept[i] = stays[cluster[i], labels[i]]
-        if kept[i] and cluster[i] >= 0 and labels[i] > 0:
-            structure[pixels[i, 1], pixels[i, 0]] = False
-    return kept, structure
-
-
-@njit(cache=True, nogil=True)
-def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
-    """By runs of points that have cluster and plane in common: a counter raised point by point waits for itself."""
-    k, label, count = 0, 0, 0
-    for i in range(len(cluster)):
-        labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
-        if labels[i] != label or cluster[i] != k:
-            counts[k, label] += count
-            k, label, count = cluster[i], labels[i], 0
-        count += 1
-    counts[k, label] += count
-
-
-@njit(cache=True, nogil=True)
-def _count(labels: UInt8, label: int) -> int:
-    wanted, count = np.uint8(label), 0
-    for first in range(0, len(labels), 128):  # a count of bytes in a byte is the fastest there is
-        some = np.uint8(0)
-        for found in labels[first : first + 128]:
-            some += np.uint8(found == wanted)
-        count += int(some)
-    return count

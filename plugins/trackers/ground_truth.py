@@ -13,6 +13,8 @@ from framework.interfaces import PoseTracker, SceneMap
 class GroundTruth(PoseTracker):
     """Returns the pose that the sequence comes with."""
 
+    pose_source = "ground_truth"
+
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         """Raises DataError for a sequence without poses: there is nothing to fall back on."""
         if frame.T_world_camera is None:

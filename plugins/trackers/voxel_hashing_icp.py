@@ -200,6 +200,8 @@ class VoxelHashingIcp(PoseTracker):
                 T_view_camera = exp_se3(xi) @ T_view_camera
                 if np.abs(xi).max() < FINE_ENOUGH * 4**level:
                     break
+        if np.abs(xi).max() >= FINE_ENOUGH:  # too long a step for what was known before it to tell where it has led
+            equations = linearize(levels[0], model_here, intensities[0], T_view_camera, weights, brightness)
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])

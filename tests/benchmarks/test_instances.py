@@ -12,8 +12,8 @@ import pytest
 
 from framework.data import Frame, PointClusters, Pose
 from framework.label_spaces import COCO
-from framework.mapping.association import list_points_by_pixel
-from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from framework.mapping.pixel_lists import list_points_by_pixel
+from plugins.fusers.bayesian_tsdf import RULE, BayesianTsdf
 from tests.benchmarks.test_refiners import MASKS, ten_masks
 
 
@@ -35,9 +35,9 @@ def test_associate_ten_masks(benchmark, mapped) -> None:
 
     def associate() -> None:
         points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = fuser._look_up(frame, pose, clusters)
-        instance_ids = fuser._associate(overlaps, clusters, points, frame)
-        fuser._merge_instances(overlaps, instance_ids)
+        overlaps = fuser.association.look_up(fuser.scene, frame, pose, clusters)
+        matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, points, frame.index)
+        fuser.association.merge(fuser.scene, matches)
 
     benchmark(associate)
     assert len(fuser.scene.table.records) == MASKS
@@ -46,13 +46,14 @@ def test_associate_ten_masks(benchmark, mapped) -> None:
 def test_write_the_labels_of_ten_masks(benchmark, mapped) -> None:
     fuser, frame, pose, clusters = mapped
     points = list_points_by_pixel(clusters, frame.depth.shape)
-    overlaps = fuser._look_up(frame, pose, clusters)
-    instance_ids = fuser._associate(overlaps, clusters, points, frame)
-    seen = fuser._integrator.integrate(frame, pose.T_world_camera, fuser.label_band * fuser.voxel_size)
+    overlaps = fuser.association.look_up(fuser.scene, frame, pose, clusters)
+    matches = fuser.association.associate(fuser.scene.table, overlaps, clusters, points, frame.index)
+    seen = fuser.voxels.integrate(fuser.scene, frame, pose)
 
     def write_labels() -> None:
-        fuser.scene.labels.update(seen, fuser._measurement(clusters, points, instance_ids))
-        fuser._observe(overlaps, clusters, instance_ids, frame)
+        evidence = fuser.evidence(clusters)
+        fuser.voxels.update(fuser.scene, seen, points, matches, evidence, RULE)
+        fuser.association.observe(fuser.scene.table, matches, evidence.classes)
 
     benchmark(write_labels)
 

@@ -17,6 +17,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.geometry import lift
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.voxel_grid import BLOCK_SIDE, UNSEEN
+from framework.registry import assemble
 from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 
@@ -38,7 +39,7 @@ def kitchen() -> tuple[BayesianTsdf, Iterator[Frame]]:
     if not KITCHEN.is_dir():
         pytest.skip(f"{KITCHEN} is absent")
     frames = iter(RgbdFolder(root=KITCHEN, stop=FRAMES))
-    fuser = BayesianTsdf(voxel_size=0.01)
+    fuser = assemble(BayesianTsdf, voxel_size=0.01)
     for _ in range(FRAMES - UPDATES):
         fuse(fuser, next(frames))
     return fuser, frames
@@ -55,7 +56,7 @@ def test_slam_mesh_update(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame
 def test_slam_mesh_full(benchmark, kitchen: tuple[BayesianTsdf, Iterator[Frame]]) -> None:
     """The whole mesh with colours and labels."""
     scene = kitchen[0].scene
-    benchmark.pedantic(scene.mesh, setup=scene.changed, rounds=20, warmup_rounds=1)
+    benchmark.pedantic(scene.mesh, setup=scene.volume.changed, rounds=20, warmup_rounds=1)
     note(benchmark, "full", len(scene.mesh().triangles))
 
 
@@ -79,7 +80,7 @@ def note(benchmark, name: str, triangles: int) -> None:
 
 def open3d_volume(scene: InstanceMap) -> o3d.t.geometry.VoxelBlockGrid:
     """The map's voxels in Open3D's structure."""
-    grid, count = scene.voxels.grid, scene.voxels.block_count
+    grid, count = scene.volume.voxels.grid, scene.volume.voxels.block_count
     seen = grid.tsdf[:count] != UNSEEN
     values = {
         "tsdf": np.where(seen, grid.tsdf[:count] * grid.tsdf_unit, 0)[..., None],
@@ -90,7 +91,7 @@ def open3d_volume(scene: InstanceMap) -> o3d.t.geometry.VoxelBlockGrid:
         tuple(values),
         (o3d.core.float32,) * 3,
         ((1,), (1,), (3,)),
-        voxel_size=scene.voxel_size,
+        voxel_size=scene.volume.voxel_size,
         block_resolution=BLOCK_SIDE,
         block_count=count,
     )

@@ -17,6 +17,7 @@ from framework.data import Detections, Float64, Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
+from framework.registry import assemble
 from framework.synthetic.sequence import Synthetic
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -47,7 +48,7 @@ def recordings(shared: Path) -> dict[str, Recording]:
 def compiled() -> None:
     """Every kernel compiled, or loaded from numba's cache, before anything is timed."""
     room = furnished_room(3)
-    loop = SlamLoop(VoxelHashingIcp(), BayesianTsdf(voxel_size=0.02))
+    loop = SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=0.02))
     for frame, detections in zip(room.frames, room.detections, strict=True):
         loop(frame, detections)
         loop.render_all(frame)
@@ -60,7 +61,7 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
     recording = recordings[name]
     duel = Duel(
         recording,
-        SlamLoop(VoxelHashingIcp(), BayesianTsdf(voxel_size=voxel_size)),
+        SlamLoop(VoxelHashingIcp(), assemble(BayesianTsdf, voxel_size=voxel_size)),
         Open3DSlam(recording.frames[0], voxel_size),
     )
     benchmark.pedantic(duel.ours, setup=duel.begin_frame, rounds=LAST - FIRST, warmup_rounds=FIRST)
@@ -95,7 +96,7 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
             f"Memory of that map: {name}, {100 * voxel_size:.0f} cm voxels",
             ["MiB", "ours", "Open3D"],
             [
-                ["used, without labels", mib(scene.voxels.byte_count), mib(theirs.bytes_used)],
+                ["used, without labels", mib(scene.volume.voxels.byte_count), mib(theirs.bytes_used)],
                 ["used, with labels", mib(scene.byte_count), NOTHING],
                 ["allocated", mib(scene.byte_count), mib(theirs.bytes_allocated)],
             ],
@@ -180,7 +181,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
 
 @pytest.fixture(scope="module")
 def walks(shared: Path) -> dict[str, list[Frame]]:
-    """The issue's two videos for accuracy: 300 real frames, and 200 without any noise."""
+    """Two videos for accuracy: 300 real frames, and 200 without any noise."""
     return {
         "redkitchen": list(RgbdFolder(shared / "data" / "redkitchen", stop=300)),
         "room without noise": list(Synthetic(frames=240, stop=200, noise=0.0)),

@@ -6,7 +6,7 @@ import logging
 import os
 import signal
 import threading
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
@@ -83,6 +83,22 @@ def test_a_frame_that_a_later_stage_refuses_is_skipped(room: CornerRoom) -> None
 
     result = pipeline(refiner=Refuses()).run(room)
     assert (result.frames, result.frames_skipped, len(mapped(result).vertices)) == (6, 1, 5)
+
+
+def test_true_masks_are_not_refined_and_made_up_pixels_end_the_run(room: CornerRoom) -> None:
+    @dataclass
+    class Exact(SphereDetector):
+        def detect(self, frame: Frame) -> Detections:
+            return replace(super().detect(frame), exact=True)
+
+    @dataclass
+    class MadeUp(KeepAll):
+        def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+            return replace(clusters, pixels=clusters.pixels - 99)
+
+    with pytest.raises(DataError, match="pixels must lie in the image"):
+        pipeline(refiner=MadeUp()).run(room)
+    assert pipeline(detector=Exact(), refiner=MadeUp()).run(room).frames_skipped == 0
 
 
 def test_many_skipped_frames_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:

@@ -6,7 +6,7 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 
@@ -19,7 +19,8 @@ from framework.configs import config_directory
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker
-from framework.registry import STAGES, build, find_class
+from framework.parameters import check_bounds
+from framework.registry import STAGES, assemble, build, find_class, parameter_fields
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 HERE = "build_targets"
@@ -58,6 +59,29 @@ class Undecorated(Probe):
 @dataclass
 class Abstract(Detector):
     pass
+
+
+@dataclass
+class Suppression:
+    """A part: parameters that several plugins have."""
+
+    nms: float = 0.5
+    agnostic: bool = False
+
+    def __post_init__(self) -> None:
+        check_bounds(self, nms=(0.0, 1.0))
+
+
+@dataclass
+class Assembled(Probe):
+    suppression: Suppression = field(default_factory=Suppression)
+    size: int = 3
+
+
+@dataclass
+class Ambiguous(Probe):
+    nms: float = 0.5
+    suppression: Suppression = field(default_factory=Suppression)
 
 
 @dataclass
@@ -101,6 +125,15 @@ def test_defaults_of_the_class_hold_where_the_config_is_silent() -> None:
     assert detector() == Probe(Path("w.bin"))
 
 
+def test_the_parameters_of_a_part_are_the_plugins_own() -> None:
+    expected = Assembled(Path("w.bin"), limit=4, suppression=Suppression(nms=0.25), size=5)
+    assert detector(_target_=f"{HERE}.Assembled", limit=4, nms=0.25, size=5) == expected
+    assert assemble(Assembled, weights=Path("w.bin"), limit=4, nms=0.25, size=5) == expected
+    assert list(parameter_fields(Assembled))[-3:] == ["nms", "agnostic", "size"]
+    with pytest.raises(TypeError, match="agnostik"):
+        assemble(Assembled, weights=Path("w.bin"), agnostik=True)
+
+
 @pytest.mark.parametrize(
     ("parameters", "said"),
     [
@@ -118,6 +151,11 @@ def test_defaults_of_the_class_hold_where_the_config_is_silent() -> None:
         ({"_target_": f"{HERE}.Abstract"}, ["does not implement detect of Detector"]),
         ({"_partial_": True}, ["no parameter '_partial_'"]),
         ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path or Enum", "ndarray"]),
+        ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["Assembled", "nms", "[0, 1]", "found 2"]),
+        ({"_target_": f"{HERE}.Assembled", "nms": "high"}, ["Assembled", "nms", "'high'", "Float"]),
+        ({"_target_": f"{HERE}.Assembled", "suppression": {"nms": 0.1}}, ["no parameter 'suppression'"]),
+        ({"_target_": f"{HERE}.Assembled", "agnostik": True}, ["did you mean 'agnostic'?"]),
+        ({"_target_": f"{HERE}.Ambiguous"}, ["Ambiguous has two parameters nms"]),
         ({"_target_": f"{HERE}.Prob"}, ["no Prob", "did you mean 'Probe'?"]),
         ({"_target_": f"{HERE}.some_function"}, ["implements Detector", "found a function"]),
         ({"_target_": f"{HERE}.Path"}, ["implements Detector", "found a class that does not"]),

@@ -5,11 +5,17 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from typing import Any
 
+import numba
+import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from framework.errors import ConfigError
+from framework.evaluation import instances
 from framework.settings import Settings, available_cores
+from framework.synthetic.ray_caster import RayCaster
 
 
 def test_threads_limit_what_is_loaded_and_what_is_loaded_later() -> None:
@@ -27,6 +33,34 @@ print(torch.get_num_threads())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.split() == ["1", "1", "1", "3"]
+
+
+def test_libraries_that_are_told_their_threads_at_each_call_obey(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    class Tree(cKDTree):
+        def query(self, *of: Any, workers: int = 1, **kept: Any) -> Any:
+            asked.append(workers)
+            return super().query(*of, workers=workers, **kept)
+
+    class Scene:
+        def cast_rays(self, rays: Any, nthreads: int) -> Any:
+            asked.append(nthreads)
+            return scene.cast_rays(rays, nthreads)
+
+    triangle = np.eye(3, dtype=np.float32)
+    monkeypatch.setattr(instances, "cKDTree", Tree)
+    caster = RayCaster(triangle, np.arange(3, dtype=np.int32)[None])
+    scene = caster._scene
+    monkeypatch.setattr(caster, "_scene", Scene())
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        instances.transfer_labels(triangle, np.arange(3, dtype=np.int32), triangle, 0.1)
+        caster.cast(np.ones((1, 6), np.float32))
+    finally:
+        numba.set_num_threads(before)
+    assert asked == [1, 1]
 
 
 def test_torch_is_seeded_whenever_it_is_imported() -> None:

@@ -27,7 +27,7 @@ from framework.data import (
     View,
 )
 from framework.errors import DataError, FrameError, MapFullError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 from framework.geometry import back_project, exp_se3, transform
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
 
@@ -134,6 +134,7 @@ class SphereDetector(Detector):
 class GivenPose(PoseTracker):
     """Passes the true pose on, but for the frames in [lost_from, lost_to)."""
 
+    pose_source = "ground_truth"
     lost_from: int = 0
     lost_to: int = 0
 

@@ -10,7 +10,8 @@
                     uint64[2] sizes of colour and depth (bytes), the two
     (IMU readings follow, which are not read)
 
-All little-endian. Such a file has gigabytes: opening it reads the 96 bytes before each frame's images.
+All little-endian. Such a file has gigabytes: opening it reads the 96 bytes before each frame's images. ScanNet's own
+reader, a script and no package, holds all of it in memory.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""The records of an OpenNI recording (.oni): which streams it holds, how many images, and where it was cut off."""
+"""The records of an OpenNI recording (.oni): which streams it holds, how many images, and where it was cut off.
+
+Hand-written, for OpenNI 2 plays the images, but can crash on a damaged file: what it is given is looked at before.
+"""
 
 from __future__ import annotations
 

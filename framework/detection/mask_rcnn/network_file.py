@@ -23,7 +23,7 @@ from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.errors import DataError
-from framework.files.atomic_files import written_whole
+from framework.files.whole_files import written_whole
 
 Fact = str | int | float | bool | None
 COUNTERS = ".num_batches_tracked"  # of the batch normalization; only a running training needs them

@@ -1,4 +1,7 @@
-"""RoIAlign (He et al., "Mask R-CNN", 2017) as two matrix products, or as weighted sums of cells: what is cheaper."""
+"""RoIAlign (He et al., "Mask R-CNN", 2017) as two matrix products, or as weighted sums of cells: what is cheaper.
+
+Hand-written, for torchvision's extension loads only beside its own build of torch, and torch has none.
+"""
 
 from __future__ import annotations
 

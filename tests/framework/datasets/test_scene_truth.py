@@ -52,7 +52,7 @@ def test_agrees_with_a_loop_over_pixels():
     truth = fuse_scene_truth(random_views(30, 3), {1: "chair"}, voxel)
     expected = reference(random_views(30, 3), voxel)
     assert len(truth.points_world) == len(expected)
-    # Dictionaries keep the order of insertion: the order of first buffer.
+    # Dictionaries keep the order of insertion: the order of first sight.
     for point, instance, (best, mean) in zip(truth.points_world, truth.instance_ids, expected.values(), strict=True):
         assert instance == best
         np.testing.assert_allclose(point, mean, atol=1e-6)

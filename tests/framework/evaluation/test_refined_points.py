@@ -139,6 +139,7 @@ def test_a_refiner_is_timed_and_sees_the_lifted_detections(truth: bool) -> None:
     refined = Refinement.of(refiner, found, seen)
     assert refiner.calls > 1
     assert refined.milliseconds > 0
+    assert len(Refinement.of(refiner, replace(found, exact=True), seen).after.cluster) == found.masks.sum()
     np.testing.assert_array_equal(refined.points_before, found.masks.sum(axis=(1, 2)))
     assert len(refined.after.cluster) == -(-len(refined.before.cluster) // 2)
     depth = refined.before.points_world[:, 2]

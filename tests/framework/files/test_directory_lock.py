@@ -5,6 +5,8 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -44,6 +46,24 @@ def test_who_waits_gets_it_afterwards(tmp_path: Path, caplog: pytest.LogCaptureF
     waiting.join(10)
     assert order == ["first", "second"]
     assert f"waiting for process {os.getpid()}" in caplog.text
+
+
+def test_a_holder_that_is_killed_holds_it_no_more(tmp_path: Path) -> None:
+    code = f"""
+from pathlib import Path
+from framework.files.directory_lock import locked
+with locked(Path({str(tmp_path)!r})):
+    print("locked", flush=True)
+    input()
+"""
+    with subprocess.Popen([sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == b"locked\n"
+        with pytest.raises(DataError, match=f"is in use by process {holder.pid} on "), locked(tmp_path):
+            pytest.fail("two are in one place")
+        holder.kill()
+    with locked(tmp_path):
+        pass
 
 
 def test_a_file_system_without_locks_gives_a_warning(

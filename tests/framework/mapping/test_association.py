@@ -7,16 +7,8 @@ from hypothesis import strategies as st
 
 from framework.data import PointClusters
 from framework.errors import DataError
-from framework.mapping.association import (
-    OverlapRule,
-    PixelLists,
-    class_agreement,
-    count_overlaps,
-    cover_another,
-    keep_on_top,
-    list_points_by_pixel,
-    match_one_to_one,
-)
+from framework.mapping.association import OverlapRule, class_agreement, count_overlaps, match_one_to_one
+from framework.mapping.pixel_lists import PixelLists, cover_another, keep_on_top, list_points_by_pixel
 
 SHAPE = (4, 5)
 

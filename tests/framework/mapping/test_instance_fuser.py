@@ -10,19 +10,21 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import lift
+from framework.interfaces import MapFuser
 from framework.mapping.association import OverlapRule
-from framework.mapping.instance_fuser import InstanceFuser, floored_log
+from framework.mapping.label_rule import floored_log
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.scenes.analytic_scene import CAMERA, Scene, room, walk
 from tests.true_masks import fuse_masks, masks_of
 
-NewFuser = Callable[..., InstanceFuser]
+NewFuser = Callable[..., MapFuser]
 
 
 @pytest.fixture(params=[BayesianTsdf, Open3DVoxelBlockGrid], ids=["our voxels", "Open3D's voxels"])
 def new_fuser(request: pytest.FixtureRequest) -> NewFuser:
-    return lambda **parameters: request.param(**{"voxel_size": 0.02, "max_depth": 4.0} | parameters)
+    return lambda **parameters: assemble(request.param, **{"voxel_size": 0.02, "max_depth": 4.0} | parameters)
 
 
 @pytest.fixture(scope="module")
@@ -99,10 +101,10 @@ def test_two_halves_become_one_when_they_are_seen_as_one(new_fuser: NewFuser, fr
     [(BayesianTsdf, 3), (Open3DVoxelBlockGrid, 1)],  # where a vote is a vote, the other half is soon outvoted
 )
 def test_two_instances_that_keep_lying_under_one_cluster_are_merged(
-    fuser_class: type[InstanceFuser], merge_frames: int, frames: list[Frame]
+    fuser_class: type[MapFuser], merge_frames: int, frames: list[Frame]
 ) -> None:
     """Weak detections of the whole, which would take long to outvote the voxels of the other half."""
-    fuser = fuser_class(voxel_size=0.02, max_depth=4.0, merge_frames=merge_frames)
+    fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, merge_frames=merge_frames)
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
     left = whole & (np.arange(CAMERA.width) < (u[0] + u[-1]) // 2)
@@ -123,6 +125,26 @@ def test_two_instances_that_keep_lying_under_one_cluster_are_merged(
     assert set(np.unique(fuser.scene.instances_seen(frames[0], frames[0].T_world_camera, 1))) == {0, 1}
     fuse_masks(fuser, dataclasses.replace(frames[0], index=last + 1), [whole], [0.9])
     assert record.observations == 2 + last
+
+
+@pytest.mark.parametrize(
+    ("merge_agreement", "agrees", "merged"), [(0.1, False, False), (0, False, True), (0.1, True, True)]
+)
+def test_a_book_that_is_rarely_found_alone_stays_on_its_table(
+    merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
+) -> None:
+    """The table's mask covers it in every frame; a part of the table in its place would be merged."""
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, merge_agreement=merge_agreement, on_top=0.0)
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    book = whole & (np.arange(CAMERA.width) < u[0] + (u[-1] - u[0]) // 3)
+    table = (0.99, 0.01)
+    for k in range(3):
+        classes = [table, table if agrees else (0.01, 0.99)]
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole & ~book, book], [0.9, 0.9], classes)
+    for k in range(3, 12):
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.1], [table])
+    assert len(fuser.scene.table.records) == (1 if merged else 2)
 
 
 def test_two_objects_seen_apart_stay_two_under_a_mask_that_covers_both(
@@ -216,6 +238,7 @@ def test_the_least_area_of_an_instance_does_not_depend_on_the_voxels(new_fuser: 
         {"overlap": 1.5},
         {"class_gate": -0.1},
         {"merge_frames": 0},
+        {"merge_agreement": 1.1},
         {"min_confidence": float("nan")},
         {"min_area": -0.001},
     ],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.mapping.instance_list import LEAST_VERTICES, Confirmation
-from framework.mapping.instance_table import InstanceTable
+from framework.mapping.instance_table import FrameSet, InstanceTable
 
 
 def test_an_instance_counts_when_it_was_seen_often_enough_and_is_trusted() -> None:
@@ -13,7 +13,7 @@ def test_an_instance_counts_when_it_was_seen_often_enough_and_is_trusted() -> No
         record = table.create(1, 0)
         for frame, score in enumerate(scores):
             table.observe(record.id, np.zeros(1), score, frame)
-    table.records[4].visible = 6  # of which it was detected in three
+    table.records[4].in_view = FrameSet([[0, 5]])  # in three of which it was detected
     assert Confirmation(3, 0.26, 0).counts(table).tolist() == [False, False, True, False, False]
     assert Confirmation(3, 0.25, 0).counts(table).tolist() == [False, False, True, False, True]
     assert Confirmation(1, 0, 0).counts(InstanceTable()).tolist() == [False]

@@ -13,7 +13,7 @@ from framework.errors import DataError
 from framework.geometry import lift
 from framework.mapping.instance_list import oriented_box
 from framework.mapping.instance_map import FORMAT, InstanceMap
-from framework.mapping.integration import Integrator
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.scenes.analytic_scene import Scene, room, walk
 
@@ -36,7 +36,7 @@ def fused(fuser: BayesianTsdf, scene: Scene, k: int, T: np.ndarray) -> None:
 
 
 def mapped(scene: Scene, frames: int = 12) -> BayesianTsdf:
-    fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     for k, T in enumerate(walk(frames)):
         fused(fuser, scene, k, T)
     return fuser
@@ -50,8 +50,8 @@ def scene_map() -> InstanceMap:
 def test_the_mesh_lies_on_the_true_surface(scene_map: InstanceMap) -> None:
     mesh = scene_map.mesh()
     distance = room().distance(mesh.vertices.astype(np.float64))
-    assert np.median(distance) < 0.1 * scene_map.voxel_size
-    assert np.quantile(distance, 0.95) < 0.5 * scene_map.voxel_size
+    assert np.median(distance) < 0.1 * scene_map.volume.voxel_size
+    assert np.quantile(distance, 0.95) < 0.5 * scene_map.volume.voxel_size
 
 
 def test_triangles_face_the_camera(scene_map: InstanceMap) -> None:
@@ -70,7 +70,7 @@ def test_each_sphere_is_one_instance_of_its_size(scene_map: InstanceMap) -> None
         points = mesh.vertices[instance.vertices].astype(np.float64)
         distance = [np.abs(np.linalg.norm(points - center, axis=1) - radius) for center, radius in room().spheres]
         best = int(np.argmin([np.median(d) for d in distance]))
-        assert np.quantile(distance[best], 0.95) < 2 * scene_map.voxel_size
+        assert np.quantile(distance[best], 0.95) < 2 * scene_map.volume.voxel_size
         assert instance.class_probabilities.argmax() == 0
         assert instance.observations == 12
         assert instance.confidence == pytest.approx(0.9, abs=0.01)
@@ -157,7 +157,7 @@ def test_what_is_below_a_threshold_does_not_count(
     loaded = InstanceMap.load(tmp_path / "map.npz")
     assert len(loaded.instances()) == 3
     loaded.confirmation = replace(loaded.confirmation, **threshold)  # type: ignore[arg-type]
-    loaded.changed()
+    loaded.volume.changed()
     assert not loaded.instances()
     assert not loaded.mesh().instance_ids.any()
     assert (loaded.mesh().class_ids == -1).all()
@@ -174,13 +174,12 @@ def test_an_instance_of_a_few_vertices_has_a_box(points: int) -> None:
 
 def test_mapping_goes_on_after_loading(tmp_path: Path) -> None:
     """A map that was saved, loaded and mapped into further equals the one that was never saved."""
-    whole, resumed = (BayesianTsdf(voxel_size=0.02, max_depth=4.0) for _ in range(2))
+    whole, resumed = (assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0) for _ in range(2))
     for k, T in enumerate(walk(4)):
         if k == 2:
             resumed.scene.save(tmp_path / "map.npz")
             resumed.scene = InstanceMap.load(tmp_path / "map.npz")
-            resumed._integrator = Integrator(resumed.scene.voxels, resumed.scene.sensor)
-            resumed._integrator.frames = k  # on which the rounding of averages depends
+            resumed.scene.volume.integrator.frames = k  # on which the rounding of averages depends
         fused(whole, room(), k, T)
         fused(resumed, room(), k, T)
     ours, theirs = whole.scene.mesh(), resumed.scene.mesh()

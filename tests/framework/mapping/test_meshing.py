@@ -13,6 +13,7 @@ from framework.geometry import lift
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.meshing import MAX_JUMP, Surface, SurfaceNets
 from framework.mapping.voxel_grid import UNSEEN, VoxelGrid
+from framework.registry import assemble
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 from plugins.detectors.none import NoDetections
@@ -181,7 +182,7 @@ def fuse(fuser: BayesianTsdf, T_world_camera: np.ndarray, k: int) -> None:
 def same_mesh(ours: InstanceMap) -> bool:
     """Whether the map's mesh equals that of a map which was never asked before."""
     mesh = ours.mesh()
-    ours.changed()
+    ours.volume.changed()
     return equal(mesh, ours.mesh())
 
 
@@ -191,17 +192,17 @@ def equal(ours: InstanceMesh, theirs: InstanceMesh) -> bool:
 
 def test_updates_equal_extraction_from_scratch() -> None:
     """After every frame and every merge, to the last bit, while blocks, instances and what counts keep changing."""
-    updated, asked_late = (BayesianTsdf(voxel_size=0.019, max_depth=4.0) for _ in range(2))
+    updated, asked_late = (assemble(BayesianTsdf, voxel_size=0.019, max_depth=4.0) for _ in range(2))
     sizes, named = [], []
     for k, T in enumerate(walk(40)[::4]):
         fuse(updated, T, k)
         fuse(asked_late, T, k)
         mesh = updated.scene.mesh()
-        assert "_surface" not in asked_late.scene.__dict__, "who asks for no mesh pays for none"
-        reference = SurfaceNets(updated.scene.voxels).extract()
+        assert asked_late.scene.volume._nets is None, "who asks for no mesh pays for none"
+        reference = SurfaceNets(updated.scene.volume.voxels).extract()
         assert np.array_equal(mesh.vertices, reference.vertices)
         assert np.array_equal(mesh.triangles, reference.triangles)
-        sizes.append(updated.scene.voxels.block_count)
+        sizes.append(updated.scene.volume.voxels.block_count)
         named.append(len(np.unique(mesh.instance_ids)))
     assert sizes[0] < 1024 < sizes[-1], "the grid's arrays grew"
     assert named[0] == 1, "nothing counts yet"
@@ -219,7 +220,7 @@ def test_updates_equal_extraction_from_scratch() -> None:
 def test_the_mesh_of_a_furnished_room_lies_on_its_surface() -> None:
     """Exact poses, no noise, 1 cm voxels: median 0.1 voxel, 95 % within 0.5 voxel, and next to nothing is missing."""
     sequence = Synthetic(kind=RoomKind.LIVING_ROOM, frames=240, stride=12, noise=0.0)
-    fuser = BayesianTsdf(voxel_size=0.01)
+    fuser = assemble(BayesianTsdf, voxel_size=0.01)
     nothing = NoDetections()
     for k in range(len(sequence)):
         frame = sequence[k]
@@ -231,7 +232,9 @@ def test_the_mesh_of_a_furnished_room_lies_on_its_surface() -> None:
     error = distance_to(surfaces.vertices, surfaces.triangles, mesh.vertices)
     assert np.median(error) < 0.1 * 0.01
     assert np.quantile(error, 0.95) < 0.5 * 0.01
-    v, u = np.nonzero((frame.depth > fuser.min_depth) & (frame.depth < fuser.max_depth))
+    v, u = np.nonzero(
+        (frame.depth > fuser.voxels.hashing.tsdf.min_depth) & (frame.depth < fuser.voxels.hashing.tsdf.max_depth)
+    )
     d = frame.depth[v, u]
     seen = np.stack(
         [(u - frame.camera.cx) / frame.camera.fx * d, (v - frame.camera.cy) / frame.camera.fy * d, d], axis=1

@@ -7,9 +7,10 @@ from framework.data import Camera, Frame
 from framework.mapping.evidence import EvidenceRows
 from framework.mapping.integration import Integrator
 from framework.mapping.raycasting import TILE, cast_coarse, cast_view, render, render_near, tile_bounds
-from framework.mapping.sensor import Sensor, depth_noise, pinhole
+from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.voxel_grid import VoxelGrid
 from framework.mapping.voxel_walk import inverses, leave_cell
+from framework.sensor_noise import axial_sigma_single
 from tests.scenes.analytic_scene import Scene, pose, room, walk
 
 VOXEL = 0.02
@@ -49,7 +50,7 @@ def test_noise_does_not_push_a_far_wall_away() -> None:
     rng = np.random.default_rng(0)
     camera = Camera(80, 60, 65.5, 65.5, 39.5, 29.5)
     for _ in range(60):
-        wall = rng.normal(depth, depth_noise(np.float32(depth)), camera.shape).astype(np.float32)
+        wall = rng.normal(depth, axial_sigma_single(np.float32(depth)), camera.shape).astype(np.float32)
         frame = Frame(0, 0.0, np.zeros((*camera.shape, 3), np.uint8), wall, camera)
         integrator.integrate(frame, np.eye(4), voxel)
     seen, _ = cast_view(integrator.voxels, sensor, camera, np.eye(4))

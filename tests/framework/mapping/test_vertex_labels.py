@@ -12,6 +12,7 @@ from framework.geometry import lift
 from framework.mapping.meshing import Surface
 from framework.mapping.vertex_labels import REACH, vertex_labels
 from framework.mapping.voxel_grid import UNSEEN, find_block
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.scenes.analytic_scene import CAMERA, room, walk
 
@@ -19,7 +20,7 @@ from tests.scenes.analytic_scene import CAMERA, room, walk
 @pytest.fixture(scope="module")
 def fuser() -> BayesianTsdf:
     """Three spheres, and a third of their masks each to a second instance, so that there are borders on objects."""
-    fuser = BayesianTsdf(voxel_size=0.03, max_depth=4.0, min_observations=1)
+    fuser = assemble(BayesianTsdf, voxel_size=0.03, max_depth=4.0, min_observations=1)
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
         assert frame.truth is not None
@@ -37,8 +38,8 @@ def fuser() -> BayesianTsdf:
 
 def slow_election(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -> tuple[int, int]:
     scene = fuser.scene
-    grid, evidence = scene.voxels.grid, scene.labels.evidence
-    place = vertex.astype(np.float64) / scene.voxel_size
+    grid, evidence = scene.volume.voxels.grid, scene.labels.evidence
+    place = vertex.astype(np.float64) / scene.volume.voxel_size
     base = np.floor(place).astype(int)
     votes: dict[int, float] = {}
     corners = []
@@ -50,7 +51,7 @@ def slow_election(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -
         n = (k * 8 + j) * 8 + i
         if block < 0 or grid.tsdf[block, n] == UNSEEN:
             continue
-        if abs(float(grid.tsdf[block, n]) * grid.tsdf_unit) > REACH * scene.voxel_size:
+        if abs(float(grid.tsdf[block, n]) * grid.tsdf_unit) > REACH * scene.volume.voxel_size:
             continue
         best, most, label, row = 0, 0.0, -1, int(grid.label_row[block])
         if row >= 0:
@@ -71,8 +72,8 @@ def test_agrees_with_the_slow_one(fuser: BayesianTsdf, dropped: tuple[int, ...])
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     counts[list(dropped)] = False
-    surface = scene._surface.extract()
-    _, instances, classes = vertex_labels(scene.voxels.grid, scene.labels.evidence, counts, surface)
+    surface = scene.volume.surface()
+    _, instances, classes = vertex_labels(scene.volume.voxels.grid, scene.labels.evidence, counts, surface)
     assert len(np.unique(instances)) >= 4 - len(dropped), "there must be something to tell apart"
     rng = np.random.default_rng(0)
     near_labels = np.flatnonzero(instances > 0)
@@ -88,6 +89,6 @@ def test_a_vertex_where_nothing_is_mapped_shows_nothing(fuser: BayesianTsdf) -> 
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
     far = Surface(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))
-    _, instances, classes = vertex_labels(scene.voxels.grid, scene.labels.evidence, counts, far)
+    _, instances, classes = vertex_labels(scene.volume.voxels.grid, scene.labels.evidence, counts, far)
     assert instances.tolist() == [0]
     assert classes.tolist() == [-1]

@@ -47,7 +47,7 @@ def test_what_one_run_or_none_cannot_say_is_nan() -> None:
 def test_differences_are_paired() -> None:
     """Rooms differ by 0.5, rows by 0.1: only the pairs can tell."""
     base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
-    difference = Mean.of(other.less(base, AP).values())
+    difference = Mean.of(other.differences(base, AP).values())
     assert difference.count == 2
     assert difference.value == pytest.approx(0.1)
     assert difference.error == pytest.approx(0, abs=1e-12)
@@ -58,7 +58,7 @@ def test_figures_that_are_not_defined_are_left_out() -> None:
     told = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
     assert told.values(AP) == {("0",): 0.4, ("5",): 1.0}
     assert told.mean("no.such.key").count == 0
-    assert told.less(row("b", seed0=None), AP) == {}
+    assert told.differences(row("b", seed0=None), AP) == {}
 
 
 def test_the_star_is_the_paired_t_test() -> None:

@@ -14,18 +14,18 @@ import numpy as np
 import pytest
 from omegaconf import OmegaConf
 
-from framework.data import Frame, InstanceMesh, Pose, SceneTruth
+from framework.data import InstanceMesh, Pose, SceneTruth
 from framework.errors import DataError, MapFullError
 from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
 from framework.files.tum_trajectory import read_tum
-from framework.interfaces import SceneMap
 from framework.journal import RunResult, TrackedFrame
 from framework.pipeline import Pipeline
 from framework.records import provenance, run_record
 from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
-from framework.records.metrics import instance_metrics, pose_source, run_metrics, trajectory_metrics
+from framework.records.metrics import instance_metrics, run_metrics, trajectory_metrics
 from framework.records.run_record import RunRecord, headline
+from tests import registered
 from tests.scenes.corner_room import (
     CLASSES,
     CornerRoom,
@@ -84,7 +84,15 @@ def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom
         *("instances.count", "instances.ap50", "instances.ap25", "instances.ap50.chair", "instances.ap50.couch"),
         *("instances.ap25.chair", "instances.ap.chair", "instances.true_count.chair", "annotation_release"),
         *("instances.ap50_agnostic", "instances.mean_iou", "trajectory.ate_rmse_m", "trajectory.rpe_rmse_m"),
-        *("seed", "config_hash", "git_commit", "environment.python", "environment.torch", "environment.cpus"),
+        *(
+            "seed",
+            "config_hash",
+            "inputs_sha256",
+            "git_commit",
+            "environment.python",
+            "environment.torch",
+            "environment.cpus",
+        ),
     }
     assert (metrics["frames"], metrics["instances.count"], metrics["instances.ap50"]) == (6, 2, 1.0)
     assert metrics["trajectory.ate_rmse_m"] == pytest.approx(0, abs=1e-9)
@@ -243,15 +251,26 @@ def test_timings_are_a_table(record: RunRecord, room: CornerRoom) -> None:
     assert metrics_of(record)["stage_ms.fuse.p95"] == pytest.approx(np.percentile(fuse, 95), abs=1e-3)
 
 
-def test_pose_source_is_what_the_poses_are(room: CornerRoom) -> None:
-    assert pose_source(mapped(room)) == "ground_truth"
+def test_the_tracker_says_where_poses_come_from(room: CornerRoom) -> None:
+    """Whatever the poses are: a tracker's first one is the true one, and lost ones are no one's."""
+    one_frame = CornerRoom(frames=1)
+    given = [mapped(room), mapped(room, lost_to=99), mapped(one_frame)]
+    assert [run_metrics(result)["pose_source"] for result in given] == ["ground_truth"] * 3
 
-    class NearlyRight(GivenPose):
-        def track(self, frame: Frame, scene: SceneMap) -> Pose:
-            return Pose(super().track(frame, scene).T_world_camera + 1e-12 * (frame.index == 3) * np.eye(4, k=3))
+    class Tracks(GivenPose):
+        pose_source = "tracked"
 
-    result = Pipeline(SphereDetector(), NearlyRight(), KeepAll(), GridFuser()).run(room)
-    assert run_metrics(result)["pose_source"] == "tracked"
+    for sequence, lost_to in ((room, 0), (room, 99), (one_frame, 0)):
+        result = Pipeline(SphereDetector(), Tracks(lost_to=lost_to), KeepAll(), GridFuser()).run(sequence)
+        assert run_metrics(result)["pose_source"] == "tracked"
+
+
+@pytest.mark.parametrize("tracker", registered.names("tracker"))
+def test_only_the_true_poses_are_not_tracked(tracker: str, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    needs = [f"tracker.path={tmp_path / 'poses.txt'}"] if tracker == "trajectory_file" else []
+    source = registered.built("tracker", tracker, *needs).pose_source
+    assert source == ("ground_truth" if tracker == "ground_truth" else "tracked")
 
 
 def test_the_headline_tells_what_matters() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from omegaconf import OmegaConf
 
 from framework.errors import DataError
 from framework.records import stored_runs
+from framework.records.inputs import inputs_sha256
 from framework.records.provenance import config_hash
 from framework.records.stored_runs import find_records, is_recorded, read_record
 
@@ -136,6 +138,86 @@ def test_a_record_of_other_code_is_kept_with_a_warning(
     [told] = caplog.records
     assert told.levelno == logging.WARNING
     assert "this is abcdef0" in told.getMessage()
+
+
+SETTINGS = {"threads": 4, "ahead": 2, "detection_cache": "off"}
+MACHINE = {"environment.processor": "a", "environment.cpus": 4}
+
+
+def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A complete record of this config, on a machine like this."""
+    monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE)
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    write(directory, config_hash=config_hash(config), inputs_sha256=inputs_sha256(config), **MACHINE)
+
+
+@pytest.mark.parametrize("changed", [{"threads": 1}, {"ahead": 0}, {"detection_cache": "read_write"}])
+def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
+    directory: Path, changed: dict[str, object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    config = CONFIG | SETTINGS
+    record_of(directory, config, monkeypatch)
+    about_results = {"table": {"columns": ["instances.ap50", "stage_ms.fuse.median"]}}
+    about_speed = {"table": {"columns": ["fps"]}}
+    assert is_recorded(directory, OmegaConf.create(config | about_speed))
+    assert is_recorded(directory, OmegaConf.create(config | changed | about_results))
+    assert is_recorded(directory, OmegaConf.create(config | changed))
+    caplog.clear()
+    assert not is_recorded(directory, OmegaConf.create(config | changed | about_speed))
+    assert caplog.messages == [
+        f"run again: the times in {directory} are of other settings or another machine: "
+        "threads=4, ahead=2, detection_cache=off, processor=a, cpus=4"
+    ]
+
+
+def test_times_of_another_machine_are_no_record_of_an_experiment_about_speed(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CONFIG | SETTINGS | {"table": {"columns": ["fps"]}}
+    record_of(directory, config, monkeypatch)
+    assert is_recorded(directory, OmegaConf.create(config))
+    monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE | {"environment.cpus": 8})
+    assert not is_recorded(directory, OmegaConf.create(config))
+
+
+def test_other_weights_or_data_in_the_same_place_are_another_run(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    weights, data = tmp_path / "net.onnx", tmp_path / "data" / "room" / "depth"
+    data.mkdir(parents=True)
+    weights.write_bytes(b"one")
+    (data / "0.png").write_bytes(b"depth")
+    dataset = {"root": str(tmp_path / "data"), "scene": "room"}
+    config = CONFIG | {"dataset": dataset, "detector": {"weights": str(weights), "labels": "auto"}}
+    for change in (
+        lambda: weights.write_bytes(b"two"),
+        lambda: (data / "1.png").write_bytes(b"depth"),
+        lambda: (data / "0.png").write_bytes(b"other depth"),
+        lambda: os.utime(data / "0.png", ns=(1, 1)),
+        lambda: (tmp_path / "data" / "camera.json").write_text("{}"),
+    ):
+        record_of(directory, config, monkeypatch)
+        assert is_recorded(directory, OmegaConf.create(config))
+        change()
+        caplog.clear()
+        assert not is_recorded(directory, OmegaConf.create(config))
+        assert caplog.messages == [f"run again: weights or data have changed since the record in {directory}"]
+    record_of(directory, config, monkeypatch)
+    (tmp_path / "data" / "another room").mkdir()
+    (tmp_path / "data" / "another room" / "0.png").write_bytes(b"depth")
+    (data / "outputs").mkdir()
+    (data / "outputs" / "table.md").write_text("of runs that were begun here")
+    os.utime(weights, ns=(1, 1))
+    assert is_recorded(directory, OmegaConf.create(config)), "neither concerns this run"
+
+
+def test_a_record_from_before_inputs_were_told_is_kept(directory: Path, tmp_path: Path) -> None:
+    config = CONFIG | {"dataset": {"root": str(tmp_path), "scene": ""}}
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    write(directory, config_hash=config_hash(config))
+    assert is_recorded(directory, OmegaConf.create(config))
 
 
 def test_no_record_is_none(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 from framework.refinement import mixture, mixture_tree
 from framework.refinement.mixture_tree import Level, MixtureTree
 from tests.thread_counts import by_one_thread_and_two
+from tests.tree_densities import gaussian_densities, leaves, log_likelihoods, owners
 
 FLOOR = 0.02**2  # m^2
 
@@ -48,13 +49,6 @@ def slow_cut(points: np.ndarray, groups: int) -> np.ndarray:
     return labels
 
 
-def slow_densities(points: np.ndarray, weights: np.ndarray, means: np.ndarray, Sigmas: np.ndarray) -> np.ndarray:
-    """(S, K) pi_k N(x_i | mu_k, Sigma_k)."""
-    offsets = points[:, None] - means
-    exponents = -0.5 * np.einsum("ska,kab,skb->sk", offsets, np.linalg.inv(Sigmas), offsets)
-    return weights * np.exp(exponents) / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(Sigmas))
-
-
 def floored(Sigma: np.ndarray) -> np.ndarray:
     values, axes = np.linalg.eigh(Sigma)
     return axes @ np.diag(np.maximum(values, FLOOR)) @ axes.T
@@ -81,7 +75,7 @@ def slow_children(points: np.ndarray, weight: float, children: int, iterations: 
         weights, means = N_k / len(points), gamma.T @ points / N_k[:, None]
         offsets = points[:, None] - means
         Sigmas = [floored(S) for S in np.einsum("sk,ska,skb->kab", gamma, offsets, offsets) / N_k[:, None, None]]
-        densities = slow_densities(points, weights, means, np.array(Sigmas))
+        densities = gaussian_densities(points, weights, means, np.array(Sigmas))
         evidence = densities.sum(axis=1) + outlier / np.prod(sides)
         if step < iterations:
             gamma = densities / evidence[:, None]
@@ -110,28 +104,6 @@ def test_same_as_the_slow_recursion(seed):
     np.testing.assert_array_equal(tree.levels[1].parents, np.repeat(np.arange(4), [len(c) for c, _ in below]))
 
 
-def test_log_likelihood_is_that_of_the_flat_sum():
-    points = surface(0, 900)
-    starts = np.array([0, 400, 400, 900])
-    tree = grown(points, starts, levels=2, children=4)
-    ours = tree.log_likelihoods(points, starts)
-    owners = [tree.owners(0), tree.owners(1)]
-    for k in (0, 2):
-        own = points[starts[k] : starts[k + 1]].astype(np.float64)
-        density = np.zeros(len(own))
-        for level, rows in tree.leaves(2):
-            rows = rows[owners[level][rows] == k]
-            part = tree.levels[level]
-            density += slow_densities(own, part.weights[rows], part.means[rows], part.covariances[rows]).sum(axis=1)
-        for level, above in zip(tree.levels, [np.arange(3), owners[0]], strict=True):
-            for q in np.nonzero((above == k) & (level.outlier_weights > 0))[0]:
-                low, high = level.outlier_boxes[q]
-                inside = ((own >= low) & (own <= high)).all(axis=1)
-                density += inside * level.outlier_weights[q] / np.prod(high - low)
-        assert ours[k] == pytest.approx(np.log(density).mean(), abs=1e-4)
-    assert ours[1] == 0.0
-
-
 def test_one_level_is_a_flat_mixture():
     points, starts = surface(2, 3000), np.array([0, 1000, 3000])
     tree = grown(points, starts, levels=1, min_support=0.0)
@@ -149,18 +121,18 @@ def test_one_level_is_a_flat_mixture():
         points, starts, mixture_tree.cut(points, starts, 8), 8, max_iterations=9, tolerance=-np.inf,
         variance_floor=FLOOR, outlier_fraction=0.02,
     )  # its last E-step, which the log-likelihood is from, sees the parameters of eight  # fmt: skip
-    np.testing.assert_allclose(tree.log_likelihoods(points, starts), more.log_likelihoods, atol=1e-4)
+    np.testing.assert_allclose(log_likelihoods(tree, points, starts), more.log_likelihoods, atol=1e-4)
 
 
 def masses(tree: MixtureTree, depth: int, sets: int) -> np.ndarray:
     """(N,) the weight of all leaves and uniform components of each tree."""
     mass = np.zeros(sets)
-    for k, rows in tree.leaves(depth):
-        np.add.at(mass, tree.owners(k)[rows], tree.levels[k].weights[rows])
+    for k, rows in leaves(tree, depth):
+        np.add.at(mass, owners(tree, k)[rows], tree.levels[k].weights[rows])
     above = np.arange(sets)
     for k in range(depth):
         np.add.at(mass, above, tree.levels[k].outlier_weights)
-        above = tree.owners(k)
+        above = owners(tree, k)
     return mass
 
 
@@ -184,7 +156,7 @@ def test_weights_add_up(min_support):
 def test_a_level_more_never_fits_the_training_points_worse(seed):
     points, starts = surface(seed, 6000), np.array([0, 2000, 6000])
     tree = grown(points, starts)
-    by_depth = np.array([tree.log_likelihoods(points, starts, depth) for depth in (1, 2, 3)])
+    by_depth = np.array([log_likelihoods(tree, points, starts, depth) for depth in (1, 2, 3)])
     assert (np.diff(by_depth, axis=0) > 0).all(), by_depth
 
 
@@ -201,7 +173,7 @@ def test_points_go_to_their_best_child_and_strays_to_none():
     tree, starts = MixtureTree((level,)), np.array([0, 4])
     child, share = tree.shared(0, points, starts, shares, np.array([0.6], np.float32), odds)
     assert child.tolist() == tree.passed(0, points, starts).tolist() == [0, 1, -1, 0]
-    densities = slow_densities(points.astype(np.float64), level.weights, level.means, level.covariances)
+    densities = gaussian_densities(points.astype(np.float64), level.weights, level.means, level.covariances)
     ours = (densities @ shares + 0.6 * 0.2 / 1000) * np.exp(odds)
     theirs = densities @ (1 - shares) + 0.4 * 0.2 / 1000
     np.testing.assert_allclose(share, ours / (ours + theirs), atol=1e-5)
@@ -242,12 +214,12 @@ def test_too_little_for_a_tree():
     tree = grown(points, starts, levels=2)
     assert np.diff(tree.levels[0].firsts)[[0, 3]].tolist() == [0, 0], "nothing, and one point"
     assert np.diff(tree.levels[0].firsts)[1] == 1, "forty times the same point is one node"
-    log_likelihoods = tree.log_likelihoods(points, starts)
-    assert log_likelihoods[0] == 0.0
-    assert np.isfinite(log_likelihoods[1:3]).all()
-    assert log_likelihoods[3] == -np.inf
+    found = log_likelihoods(tree, points, starts)
+    assert found[0] == 0.0
+    assert np.isfinite(found[1:3]).all()
+    assert found[3] == -np.inf
     nothing = grown(np.zeros((0, 3), np.float32), np.array([0]))
-    assert len(nothing.log_likelihoods(np.zeros((0, 3), np.float32), np.array([0]))) == 0
+    assert len(log_likelihoods(nothing, np.zeros((0, 3), np.float32), np.array([0]))) == 0
 
 
 def test_same_result_with_one_thread_and_with_two():
@@ -255,7 +227,7 @@ def test_same_result_with_one_thread_and_with_two():
 
     def grow():
         tree = grown(points, starts)
-        return tree.levels[-1].means, tree.log_likelihoods(points, starts)
+        return tree.levels[-1].means, log_likelihoods(tree, points, starts)
 
     for one, other in zip(*by_one_thread_and_two(grow), strict=True):
         np.testing.assert_array_equal(one, other)

@@ -57,7 +57,7 @@ def test_a_picture_is_of_fronts_and_interpolates_exactly(surface: Surface, hits:
 
 @pytest.mark.parametrize("n", [1, 2, 3])
 def test_every_nth_pixel_is_what_its_camera_sees(hits: Hits, n: int) -> None:
-    some = hits.every(n)
+    some = hits.subsampled(n)
     np.testing.assert_array_equal(some.depth, hits.depth[::n, ::n])
     np.testing.assert_array_equal(some.points_world, hits.points_world[::n, ::n])
     T = np.eye(4)

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
+from framework.sensor_noise import axial_sigma_at_angle
 from framework.synthetic.depth_camera import (
     DepthSensor,
-    axial_sigma,
     depth_step,
     noisy_color,
     normal_quantiles,
@@ -36,7 +36,7 @@ def test_grazing_surfaces_are_noisier():
     wall = np.full(FRONT.shape, 2.0)
     slanted = measure(wall, np.full(FRONT.shape, np.cos(np.deg2rad(72)), np.float32))
     theta = np.float32(np.deg2rad(72))
-    assert axial_sigma(np.float32(2), theta) > 1.05 * axial_sigma(np.float32(2), np.float32(0))
+    assert axial_sigma_at_angle(np.float32(2), theta) > 1.05 * axial_sigma_at_angle(np.float32(2), np.float32(0))
     assert slanted[slanted > 0].std() > 1.05 * measure(wall).std()
 
 

@@ -11,7 +11,7 @@ from framework.tables.grid import Grid, decimals, figure, latex_grid, markdown_g
 GRID = Grid(
     heads=["scene", "a_b", "x"],
     body=[["011", "y|z", "0.5 ± 0.1"], ["", "50%", "–"]],
-    words=2,
+    label_columns=2,
     bold=frozenset({(0, 2)}),
     groups=frozenset({1}),
 )

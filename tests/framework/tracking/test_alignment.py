@@ -8,7 +8,6 @@ import pytest
 
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
-from framework.mapping.sensor import depth_noise
 from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize, smoothed
 from framework.tracking.pyramid import build_pyramid, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
@@ -148,8 +147,3 @@ def test_smoothed_normals_are_means_of_squares_without_what_is_not_mapped() -> N
             for u in range(reach, 17 - reach):
                 total = normals[:, v - reach : v + reach + 1, u - reach : u + reach + 1].sum(axis=(1, 2))
                 np.testing.assert_allclose(found.normals[:, v, u], total / np.linalg.norm(total), atol=1e-4)
-
-
-def test_depth_noise_is_nguyens() -> None:
-    assert depth_noise(np.float32(0.4)) == pytest.approx(0.0012)
-    assert depth_noise(np.float32(3.4)) == pytest.approx(0.0012 + 0.0019 * 9)

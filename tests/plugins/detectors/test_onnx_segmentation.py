@@ -5,7 +5,6 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.detection.masks import tight_boxes
-from framework.detection.onnx_network import Runtime
 from framework.errors import ConfigError, DataError
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
 from tests.test_contracts import (  # noqa: F401  the contract of every detector, on the `detector` below
@@ -41,13 +40,11 @@ def outputs(objectness=False, transposed=False):
     return {"output0": rows[None] if transposed else rows.T[None], "output1": prototypes[None]}
 
 
-def tiny(folder, runtime=Runtime.auto, objectness=False, transposed=False, **parameters):
+def tiny(folder, objectness=False, transposed=False, **parameters):
     labels = folder / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(folder / "tiny.onnx", (1, 3, SIZE, SIZE), outputs(objectness, transposed))
-    return OnnxSegmentation(
-        weights=weights, labels=str(labels), objectness=objectness, runtime=runtime, device="cpu", **parameters
-    )
+    return OnnxSegmentation(weights=weights, labels=str(labels), objectness=objectness, device="cpu", **parameters)
 
 
 @pytest.fixture
@@ -55,10 +52,9 @@ def detector(tmp_path):
     return tiny(tmp_path)
 
 
-@pytest.mark.parametrize("runtime", [Runtime.onnxruntime, Runtime.opencv])
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
-def test_boxes_scores_and_masks(tmp_path, runtime, objectness, transposed):
-    found = tiny(tmp_path, runtime, objectness, transposed).detect(frame())
+def test_boxes_scores_and_masks(tmp_path, objectness, transposed):
+    found = tiny(tmp_path, objectness, transposed).detect(frame())
     # A pixel u of the image has its centre at (u + 0.5) / 2 in the input and at a half of that, less 0.5, in cells.
     cup = ((U + 0.5) / 4 - 0.5 < 10.4) & (U >= 10) & (U < 70) & (V >= 20) & (V < 60)
     chair = (((V + 0.5) / 2 + 10) / 2 - 0.5 > 25.4) & (U >= 100) & (U < 140) & (V >= 60) & (V < 100)

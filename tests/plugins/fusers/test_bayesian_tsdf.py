@@ -7,6 +7,7 @@ import pytest
 
 from framework.data import Frame
 from framework.errors import ConfigError, MapFullError
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.scenes.analytic_scene import room, walk
 from tests.thread_counts import by_one_thread_and_two
@@ -14,7 +15,7 @@ from tests.true_masks import fuse_masks, masks_of
 
 
 def new_fuser(**parameters: object) -> BayesianTsdf:
-    return BayesianTsdf(voxel_size=0.02, max_depth=4.0, **parameters)  # type: ignore[arg-type]
+    return assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, **parameters)
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +34,7 @@ def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame]) -> None:
 def test_parameters_are_checked() -> None:
     for wrong in ({"max_weight": 256.0}, {"class_floor": 0.0}, {"absence": float("nan")}, {"on_top": 1.5}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
-            BayesianTsdf(**wrong)  # type: ignore[arg-type]
+            assemble(BayesianTsdf, **wrong)
 
 
 def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -> None:
@@ -41,8 +42,8 @@ def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame]) -
         fuser = new_fuser()
         for frame in frames:
             fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.5, 0.4])
-        grid, labels = fuser.scene.voxels.grid, fuser.scene.labels
-        b, r = fuser.scene.voxels.block_count, labels.row_count
+        grid, labels = fuser.scene.volume.voxels.grid, fuser.scene.labels
+        b, r = fuser.scene.volume.voxels.block_count, labels.row_count
         of_grid = [a[:b].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color, grid.label_row)]
         return of_grid + [a[:r].tobytes() for a in labels.evidence]
 

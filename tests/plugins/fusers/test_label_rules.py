@@ -7,7 +7,8 @@ import pytest
 
 from framework.data import Detections, Pose
 from framework.geometry import lift
-from framework.mapping.instance_fuser import InstanceFuser
+from framework.interfaces import MapFuser
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.label_count import LabelCount
 from plugins.fusers.last_write import LastWrite
@@ -34,8 +35,8 @@ def product() -> np.ndarray:
         (Open3DVoxelBlockGrid, product()),
     ],
 )
-def test_each_rule_has_its_own_opinion(fuser_class: type[InstanceFuser], expected: np.ndarray) -> None:
-    fuser = fuser_class(voxel_size=0.02, max_depth=4.0)
+def test_each_rule_has_its_own_opinion(fuser_class: type[MapFuser], expected: np.ndarray) -> None:
+    fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0)
     for k, (T, (score, probabilities)) in enumerate(zip(walk(3), SEEN, strict=True)):
         frame = room().frame(T, k)
         assert frame.truth is not None

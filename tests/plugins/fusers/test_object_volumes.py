@@ -12,6 +12,7 @@ from framework.data import Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, MapFullError
 from framework.geometry import lift
 from framework.mapping.association import OverlapRule
+from framework.registry import assemble
 from plugins.fusers.object_volumes import ObjectVolumes, existence
 from tests.scenes.box_scene import CAMERA, BoxScene, bled, detected, look_from
 from tests.thread_counts import by_one_thread_and_two
@@ -22,7 +23,7 @@ MASK_FUSION = {"overlap_rule": OverlapRule.CLUSTER, "overlap": 0.05, "same_class
 
 
 def new_fuser(**parameters: object) -> ObjectVolumes:
-    return ObjectVolumes(voxel_size=VOXEL, **parameters)  # type: ignore[arg-type]
+    return assemble(ObjectVolumes, voxel_size=VOXEL, **parameters)
 
 
 def pan(width: float) -> list[Frame]:
@@ -97,10 +98,10 @@ def test_rendered_ids_are_those_of_the_boxes(mapped: ObjectVolumes, frames: list
 def test_bytes_and_voxels_are_those_of_all_volumes(mapped: ObjectVolumes) -> None:
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
-    assert scene.voxel_count == 512 * (scene.voxels.block_count + objects)
+    assert scene.voxel_count == 512 * (scene.background.voxels.block_count + objects)
     per_object_voxel = 8 + 4  # a grid's, and the two counts
-    assert scene.byte_count > 8 * 512 * scene.voxels.block_count + per_object_voxel * 512 * objects
-    assert 0 < objects < scene.voxels.block_count
+    assert scene.byte_count > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
+    assert 0 < objects < scene.background.voxels.block_count
 
 
 def share_of_the_room(fuser: ObjectVolumes) -> float:
@@ -308,7 +309,7 @@ def test_the_map_does_not_depend_on_the_number_of_threads(frames: list[Frame], t
 
 
 def test_a_full_map_says_so(frames: list[Frame]) -> None:
-    background = fuse(new_fuser(), frames[0], []).scene.voxels.block_count
+    background = fuse(new_fuser(), frames[0], []).scene.background.voxels.block_count
     with pytest.raises(MapFullError, match=f"more than {background} blocks in the background and 2 objects"):
         fuse(new_fuser(max_blocks=background), frames[0], masks_of(frames[0]))
 
@@ -326,4 +327,4 @@ def test_a_pixel_out_of_the_image_and_other_classes_are_refused(frames: list[Fra
 def test_parameters_are_checked() -> None:
     for wrong in ({"overlap": 1.5}, {"min_existence": -0.1}, {"create_points": 0}, {"label_band": 9.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
-            ObjectVolumes(**wrong)  # type: ignore[arg-type]
+            assemble(ObjectVolumes, **wrong)

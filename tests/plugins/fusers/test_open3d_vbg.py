@@ -9,6 +9,7 @@ import pytest
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError, MapFullError
 from framework.mapping.instance_list import Confirmation
+from framework.registry import assemble
 from framework.rivals.open3d_grid import BlockGridSettings
 from framework.rivals.open3d_map import Open3DMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -29,7 +30,7 @@ CONFIRMATION = Confirmation(min_observations=3, min_confidence=0.05, min_area=0.
 
 
 def new_fuser(**parameters: float) -> Open3DVoxelBlockGrid:
-    return Open3DVoxelBlockGrid(voxel_size=0.02, max_depth=4.0, **parameters)  # type: ignore[arg-type]
+    return assemble(Open3DVoxelBlockGrid, voxel_size=0.02, max_depth=4.0, **parameters)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ def mapped(frames: list[Frame]) -> Open3DMap:
 def one_view(**changes: float) -> tuple[Open3DMap, Frame]:
     """A wall seen once."""
     frame = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)]).frame(np.eye(4))
-    scene = Open3DMap(dataclasses.replace(SETTINGS, **changes), CONFIRMATION)  # type: ignore[arg-type]
+    scene = Open3DMap(dataclasses.replace(SETTINGS, **changes), CONFIRMATION)
     scene.integrate(frame, np.eye(4))
     return scene, frame
 
@@ -214,7 +215,7 @@ def test_a_close_view_of_a_large_map_is_whole_and_silent(mapped: Open3DMap, capf
 
 
 def test_ids_stay_with_their_objects_and_are_those_of_the_other_fuser(frames: list[Frame]) -> None:
-    ours, theirs = new_fuser(), BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    ours, theirs = new_fuser(), assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     for k, frame in enumerate(frames):
         order = np.roll(np.arange(3), k)
         for fuser in (ours, theirs):
@@ -334,7 +335,7 @@ def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path)
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match="map format 4, this version reads open3d_vbg"):
+    with pytest.raises(DataError, match="map format 5, this version reads open3d_vbg"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")
@@ -363,4 +364,4 @@ def test_a_single_reading_is_mapped(frames: list[Frame]) -> None:
 def test_parameters_are_checked() -> None:
     for wrong in ({"block_resolution": 1}, {"class_floor": 1.0}, {"min_weight": float("nan")}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
-            Open3DVoxelBlockGrid(**wrong)  # type: ignore[arg-type]
+            assemble(Open3DVoxelBlockGrid, **wrong)

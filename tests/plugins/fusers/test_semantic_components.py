@@ -11,7 +11,7 @@ import pytest
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
 from framework.geometry import lift
-from framework.mapping.integration import Integrator
+from framework.registry import assemble
 from framework.rivals.semantic_map import SemanticMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.semantic_components import SemanticComponents
@@ -28,7 +28,7 @@ TOUCHING = (-0.1, 0.8, 0.0, 0.4, 1.2, 0.5)  # the left box's side
 
 
 def new_fuser(**parameters: object) -> SemanticComponents:
-    return SemanticComponents(voxel_size=0.03, max_depth=4.0, **parameters)  # type: ignore[arg-type]
+    return assemble(SemanticComponents, voxel_size=0.03, max_depth=4.0, **parameters)
 
 
 def mapped_boxes(boxes: list[box_scene.Box], class_ids: list[int]) -> SemanticMap:
@@ -120,8 +120,8 @@ def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
 
 def test_each_voxel_has_the_product_of_what_its_pixels_said(mapped: SemanticMap, frames: list[Frame]) -> None:
     """Against eq. [7] over classes and background, by projecting the voxel into each frame."""
-    grid, evidence, fuser = mapped.voxels.grid, mapped.labels.evidence, new_fuser()
-    rows = np.flatnonzero(grid.label_row[: mapped.voxels.block_count] >= 0)
+    grid, evidence, fuser = mapped.volume.voxels.grid, mapped.labels.evidence, new_fuser()
+    rows = np.flatnonzero(grid.label_row[: mapped.volume.voxels.block_count] >= 0)
     rng = np.random.default_rng(0)
     differing = seen = 0
     for block, n in zip(rng.choice(rows, 600), rng.integers(0, 512, 600), strict=True):
@@ -158,8 +158,8 @@ def test_each_voxel_has_the_product_of_what_its_pixels_said(mapped: SemanticMap,
 
 
 def test_an_instances_numbers_are_those_of_its_voxels(mapped: SemanticMap) -> None:
-    grid, evidence, mesh = mapped.voxels.grid, mapped.labels.evidence, mapped.mesh()
-    voxels = mapped._surface.extract().voxels
+    grid, evidence, mesh = mapped.volume.voxels.grid, mapped.labels.evidence, mapped.mesh()
+    voxels = mapped.volume.surface().voxels
     instances = mapped.instances()
     assert list(instances) == list(range(1, 1 + mapped.instance_count))
     assert len(instances) >= 1
@@ -247,8 +247,7 @@ def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> N
         if k == 2:
             resumed.scene.save(tmp_path / "map.npz")
             resumed.scene = SemanticMap.load(tmp_path / "map.npz")
-            resumed._integrator = Integrator(resumed.scene.voxels, resumed.scene.sensor)
-            resumed._integrator.frames = k  # on which the rounding of averages depends
+            resumed.scene.volume.integrator.frames = k  # on which the rounding of averages depends
         for fuser in (whole, resumed):
             fuse_masks(fuser, frame, masks_of(frame), [0.6, 0.5, 0.4])
     ours, theirs = whole.scene.labels.saved(), resumed.scene.labels.saved()
@@ -257,7 +256,7 @@ def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> N
 
 def test_a_map_of_instances_is_refused(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
-    with pytest.raises(DataError, match="map format 4, this version reads semantic 1"):
+    with pytest.raises(DataError, match="map format 5, this version reads semantic 1"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
@@ -273,4 +272,4 @@ def test_another_label_space_is_refused(frames: list[Frame]) -> None:
 def test_parameters_are_checked() -> None:
     for wrong in ({"missed": 0.0}, {"class_floor": 1.0}, {"max_weight": 256.0}, {"voxel_size": float("nan")}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
-            SemanticComponents(**wrong)  # type: ignore[arg-type]
+            assemble(SemanticComponents, **wrong)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from framework.data import Camera, Frame, PointClusters
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
 from plugins.refiners.chain import Chain
 from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.kmeans import KMeans
@@ -29,15 +31,29 @@ class Halving(LargestComponent):
         )
 
 
-def test_each_link_refines_what_the_one_before_it_left() -> None:
+def line() -> tuple[Frame, PointClusters]:
     camera = Camera(8, 8, 8.0, 8.0, 3.5, 3.5)
     frame = Frame(0, 0.0, np.zeros((8, 8, 3), np.uint8), np.ones((8, 8), np.float32), camera)
     points = np.arange(24, dtype=np.float32).reshape(8, 3)
     pixels = np.zeros((8, 2), np.int32)
     ones = np.ones((1, 1), np.float32)
-    clusters = PointClusters(points, pixels, np.zeros(8, np.int32), ones, ones[0], ("chair",))
+    return frame, PointClusters(points, pixels, np.zeros(8, np.int32), ones, ones[0], ("chair",))
+
+
+def test_each_link_refines_what_the_one_before_it_left() -> None:
+    frame, clusters = line()
     left = Chain({"first": Halving(), "second": Halving()}).refine(clusters, frame)
-    assert left.points_world.tolist() == points[::4].tolist()
+    assert left.points_world.tolist() == clusters.points_world[::4].tolist()
+
+
+def test_no_link_is_given_pixels_that_the_one_before_it_made_up() -> None:
+    class MadeUp(LargestComponent):
+        def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+            return replace(clusters, pixels=clusters.pixels - 9)
+
+    frame, clusters = line()
+    with pytest.raises(DataError, match=r"image of 8x8, found u in \[-9, -9\]"):
+        Chain({"first": MadeUp(), "second": LargestComponent()}).refine(clusters, frame)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Density clustering beside scikit-learn's, and what it keeps of clusters."""
+"""What density clustering keeps of clusters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from sklearn.cluster import DBSCAN
 
 from framework.data import Camera, Frame, PointClusters
 from framework.errors import ConfigError
-from plugins.refiners.dbscan import Dbscan, dense_pieces
+from plugins.refiners.dbscan import Dbscan
 from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(90, 60, 50.0, 50.0, 44.5, 29.5)
@@ -37,32 +37,6 @@ def blobs(seed: int, count: int = 1500) -> np.ndarray:
     dense = centers[which] + rng.normal(size=(count, 3)) * sigmas[which, None]
     everywhere = rng.uniform(-0.6, 0.6, (count // 5, 3))
     return (np.concatenate([dense, everywhere]) + np.array([-3, 5, 2])).astype(np.float32)
-
-
-def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
-    pairs = np.unique(np.stack([a, b]), axis=1).shape[1]
-    return pairs == len(np.unique(a)) == len(np.unique(b))
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize(("eps", "min_points"), [(0.03, 5), (0.05, 3), (0.05, 20), (0.02, 1), (0.3, 50)])
-def test_core_points_and_their_partition_are_scikit_learns(seed, eps, min_points):
-    points = blobs(seed)
-    reference = DBSCAN(eps=eps, min_samples=min_points).fit(points)
-    labels = dense_pieces(points, eps, min_points)
-    core = np.flatnonzero(labels >= 0)
-    np.testing.assert_array_equal(core, reference.core_sample_indices_)
-    assert same_partition(labels[core], reference.labels_[core])
-
-
-@pytest.mark.parametrize("step", [1, -1])
-def test_a_border_point_joins_no_pieces(step):
-    """At 0.95 a point with two neighbors within 1, one of each piece; it shares its cell with a core point at 1.1."""
-    x = np.array([0.0, -0.3, -0.6, -0.9, 0.95, 1.1, 2.0, 2.05, 2.5])[::step]
-    labels = dense_pieces(np.stack([x, 0 * x, 0 * x], axis=1).astype(np.float32), 1.0, 4)[::step]
-    assert labels[4] == -1
-    assert len(set(labels[:4])) == len(set(labels[5:8])) == 1
-    assert labels[0] != labels[5]
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -100,6 +74,16 @@ def test_all_points_are_judged_by_the_thinned_ones():
         assert len(refined.pixels) == 60 * 50
 
 
+def test_a_large_cluster_is_thinned_and_its_points_count_for_those_left_out():
+    """Of a plate of 5400 points at most 600 are searched: every third row and column, each point for nine."""
+    v, u = np.mgrid[:60, :90]
+    plate = np.stack([u * 0.01, v * 0.01, 0 * u + 2.0], axis=-1).reshape(-1, 3)
+    plate[-90:, 1] += 0.5  # the last row comes off: none of the points searched is in it
+    for eps, min_points, kept in ((0.035, 9 * 3, 59 * 90), (0.035, 9 * 5 + 1, 60 * 90)):
+        refiner = Dbscan(eps=eps, eps_per_depth=0.0, min_points=min_points, stride=1, max_points=600)
+        assert len(refiner.refine(clusters_of(plate), FRAME).pixels) == kept, "each has at most 5 within eps"
+
+
 def test_of_two_equal_pieces_the_first_stays():
     rng = np.random.default_rng(0)
     ball = rng.normal(0, 0.01, (50, 3))
@@ -127,10 +111,8 @@ def test_degenerate_clusters():
     assert len(Dbscan(eps=0.001, eps_per_depth=0, min_points=1, stride=1).refine(clusters_of(far), FRAME).pixels) == 1
 
 
-def test_exact_clusters_and_points_of_no_cluster_stay():
+def test_points_of_no_cluster_stay():
     clusters = clusters_of(blobs(0))
-    exact = replace(clusters, exact=True)
-    assert Dbscan().refine(exact, FRAME) is exact
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, 0).astype(np.int32)
     refined = Dbscan(stride=1).refine(replace(clusters, cluster=cluster), FRAME)
     np.testing.assert_array_equal(refined.pixels[refined.cluster == -1], clusters.pixels[::3])

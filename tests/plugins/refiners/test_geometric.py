@@ -107,7 +107,7 @@ def test_too_little_of_a_segment_is_no_claim(min_overlap, claimed):
     assert len(refined) == 1
 
 
-def test_points_of_no_cluster_and_exact_clusters_stay():
+def test_points_of_no_cluster_stay():
     depth, ids = table()
     frame = frame_of(depth)
     before = lifted((ids == 1)[None], frame)
@@ -116,8 +116,6 @@ def test_points_of_no_cluster_and_exact_clusters_stay():
     arrays = (before.points_world, before.pixels, cluster, before.class_probabilities, before.scores, before.classes)
     after = Geometric().refine(PointClusters(*arrays), frame)
     np.testing.assert_array_equal(after.pixels[after.cluster == -1], before.pixels[::7])
-    exact = PointClusters(*arrays, exact=True)
-    assert Geometric().refine(exact, frame) is exact
 
 
 def test_nothing_is_added_where_the_pose_is_open():

@@ -110,7 +110,7 @@ def test_too_little_to_tell_is_left_alone():
     assert len(GmmTree(min_node=10**6).refine(few, sparse).pixels) == len(few.pixels), "a tree without a node"
 
 
-def test_points_of_no_cluster_and_exact_clusters_stay():
+def test_points_of_no_cluster_stay():
     depth, ids = room()
     frame = frame_of(depth)
     before = lifted(bleeding(ids > 0, 8)[None], frame)
@@ -118,8 +118,6 @@ def test_points_of_no_cluster_and_exact_clusters_stay():
     cluster[::7] = -1
     arrays = (before.points_world, before.pixels, cluster, before.class_probabilities, before.scores, before.classes)
     assert (GmmTree().refine(PointClusters(*arrays), frame).cluster == -1).sum() == (cluster == -1).sum()
-    exact = PointClusters(*arrays, exact=True)
-    assert GmmTree().refine(exact, frame) is exact
 
 
 def test_same_result_with_one_thread_and_with_two():

@@ -184,11 +184,9 @@ def test_a_small_plane_is_not_structure():
         assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
 
 
-def test_exact_clusters_and_points_of_no_cluster_stay():
+def test_points_of_no_cluster_stay():
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1), np.zeros_like(ids, bool))
-    exact = replace(clusters, exact=True)
-    assert PlaneRemoval().refine(exact, frame) is exact
     cluster = np.where(np.arange(len(clusters.cluster)) % 3 == 0, -1, clusters.cluster).astype(np.int32)
     refined = PlaneRemoval().refine(replace(clusters, cluster=cluster), frame)
     np.testing.assert_array_equal(refined.pixels[refined.cluster == -1], clusters.pixels[::3])

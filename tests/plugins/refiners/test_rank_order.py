@@ -1,4 +1,4 @@
-"""Rank-order clustering beside its definition, and what it keeps of clusters."""
+"""What rank-order clustering keeps of clusters."""
 
 from __future__ import annotations
 
@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from framework.data import Camera, Frame, PointClusters
 from framework.errors import ConfigError
-from plugins.refiners.rank_order import RankOrder, nearest_neighbors, rank_order_groups
+from framework.refinement.rank_order_clustering import rank_order_groups
+from plugins.refiners.rank_order import RankOrder
 from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(90, 60, 50.0, 50.0, 44.5, 29.5)
@@ -28,67 +28,11 @@ def clusters_of(*sets: np.ndarray) -> PointClusters:
     return PointClusters(points, pixels, cluster, ones[:, None], ones, ("thing",))
 
 
-def neighbor_order(points: np.ndarray) -> list[list[int]]:
-    """All points in the order of their distance from each one; itself first, of equally near the first."""
-    distances = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
-    np.fill_diagonal(distances, -1)
-    return [sorted(range(len(points)), key=lambda b, row=row: (row[b], b)) for row in distances]
-
-
-def slow_groups(points: np.ndarray, k: int, threshold: float) -> np.ndarray:
-    """The definition, word by word."""
-    order = neighbor_order(points)
-    n = len(points)
-
-    def d(a: int, b: int) -> int:
-        last = min(order[a].index(b), k)
-        return sum(order[b].index(order[a][i]) > k for i in range(1, last + 1))
-
-    linked = np.zeros((n, n), bool)
-    for a in range(n):
-        for b in range(n):
-            smaller = min(order[a].index(b), order[b].index(a))
-            linked[a, b] = 0 < smaller <= k and (d(a, b) + d(b, a)) / smaller <= threshold
-    return np.asarray(connected_components(linked)[1])
-
-
 def blobs(seed: int, count: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     return (rng.normal(size=(count, 3)) * 0.1 + rng.uniform(-0.3, 0.3, (3, 3))[rng.integers(0, 3, count)]).astype(
         np.float32
     )
-
-
-def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
-    pairs = np.unique(np.stack([a, b]), axis=1).shape[1]
-    return pairs == len(np.unique(a)) == len(np.unique(b))
-
-
-def lattice(rows: int, columns: int) -> np.ndarray:
-    """A flat grid, full of equal distances."""
-    v, u = np.mgrid[:rows, :columns]
-    return np.stack([u, v, 0 * u], axis=-1).reshape(-1, 3).astype(np.float32)
-
-
-@pytest.mark.parametrize("points", [blobs(0, 60), blobs(1, 5), lattice(6, 9), np.zeros((12, 3), np.float32)])
-@pytest.mark.parametrize("k", [2, 5, 16])
-def test_neighbors_are_those_of_a_full_sort(points, k):
-    right = np.array([row[1 : k + 1] for row in neighbor_order(points)])
-    np.testing.assert_array_equal(nearest_neighbors(points, k), right)
-
-
-@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.7, 1.0, 1.5])
-@pytest.mark.parametrize(
-    ("points", "k"), [(blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3), (lattice(6, 9), 5), (blobs(3, 8), 9)]
-)
-def test_groups_are_those_of_the_definition(points, k, threshold):
-    assert same_partition(rank_order_groups(points, k, threshold), slow_groups(points, k, threshold))
-
-
-def test_the_definition_splits_the_sets_that_are_compared():
-    """Neither one group nor as many as points: the comparison above says something."""
-    for points, k in ((blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3)):
-        assert 1 < len(np.unique(slow_groups(points, k, 0.5))) < len(points) // 2
 
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 100.0])
@@ -115,7 +59,7 @@ def test_points_left_out_go_with_the_nearest_that_takes_part():
     assert len(refined.pixels) == 60 * 50
     side = 6  # of the blocks: 10 x 15 are at most 200, with 5 px they were 12 x 18
     first = np.flatnonzero((u.ravel() % side == 0) & (v.ravel() % side == 0))
-    groups = slow_groups(plates[first].astype(np.float32), 16, 0.6)
+    groups = rank_order_groups(plates[first].astype(np.float32), 16, 0.6)
     nearest = cdist(plates.astype(np.float32).astype(np.float64), plates[first].astype(np.float32)).argmin(axis=1)
     right = (groups == np.bincount(groups).argmax())[nearest]
     refined = RankOrder(threshold=0.6, max_points=200).refine(clusters_of(plates), FRAME)
@@ -142,10 +86,8 @@ def test_degenerate_clusters():
     assert len(RankOrder().refine(clusters_of(), FRAME)) == 0
 
 
-def test_exact_clusters_and_points_of_no_cluster_stay():
+def test_points_of_no_cluster_stay():
     clusters = clusters_of(blobs(0, 900))
-    exact = replace(clusters, exact=True)
-    assert RankOrder().refine(exact, FRAME) is exact
     cluster = np.where(np.arange(900) % 3 == 0, -1, 0).astype(np.int32)
     refined = RankOrder(threshold=0.3).refine(replace(clusters, cluster=cluster), FRAME)
     np.testing.assert_array_equal(refined.pixels[refined.cluster == -1], clusters.pixels[::3])

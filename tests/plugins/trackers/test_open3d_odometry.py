@@ -10,6 +10,7 @@ import pytest
 from framework.data import Frame, Pose
 from framework.errors import ConfigError
 from framework.geometry import exp_se3, inverse, rotation_angle
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.open3d_odometry import Method, Open3dOdometry, Reference
 from tests import registered
@@ -31,7 +32,7 @@ def frames() -> list[Frame]:
 
 
 def run(tracker: Open3dOdometry, frames: list[Frame]) -> list[Pose]:
-    fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     poses = []
     for frame in frames:
         pose = tracker.track(frame, fuser.scene)

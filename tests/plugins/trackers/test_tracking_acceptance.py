@@ -1,6 +1,6 @@
 """What the tracker promises: accuracy on scenes known exactly, and a map that no bad frame damages.
 
-The issue's longer runs (300 real frames, 200 synthetic ones) are rows of `pytest tests/benchmarks -k slam`.
+Longer runs (300 real frames, 200 synthetic ones) are rows of `pytest tests/benchmarks -k slam`.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
 from framework.interfaces import SceneMap
+from framework.registry import assemble
 from framework.synthetic.sequence import Synthetic
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
@@ -30,7 +31,7 @@ WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as
 
 def run(tracker: VoxelHashingIcp, frames: Iterable[Frame], voxel_size: float = VOXEL) -> tuple[list[Pose], SceneMap]:
     """As the pipeline does it: what is lost is not fused."""
-    fuser = BayesianTsdf(voxel_size=voxel_size)
+    fuser = assemble(BayesianTsdf, voxel_size=voxel_size)
     poses = []
     for frame in frames:
         poses.append(tracker.track(frame, fuser.scene))

@@ -7,15 +7,17 @@ import pytest
 
 from framework.data import Camera, Frame, Pose
 from framework.errors import ConfigError, DataError
-from framework.geometry import inverse, rotation_angle
+from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.interfaces import SceneMap
+from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.trackers import voxel_hashing_icp
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:
-    fuser = BayesianTsdf(voxel_size=0.02, max_depth=4.0)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     poses = []
     for frame in frames:
         pose = tracker.track(frame, fuser.scene)
@@ -169,3 +171,24 @@ def test_images_too_small_for_the_levels_are_refused_in_one_line() -> None:
     frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
     with pytest.raises(DataError, match=r"30x23 px are too small for tracker\.finest=0\.5"):
         VoxelHashingIcp(finest=0.5).track(frame, BayesianTsdf().scene)
+
+
+ONE_STEP = {"finest": 1.0, "relocalize": False, "iterations_coarse": 0, "iterations_middle": 0, "iterations_fine": 1}
+
+
+def test_a_pose_is_trusted_for_where_the_last_step_has_led() -> None:
+    """Before it, 6 cm away, too little agreed with the map; the single step goes most of that way."""
+    start = walk(1)[0]
+    frames = [room().frame(T, k) for k, T in enumerate((start, start @ exp_se3(np.array([0.06, 0, 0, 0, 0, 0]))))]
+    poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
+    assert not poses[1].lost
+    assert drift(poses[1], frames[1])[0] < 0.03
+
+
+def test_a_pose_is_lost_where_the_last_step_has_led_astray(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [room().frame(walk(1)[0], k) for k in range(2)]
+    assert not any(pose.lost for pose in run(VoxelHashingIcp(**ONE_STEP), frames)[0])
+    monkeypatch.setattr(voxel_hashing_icp, "_solved", lambda _: np.array([0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
+    poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
+    assert poses[1].lost
+    assert "agree with the map" in poses[1].reason

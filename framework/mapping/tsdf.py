@@ -1,27 +1,25 @@
-"""The parameters of fusers that keep a signed distance: those of any such map, and those of our own voxels."""
+"""The parameters of maps that keep a signed distance: those of any, and those of our own voxel blocks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.errors import DataError
-from framework.interfaces import MapFuser
 from framework.mapping.sensor import Sensor
+from framework.mapping.tsdf_volume import TsdfVolume
 from framework.parameters import check_bounds
 
 
 @dataclass
-class TsdfFuser(MapFuser):
-    """A TSDF whose voxels near the measured surface are labelled. A subclass says with what."""
+class Tsdf:
+    """A signed distance, truncated; its voxels near the measured surface are labelled."""
 
     voxel_size: float = 0.01  # m, > 0
     truncation: float = 4.0  # voxels, >= 1: the width of the band at depth 0
     min_depth: float = 0.2  # m, > 0
     max_depth: float = 5.0  # m, > min_depth: beyond it a structured-light sensor is off by voxels
     label_band: float = 2.0  # voxels, >= 1: labels go to voxels within this distance of the measured surface
-    min_area: float = 0.01  # m^2 of surface in the mesh, >= 0, for an instance to count: voxel_size^2 a vertex
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -31,21 +29,20 @@ class TsdfFuser(MapFuser):
             min_depth=(1e-3, 100.0),
             max_depth=(self.min_depth, 1000.0),
             label_band=(1.0, self.truncation),
-            min_area=(0.0, 1000.0),
         )
 
 
 @dataclass
-class VoxelHashingFuser(TsdfFuser):
-    """A TSDF in our own voxel blocks."""
+class VoxelHashing:
+    """A signed distance in our own voxel blocks."""
 
+    tsdf: Tsdf = field(default_factory=Tsdf)
     truncation_slope: float = 0.01  # m more for each m of depth, >= 0: noise grows with depth (VoxelHashing's value)
     max_weight: float = 200.0  # observations, 1 to 255: how slowly an old surface gives way
     full_weight_depth: float = 1.5  # m, > 0: farther readings weigh (full_weight_depth / depth)^2
     max_blocks: int = 400_000  # blocks of 8^3 voxels, > 0: 1.7 GB, about 1000 m^2 of surface at 1 cm
 
     def __post_init__(self) -> None:
-        super().__post_init__()
         check_bounds(
             self,
             truncation_slope=(0.0, 1.0),
@@ -54,23 +51,20 @@ class VoxelHashingFuser(TsdfFuser):
             max_blocks=(1, 2**31 // 512),
         )
 
-    @property
-    def sensor(self) -> Sensor:
-        """The parameters of integration, for a subclass to make its map with."""
-        return Sensor(
-            truncation=np.float32(self.truncation * self.voxel_size),
+    def new_volume(self) -> TsdfVolume:
+        """An empty one, to make a map with."""
+        tsdf = self.tsdf
+        sensor = Sensor(
+            truncation=np.float32(tsdf.truncation * tsdf.voxel_size),
             truncation_slope=np.float32(self.truncation_slope),
-            min_depth=np.float32(self.min_depth),
-            max_depth=np.float32(self.max_depth),
+            min_depth=np.float32(tsdf.min_depth),
+            max_depth=np.float32(tsdf.max_depth),
             max_weight=np.float32(self.max_weight),
             full_weight_depth=np.float32(self.full_weight_depth),
         )
+        return TsdfVolume(tsdf.voxel_size, sensor, self.max_blocks)
 
-
-def require_same_classes(known: tuple[str, ...], found: tuple[str, ...]) -> None:
-    """Raises DataError unless a frame's clusters have the label space of the map."""
-    if known != found:
-        raise DataError(
-            f"the map has {len(known)} classes and this frame's clusters have {len(found)} "
-            "others; use one detector, or map them to one label space"
-        )
+    @property
+    def near(self) -> float:
+        """m from the measured surface within which voxels are labelled."""
+        return self.tsdf.label_band * self.tsdf.voxel_size

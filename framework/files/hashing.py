@@ -1,0 +1,33 @@
+"""SHA-256 of arrays, files and folders."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Array
+
+
+def add_values(digest: hashlib._Hash, array: Array) -> None:
+    """Updates `digest` by the bytes of an array, row by row, whatever its order in memory."""
+    digest.update(np.ascontiguousarray(array).data)
+
+
+def add_array(digest: hashlib._Hash, array: Array) -> None:
+    """Likewise, and by what tells the same bytes of another array apart: its type and shape."""
+    digest.update(f"{array.dtype.str}{array.shape};".encode())
+    add_values(digest, array)
+
+
+def path_hash(path: Path) -> str:
+    """SHA-256 (hex) of a file's bytes, or of the names and the bytes of all files below a folder."""
+    if path.is_dir():
+        digest = hashlib.sha256()
+        for below in sorted(below for below in path.rglob("*") if below.is_file()):
+            name = below.relative_to(path).as_posix()
+            digest.update(f"{len(name)}:{name}:{path_hash(below)}".encode())
+        return digest.hexdigest()
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

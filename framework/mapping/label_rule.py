@@ -1,0 +1,108 @@
+"""What detections say of instances and classes, and how a rule writes that into the voxels of a map."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import Float32, Float64, Frame, PointClusters, Pose
+from framework.mapping.association import Matches
+from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
+from framework.mapping.instance_list import Confirmation
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.integration import SeenBlocks
+from framework.mapping.pixel_lists import PixelLists, keep_on_top
+from framework.mapping.tsdf import VoxelHashing
+from framework.parameters import check_bounds
+
+EXACT_BITS = 16  # by which exact storage's units are finer
+
+
+class LabelRule(NamedTuple):
+    """How what is said of a label is kept."""
+
+    combine: Combine  # how new evidence for a label meets the old one
+    logarithmic: bool  # whether evidence is the logarithm of what it says, or proportional to it
+    units: int = 64  # that class evidence of 1 has in compact storage
+
+
+class DetectionEvidence(NamedTuple):
+    """What a frame's N clusters say."""
+
+    instances: Float32  # (N,) for the instance that each is matched with, over any other
+    classes: Float64  # (N, C) of each class
+    absence: float = 0.0  # not above 0: for a matched instance, where it is not seen
+
+
+def floored_log(class_probabilities: Float32, floor: float) -> Float64:
+    """(N, C) log P(O_u = c | I_t) of eq. [7], the uniform distribution mixed in by a share of `floor`.
+
+    No zero of a detector kills a class for good: sums of these are the product of the distributions.
+    """
+    p = class_probabilities.astype(np.float64)
+    return np.asarray(np.log((1 - floor) * p + floor / max(p.shape[1], 1)))
+
+
+def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
+    """Each cluster counts with its weight (N,) for its instance and for its most likely class, and for nothing else."""
+    classes = np.zeros(clusters.class_probabilities.shape)
+    if len(clusters):
+        classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
+    return DetectionEvidence(weights, classes)
+
+
+@dataclass
+class LabeledVoxels:
+    """Our own voxels, with labels as evidence."""
+
+    hashing: VoxelHashing = field(default_factory=VoxelHashing)
+    confirmation: Confirmation = field(default_factory=Confirmation)
+    on_top: float = 0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
+    storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
+
+    def __post_init__(self) -> None:
+        check_bounds(self, on_top=(0.0, 1.0))
+
+    def new_map(self, rule: LabelRule) -> InstanceMap:
+        """An empty one for labels by this rule."""
+        return InstanceMap(self.hashing.new_volume(), self.confirmation, rule.combine, rule.logarithmic, self.storage)
+
+    def integrate(self, scene: InstanceMap, frame: Frame, pose: Pose) -> SeenBlocks:
+        """Integrates the frame into the TSDF. Raises MapFullError when the block budget is reached."""
+        return scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
+
+    def update(
+        self,
+        scene: InstanceMap,
+        seen: SeenBlocks,
+        points: PixelLists,
+        matches: Matches,
+        evidence: DetectionEvidence,
+        rule: LabelRule,
+    ) -> None:
+        """Gives the voxels that a frame saw what its clusters, in the lists of each pixel, say by this rule."""
+        points = keep_on_top(matches.clusters, points, matches.instance_ids, self.on_top)
+        matched = np.zeros(scene.table.last_id + 1, np.bool_)
+        matched[matches.instance_ids] = True
+        class_gain, named, bits = named_classes(evidence.classes, rule.logarithmic)
+        compact = self.storage is Storage.COMPACT
+        units = rule.units if compact else rule.units << EXACT_BITS
+        if compact and rule.combine is Combine.SUM:
+            class_gain = np.clip(class_gain, -MOST_GAIN / units, MOST_GAIN / units)
+        measurement = Measurement(
+            first_point=points.first,
+            next_point=points.next,
+            cluster=matches.clusters.cluster,
+            instance_id=matches.instance_ids,
+            instance_gain=evidence.instances,
+            absence=np.float32(evidence.absence),
+            matched=matched,
+            class_gain=np.rint(class_gain * units).astype(np.int64),
+            named_classes=named,
+            named_bit=bits,
+            combine=int(rule.combine),
+            most_units=MOST_UNITS if compact else 1 << 62,
+        )
+        scene.labels.update(seen, measurement)

@@ -1,0 +1,109 @@
+"""A TSDF in our own voxel blocks as maps have it: integration, its surface, views of it, and how it is saved."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
+from framework.errors import DataError
+from framework.mapping.integration import Integrator, SeenBlocks
+from framework.mapping.map_file import check_like, check_range
+from framework.mapping.meshing import Surface, SurfaceNets
+from framework.mapping.raycasting import render_near, render_surface
+from framework.mapping.sensor import Sensor
+from framework.mapping.voxel_grid import BLOCK_VOXELS, MOST_BLOCKS, VoxelGrid, find_solid_blocks
+
+BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
+NO_BLOCKS = np.zeros(0, np.int32)
+
+
+class TsdfVolume:
+    """Voxels, what integrates frames into them, and their surface, which is brought up to date as blocks change."""
+
+    def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
+        self.sensor = sensor
+        self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
+        self.integrator = Integrator(self.voxels, sensor)
+        self._nets: SurfaceNets | None = None  # made when a mesh is first asked for: who never asks pays nothing
+        self._mesh: InstanceMesh | None = None
+
+    @property
+    def voxel_size(self) -> float:
+        """m"""
+        return float(self.voxels.grid.voxel_size)
+
+    @property
+    def voxel_count(self) -> int:
+        return self.voxels.block_count * BLOCK_VOXELS
+
+    def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
+        """Integrates one frame and tells what it saw within `near` m of the measured surface.
+
+        Raises MapFullError when the block budget is reached; the frame is then not integrated.
+        """
+        seen = self.integrator.integrate(frame, T_world_camera, near)
+        self.changed(seen.blocks)
+        return seen
+
+    def changed(self, blocks: Int32 | None = None) -> None:
+        """To be called after the map was written: what was derived from it is out of date.
+
+        `blocks` (A,) are the numbers of those whose voxels were written; None = perhaps all.
+        """
+        self._mesh = None
+        if blocks is None:
+            self._nets = None
+        elif self._nets is not None:
+            self._nets.changed(blocks)
+
+    def surface(self) -> Surface:
+        """As it is now, without labels."""
+        self._nets = self._nets or SurfaceNets(self.voxels)
+        return self._nets.extract()
+
+    def mesh(self, label: Callable[[Surface], InstanceMesh]) -> InstanceMesh:
+        """The surface as it is now, with the labels that `label` gives it; kept until the map changes."""
+        if self._mesh is None:
+            self._mesh = label(self.surface())
+        return self._mesh
+
+    def render(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
+        return render_surface(self.voxels, self.sensor, camera, T_world_camera)
+
+    def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
+        return render_near(self.voxels, self.sensor, camera, T_world_camera, depth)
+
+    def saved(self) -> tuple[dict[str, Any], dict[str, Array]]:
+        """What a map's file has of it: a part of the header, and arrays."""
+        b = self.voxels.block_count
+        header = {
+            "voxel_size": self.voxel_size,
+            "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
+            "max_blocks": self.voxels.max_blocks,
+        }
+        return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
+
+    @classmethod
+    def load(cls, header: dict[str, Any], arrays: dict[str, Any], rows: int) -> TsdfVolume:
+        """The one that `saved` gave, of a map whose labels have so many rows. Raises DataError where it cannot be."""
+        sensor = Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()})
+        volume = cls(header["voxel_size"], sensor, header["max_blocks"])
+        check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
+        check_range("label_row", arrays["label_row"], -1, rows - 1)
+        volume.fill(arrays)
+        return volume
+
+    def fill(self, arrays: dict[str, Any]) -> None:
+        """Gives an empty one the voxels of a saved one, whose types and shapes were checked."""
+        coords = arrays["block_coords"]
+        check_range("block_coords", coords, -MOST_BLOCKS, MOST_BLOCKS - 1)
+        self.voxels.allocate(coords)
+        b = self.voxels.block_count
+        if b != len(coords):
+            raise DataError(f"block_coords must name each block once, found {b} of {len(coords)} blocks")
+        for name in arrays.keys() & set(BLOCK_ARRAYS):
+            getattr(self.voxels.grid, name)[:b] = arrays[name]
+        find_solid_blocks(self.voxels.grid, b)

@@ -1,0 +1,66 @@
+"""Which points leave their clusters for lying on a plane that bounds the scene."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.data import Bool, Int32, Int64, PointClusters, UInt8
+from framework.refinement.selection import PART
+
+
+def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: float) -> tuple[Bool, Bool]:
+    """(P,) which points stay; (H, W) which pixels are on a plane, and not in a cluster that keeps it.
+
+    `on_plane` (H, W) has 1 + the plane of each reading, 0 = none. A cluster loses those planes of which it holds at
+    most `max_own` of the readings.
+    """
+    kept, structure = _off_planes(clusters.cluster, clusters.pixels, on_plane, len(clusters), planes, max_own)
+    return kept, structure
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _off_planes(
+    cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float
+) -> tuple[Bool, Bool]:
+    """A pixel is in a cluster once, so its points on a plane are a part of the plane's."""
+    parts = (len(cluster) + PART - 1) // PART
+    labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
+    counts = np.zeros((parts, clusters + 1, planes + 1), np.int64)  # the last row is for points of no cluster
+    for part in prange(parts):
+        own = slice(part * PART, (part + 1) * PART)
+        _count_on_planes(cluster[own], pixels[own], on_plane, labels[own], counts[part])
+    on_planes = counts.sum(axis=0)
+    stays = np.ones((clusters + 1, planes + 1), np.bool_)
+    for label in range(1, planes + 1):
+        stays[:clusters, label] = on_planes[:clusters, label] > max_own * _count(on_plane.ravel(), label)
+    structure = on_plane > 0
+    for i in prange(len(cluster)):
+        kept[i] = stays[cluster[i], labels[i]]
+        if kept[i] and cluster[i] >= 0 and labels[i] > 0:
+            structure[pixels[i, 1], pixels[i, 0]] = False
+    return kept, structure
+
+
+@njit(cache=True, nogil=True)
+def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
+    """By runs of points that have cluster and plane in common: a counter raised point by point waits for itself."""
+    k, label, count = 0, 0, 0
+    for i in range(len(cluster)):
+        labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
+        if labels[i] != label or cluster[i] != k:
+            counts[k, label] += count
+            k, label, count = cluster[i], labels[i], 0
+        count += 1
+    counts[k, label] += count
+
+
+@njit(cache=True, nogil=True)
+def _count(labels: UInt8, label: int) -> int:
+    wanted, count = np.uint8(label), 0
+    for first in range(0, len(labels), 128):  # a count of bytes in a byte is the fastest there is
+        some = np.uint8(0)
+        for found in labels[first : first + 128]:
+            some += np.uint8(found == wanted)
+        count += int(some)
+    return count

@@ -1,0 +1,52 @@
+"""Digests are of what arrays and folders hold, and those that records keep stay what they are."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Array, SceneTruth
+from framework.evaluation.instances import PredictedInstances
+from framework.files.hashing import add_array, add_values, path_hash
+from framework.records.metrics import evaluation_metrics
+
+NUMBERS = np.arange(6, dtype=np.int16).reshape(2, 3)
+
+
+def digest_of(add: Callable[[hashlib._Hash, Array], None], array: Array) -> str:
+    digest = hashlib.sha256()
+    add(digest, array)
+    return digest.hexdigest()
+
+
+@pytest.mark.parametrize("add", [add_values, add_array])
+def test_order_in_memory_does_not_count(add: Callable[[hashlib._Hash, Array], None]) -> None:
+    assert digest_of(add, np.asfortranarray(NUMBERS)) == digest_of(add, NUMBERS) != digest_of(add, NUMBERS.T)
+
+
+@pytest.mark.parametrize("other", [NUMBERS.view(np.uint16), NUMBERS.reshape(3, 2), NUMBERS.astype(np.int32)])
+def test_type_and_shape_of_an_array_count(other: Array) -> None:
+    assert digest_of(add_array, other) != digest_of(add_array, NUMBERS)
+
+
+def test_values_are_the_bytes_alone() -> None:
+    assert digest_of(add_values, NUMBERS) == hashlib.sha256(b"\0\0\1\0\2\0\3\0\4\0\5\0").hexdigest()
+
+
+def test_a_file_and_a_folder(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"1")
+    of_file = hashlib.sha256(b"1").hexdigest()
+    assert path_hash(tmp_path / "a") == of_file
+    assert path_hash(tmp_path) == hashlib.sha256(f"1:a:{of_file}".encode()).hexdigest()
+
+
+def test_the_hash_of_the_truth_in_stored_records_still_holds() -> None:
+    points = np.array([[0, 0, 0], [1, 0, 0.5]], np.float32)
+    ids = np.array([0, 3], np.int32)
+    nothing = PredictedInstances(points, np.zeros(2, np.int32), np.zeros(0, np.int64), np.zeros(0), ())
+    metrics = evaluation_metrics(nothing, SceneTruth(points, ids, {3: "chair"}, ("chair", "desk")), "")
+    assert metrics["truth_sha256"] == "1e0d8c2f8e4a897f2869469f5484e1a85d701f89c5e08781ddde12813170287d"

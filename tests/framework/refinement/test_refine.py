@@ -1,0 +1,58 @@
+"""What holds for all refiners: true masks pass as they are, made-up pixels go no further."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Detections, Frame, PointClusters, Pose
+from framework.errors import DataError
+from framework.geometry import lift
+from framework.interfaces import ClusterRefiner
+from framework.refinement.refine import refine
+
+CAMERA = Camera(5, 4, 4.0, 4.0, 2.0, 1.5)
+FRAME = Frame(0, 0.0, np.zeros((4, 5, 3), np.uint8), np.ones((4, 5), np.float32), CAMERA)
+
+
+@dataclass
+class Moving(ClusterRefiner):
+    """Moves the last point to a pixel of its own choice."""
+
+    pixel: tuple[int, int]
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        pixels = clusters.pixels.copy()
+        pixels[-1] = self.pixel
+        return replace(clusters, pixels=pixels)
+
+
+def whole_image(exact: bool = False) -> PointClusters:
+    one = np.ones((1, 1), np.float32)
+    masks = np.ones((1, 4, 5), np.bool_)
+    return lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("wall",), exact), FRAME, Pose(np.eye(4)))
+
+
+def test_true_masks_pass_as_they_are() -> None:
+    exact = whole_image(exact=True)
+    assert refine(Moving((0, 0)), exact, FRAME) is exact
+    assert refine(Moving((0, 0)), whole_image(), FRAME).pixels[-1].tolist() == [0, 0]
+
+
+@pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
+def test_a_refiner_that_makes_a_pixel_up_is_refused(pixel: tuple[int, int]) -> None:
+    with pytest.raises(DataError, match=r"pixels must lie in the image of 5x4, found u in .*, v in ") as caught:
+        refine(Moving(pixel), whole_image(), FRAME)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_refiner_may_leave_nothing() -> None:
+    @dataclass
+    class Dropping(ClusterRefiner):
+        def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+            nothing = np.zeros((0, 3), np.float32)
+            return replace(clusters, points_world=nothing, pixels=clusters.pixels[:0], cluster=clusters.cluster[:0])
+
+    assert len(refine(Dropping(), whole_image(), FRAME).pixels) == 0
