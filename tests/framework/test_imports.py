@@ -13,7 +13,7 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = [
     ["errors"],
     ["data", "parameters", "settings"],
-    ["geometry", "label_spaces"],
+    ["geometry", "label_spaces", "sensor_noise"],
     ["interfaces"],
     ["files"],
     ["configs"],
