@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 from framework.commands.plugins import registered as options_of
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
-from framework.registry import STAGES, find_class, parameters, plugin_fields
+from framework.registry import STAGES, find_class, parameter_fields, parameters, plugin_fields
 from framework.tables.comparison import TableChoice
 from framework.training.trainer import Schedule
 from tests import registered
@@ -71,7 +71,7 @@ def test_every_value_in_the_yaml_is_the_default_of_the_class(stage: str, name: s
     for key in links:
         for link in node[key]:
             assert node[key][link] == registered.composed(stage, link)[stage], "a link is the option of its name"
-    fields = [field for field in dataclasses.fields(plugin_class) if field.init and field.name not in links]
+    fields = [field for name, (field, _) in parameter_fields(plugin_class).items() if name not in links]
     asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
     assert asked == [field.name for field in fields if default_of(field) == "???"]
     typed = parameters(stage, plugin_class, OmegaConf.merge(node, dict.fromkeys(asked, "given by the user")))
