@@ -11,19 +11,10 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes, look_up_instances
-from framework.mapping.evidence import INSTANCE_SLOTS, Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.evidence import INSTANCE_SLOTS, NO_CLASS, Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import (
-    check_classes,
-    check_instances,
-    check_like,
-    faults_of,
-    plain_table,
-    read_map,
-    table_of,
-    write_map,
-)
+from framework.mapping.map_file import check_known, check_like, faults_of, plain_table, read_map, table_of, write_map
 from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import render
 from framework.mapping.sensor import pinhole
@@ -138,8 +129,8 @@ class InstanceMap(SceneMap):
             free = np.empty((0, BLOCK_VOXELS, slots), np.float32)
             free_rows = scene.labels.evidence._replace(instance_ids=free.astype(np.int32), instance_value=free)
             check_like(arrays, free_rows._asdict(), len(arrays["instance_ids"]))
-            check_classes(arrays["class_ids"], len(classes))
-            check_instances("instance_ids", arrays["instance_ids"], table)
+            check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
+            check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
             scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
             scene.labels.row_count = len(scene.labels.evidence.instance_ids)
             scene.labels.evicted = header["evicted"]

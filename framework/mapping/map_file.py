@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -13,10 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Array, Int32, UInt8, check_array
+from framework.data import Array, check_array
 from framework.errors import DataError, InstanceMapError
 from framework.files.whole_files import written_whole
-from framework.mapping.evidence import NO_CLASS, Combine
+from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceTable
 
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
@@ -74,24 +74,19 @@ def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], lengt
         check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
 
 
-def check_range(name: str, array: Array, low: int, high: int) -> None:
-    """Raises DataError unless all values lie in [low, high]."""
-    if array.size and not (low <= array.min() and array.max() <= high):
-        raise DataError(f"{name} must be in [{low}, {high}], found {array.min()} to {array.max()}")
+def check_known(name: str, array: Array, known: Iterable[int]) -> None:
+    """Raises DataError unless all numbers in the array, which kernels take for places in others, are known ones."""
+    unknown = array[~np.isin(array, list(known))]
+    if unknown.size:
+        raise DataError(f"{name} has {unknown[0]}, which is none of the map's")
 
 
-def check_classes(class_ids: UInt8, classes: int) -> None:
-    """Raises DataError unless the slots of voxels hold numbers of classes, or are free."""
-    check_range("class_ids", np.where(class_ids == NO_CLASS, 0, class_ids), 0, max(classes - 1, 0))
-
-
-def check_instances(name: str, instance_ids: Int32, table: InstanceTable) -> None:
-    """Raises DataError unless the ids are 0 or of instances in the table."""
-    check_range(name, instance_ids, 0, max(table.records, default=0))
-    known = np.zeros(max(table.records, default=0) + 1, np.bool_)
-    known[[0, *table.records]] = True
-    if not known[instance_ids].all():
-        raise DataError(f"{name} has an instance that the table does not have")
+def check_blocks(coords: Any) -> None:
+    """Raises DataError unless blocks (B, 3) lie within 2^20 blocks of the origin, and each is named once."""
+    if len(coords) and np.abs(coords, dtype=np.int64).max() >= 1 << 20:
+        raise DataError(f"block_coords must be within 2^20 of 0, found {coords.min()} to {coords.max()}")
+    if len(np.unique(coords, axis=0)) < len(coords):
+        raise DataError("block_coords has a block twice")
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
@@ -122,5 +117,6 @@ def table_of(plain: Mapping[str, Any]) -> InstanceTable:
         record.observed_in = set(record.observed_in)
         record.in_view = FrameSet(entry["in_view"])
         table.records[record.id] = record
-        check_range("the table's ids", np.array(record.id), 1, table.last_id)
+        if not 0 < record.id <= table.last_id:
+            raise DataError(f"the table's ids must be in [1, {table.last_id}], found {record.id}")
     return table

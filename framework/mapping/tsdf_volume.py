@@ -8,13 +8,12 @@ from typing import Any
 import numpy as np
 
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
-from framework.errors import DataError
 from framework.mapping.integration import Integrator, SeenBlocks
-from framework.mapping.map_file import check_like, check_range
+from framework.mapping.map_file import check_blocks, check_known, check_like
 from framework.mapping.meshing import Surface, SurfaceNets
 from framework.mapping.raycasting import render_near, render_surface
 from framework.mapping.sensor import Sensor
-from framework.mapping.voxel_grid import BLOCK_VOXELS, MOST_BLOCKS, VoxelGrid, find_solid_blocks
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)
@@ -92,18 +91,16 @@ class TsdfVolume:
         sensor = Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()})
         volume = cls(header["voxel_size"], sensor, header["max_blocks"])
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
-        check_range("label_row", arrays["label_row"], -1, rows - 1)
+        check_known("label_row", arrays["label_row"], range(-1, rows))
         volume.fill(arrays)
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
         """Gives an empty one the voxels of a saved one, whose types and shapes were checked."""
         coords = arrays["block_coords"]
-        check_range("block_coords", coords, -MOST_BLOCKS, MOST_BLOCKS - 1)
+        check_blocks(coords)
         self.voxels.allocate(coords)
         b = self.voxels.block_count
-        if b != len(coords):
-            raise DataError(f"block_coords must name each block once, found {b} of {len(coords)} blocks")
         for name in arrays.keys() & set(BLOCK_ARRAYS):
             getattr(self.voxels.grid, name)[:b] = arrays[name]
         find_solid_blocks(self.voxels.grid, b)

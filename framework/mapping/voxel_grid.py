@@ -50,7 +50,6 @@ def one_more(count, condition):
 _KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
 _KEY_OFFSET = 1 << (_KEY_BITS - 1)
 _KEY_MASK = (1 << _KEY_BITS) - 1
-MOST_BLOCKS = _KEY_OFFSET  # from the origin along each axis
 
 
 class Grid(NamedTuple):

@@ -26,7 +26,7 @@ from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
 from framework.mapping.evidence import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS, best_first, named_classes
 from framework.mapping.integration import SeenBlocks
-from framework.mapping.map_file import check_classes, check_like
+from framework.mapping.map_file import check_known, check_like
 from framework.mapping.pixel_lists import PixelLists
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
@@ -220,7 +220,7 @@ class ClassRows:
         free = self.evidence._asdict()
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
-        check_classes(arrays["class_ids"], classes)
+        check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
 

@@ -37,7 +37,7 @@ from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.map_file import (
-    check_instances,
+    check_known,
     check_like,
     faults_of,
     plain_table,
@@ -236,7 +236,7 @@ class ObjectMap(SceneMap):
             scene.table = table_of(header["table"])
             counts = {int(key): blocks for key, blocks in header["objects"].items()}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
-            check_instances("objects", np.array([*counts], np.int32), scene.table)
+            check_known("objects", np.array([*counts]), scene.table.records)
             first = 0
             for key, blocks in counts.items():
                 volume = scene.volumes[key] = scene._empty_volume()

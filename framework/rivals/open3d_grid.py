@@ -17,10 +17,9 @@ import open3d as o3d
 from open3d.core import Tensor
 
 from framework.data import Array, Bool, Camera, Float32, Float64, Frame, Int32, Int64, SurfaceView, UInt8
-from framework.errors import DataError, MapFullError
+from framework.errors import MapFullError
 from framework.geometry import inverse
-from framework.mapping.map_file import check_like, check_range
-from framework.mapping.voxel_grid import MOST_BLOCKS
+from framework.mapping.map_file import check_blocks, check_like
 
 ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three as Open3D's `integrate` wants them
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
@@ -288,12 +287,10 @@ class BlockGrid:
         expected = {"block_coords": np.zeros((0, 3), np.int32), **values}
         check_like(arrays, expected, len(arrays["block_coords"]))
         if len(arrays["block_coords"]):
-            check_range("block_coords", arrays["block_coords"], -MOST_BLOCKS, MOST_BLOCKS - 1)
+            check_blocks(arrays["block_coords"])
             coords = Tensor(arrays["block_coords"])
             self._make_room(coords)
-            blocks, new = (tensor.numpy() for tensor in self.blocks.hashmap().activate(coords))
-            if not new.all():
-                raise DataError(f"block_coords must name each block once, found {new.sum()} of {len(new)} blocks")
+            blocks = self.blocks.hashmap().activate(coords)[0].numpy()
             for name in ATTRIBUTES:
                 self.blocks.attribute(name).numpy()[blocks] = arrays[name]
 

@@ -16,7 +16,7 @@ from framework.mapping.association import agreed_classes
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.map_file import (
-    check_instances,
+    check_known,
     faults_of,
     plain_table,
     read_map,
@@ -149,5 +149,5 @@ class Open3DMap(SceneMap):
             scene.table = table_of(header["table"])
             scene.grid.frames = header["frames"]
             scene.grid.fill(arrays)
-            check_instances("instance", arrays["instance"], scene.table)
+            check_known("instance", arrays["instance"], [0, *scene.table.records])
         return scene

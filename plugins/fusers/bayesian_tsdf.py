@@ -42,12 +42,12 @@ class BayesianTsdf(MapFuser):
         matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
         seen = self.voxels.integrate(self.scene, frame, pose)
         evidence = self.evidence(clusters)
-        self.voxels.update(self.scene, seen, points, matches, evidence, RULE)
+        self.voxels.update(self.scene, seen, points, matches, evidence, RULE)  # the sums of eqs. [7] and [8]
         self.association.observe(self.scene.table, matches, evidence.classes)
         self.association.merge(self.scene, matches)
 
     def evidence(self, clusters: PointClusters) -> DetectionEvidence:
-        """Eqs. [7] and [8]: log P(O_u | I_t), that of the matched instance over any other's."""
+        """log P(O_u | I_t) of eqs. [7] and [8], that of the matched instance over any other's."""
         scores = np.maximum(clusters.scores, 2 * self.instance_floor)  # a detection never speaks against itself
         return DetectionEvidence(
             instances=np.asarray(np.log(scores / self.instance_floor), np.float32),
