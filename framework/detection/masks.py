@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numba import njit
 
-from framework.data import Bool, Float32, Float64, Int32
+from framework.data import Bool, Detections, Float32, Float64, Int32
 
 
 def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
@@ -48,6 +48,15 @@ def suppress_duplicates(masks: Bool, iou: float) -> Int32:
     for i in range(1, len(masks)):
         survives[i] &= not (covered[i, :i] & survives[:i]).any()
     return np.flatnonzero(survives).astype(np.int32)
+
+
+def without_duplicates(
+    masks: Bool, scores: Float32, class_probabilities: Float32, classes: tuple[str, ...], iou: float
+) -> Detections:
+    """The detections, best first, whose masks (N, H, W) `suppress_duplicates` leaves, in tight boxes."""
+    kept = suppress_duplicates(masks, iou)
+    masks = masks[kept]
+    return Detections(masks, tight_boxes(masks), scores[kept], class_probabilities[kept], classes)
 
 
 @njit(cache=True, nogil=True)

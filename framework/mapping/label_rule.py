@@ -7,12 +7,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Float32, Float64, Frame, PointClusters, Pose
+from framework.data import Float32, Float64, PointClusters
 from framework.mapping.association import Matches
 from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.integration import SeenBlocks
+from framework.mapping.instance_table import InstanceTable
 from framework.mapping.pixel_lists import PixelLists, keep_on_top
 from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
@@ -69,29 +69,19 @@ class LabeledVoxels:
         """An empty one for labels by this rule."""
         return InstanceMap(self.hashing.new_volume(), self.confirmation, rule.combine, rule.logarithmic, self.storage)
 
-    def integrate(self, scene: InstanceMap, frame: Frame, pose: Pose) -> SeenBlocks:
-        """Integrates the frame into the TSDF. Raises MapFullError when the block budget is reached."""
-        return scene.volume.integrate(frame, pose.T_world_camera, self.hashing.near)
-
-    def update(
-        self,
-        scene: InstanceMap,
-        seen: SeenBlocks,
-        points: PixelLists,
-        matches: Matches,
-        evidence: DetectionEvidence,
-        rule: LabelRule,
-    ) -> None:
-        """Gives the voxels that a frame saw what its clusters, in the lists of each pixel, say by this rule."""
+    def measurement(
+        self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
+    ) -> Measurement:
+        """What a frame's clusters, in the lists of each pixel, say of the voxels by this rule."""
         points = keep_on_top(matches.clusters, points, matches.instance_ids, self.on_top)
-        matched = np.zeros(scene.table.last_id + 1, np.bool_)
+        matched = np.zeros(table.last_id + 1, np.bool_)
         matched[matches.instance_ids] = True
         class_gain, named, bits = named_classes(evidence.classes, rule.logarithmic)
         compact = self.storage is Storage.COMPACT
         units = rule.units if compact else rule.units << EXACT_BITS
         if compact and rule.combine is Combine.SUM:
             class_gain = np.clip(class_gain, -MOST_GAIN / units, MOST_GAIN / units)
-        measurement = Measurement(
+        return Measurement(
             first_point=points.first,
             next_point=points.next,
             cluster=matches.clusters.cluster,
@@ -105,4 +95,3 @@ class LabeledVoxels:
             combine=int(rule.combine),
             most_units=MOST_UNITS if compact else 1 << 62,
         )
-        scene.labels.update(seen, measurement)

@@ -23,10 +23,6 @@ class AbsolutePose:
     T_world_camera: Float64  # (4, 4)
     inliers: Bool  # (M,) of the matches: those that it explains
 
-    @property
-    def inlier_count(self) -> int:
-        return int(np.count_nonzero(self.inliers))
-
 
 @dataclass
 class AbsolutePoseEstimator:

@@ -17,7 +17,7 @@ from framework.detection.fusion import fuse_batch_norms
 from framework.detection.mask_rcnn.checkpoint import read_network
 from framework.detection.mask_rcnn.network import select
 from framework.detection.mask_rcnn.published_weights import find_network
-from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
+from framework.detection.masks import paste_masks, without_duplicates
 from framework.errors import DataError
 from framework.interfaces import Detector
 from framework.parameters import require
@@ -106,16 +106,9 @@ class MaskRCNNDetector(Detector):
             frame.camera.shape,
             self.mask_threshold,
         )
-        kept = suppress_duplicates(masks, self.agnostic_nms)
-        masks, proposal, label = masks[kept], proposal[kept], label[kept]
         objects = probabilities[proposal, 1:]
-        return Detections(
-            masks=masks,
-            boxes=tight_boxes(masks),
-            scores=probabilities[proposal, label],
-            class_probabilities=objects / objects.sum(axis=1, keepdims=True),
-            classes=self.classes,
-        )
+        shares = objects / objects.sum(axis=1, keepdims=True)
+        return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms)
 
     def _resize(self, frame: Frame) -> Tensor:
         """The network's input before normalization (1, 3, H, W), RGB, 0..255.

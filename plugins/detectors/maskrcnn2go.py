@@ -20,7 +20,7 @@ from framework.data import Detections, Float32, Frame, Int32
 from framework.detection.boxes import anchor_grid, clip, decode, to_original_image
 from framework.detection.device import torch_device
 from framework.detection.mask_rcnn.roi_align import roi_align
-from framework.detection.masks import paste_masks, suppress_duplicates, tight_boxes
+from framework.detection.masks import paste_masks, without_duplicates
 from framework.detection.nms import suppress_boxes
 from framework.errors import DataError
 from framework.files.search_paths import candidates
@@ -107,16 +107,9 @@ class MaskRCNN2Go(Detector):
         masks = paste_masks(
             grids, to_original_image(boxes, shape, frame.camera.shape), frame.camera.shape, self.mask_threshold
         )
-        kept = suppress_duplicates(masks, self.agnostic_nms)
-        masks, proposal, label = masks[kept], proposal[kept], label[kept]
         objects = probabilities[proposal, 1:]
-        return Detections(
-            masks=masks,
-            boxes=tight_boxes(masks),
-            scores=probabilities[proposal, label],
-            class_probabilities=objects / objects.sum(axis=1, keepdims=True),
-            classes=self.classes,
-        )
+        shares = objects / objects.sum(axis=1, keepdims=True)
+        return without_duplicates(masks, probabilities[proposal, label], shares, self.classes, self.agnostic_nms)
 
     def _resize(self, frame: Frame) -> Tensor:
         """The network's input (1, 3, H, W), RGB, 0..255."""

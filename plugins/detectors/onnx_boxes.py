@@ -11,7 +11,7 @@ from framework.detection.box_masks import masks_in_boxes
 from framework.detection.candidates import Layout, decode
 from framework.detection.image_network import ImageNetwork
 from framework.detection.letterbox import Placement
-from framework.detection.masks import suppress_duplicates, tight_boxes
+from framework.detection.masks import without_duplicates
 from framework.interfaces import Detector
 from framework.label_spaces import read_labels, to_coco
 from framework.parameters import require
@@ -91,14 +91,8 @@ class OnnxBoxes(Detector):
             self.min_readings,
         )
         self._count(frame, found)
-        kept = suppress_duplicates(masks, self.agnostic_nms)
-        return Detections(
-            masks=masks[kept],
-            boxes=tight_boxes(masks[kept]),
-            scores=candidates.class_scores[best[kept]].max(axis=1).clip(0, 1),
-            class_probabilities=class_probabilities[kept],
-            classes=self.classes,
-        )
+        scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
+        return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms)
 
     def _count(self, frame: Frame, found: Bool) -> None:
         """Says aloud what is dropped: the first time as a warning, then in the debug log."""

@@ -9,7 +9,7 @@ from framework.data import Detections, Float32, Frame
 from framework.detection.candidates import Candidates, decode_yolo, described, rows_of
 from framework.detection.image_network import ImageNetwork
 from framework.detection.letterbox import Placement
-from framework.detection.masks import suppress_duplicates, tight_boxes
+from framework.detection.masks import without_duplicates
 from framework.detection.onnx_network import Outputs
 from framework.detection.prototype_masks import masks_from_prototypes
 from framework.errors import DataError
@@ -83,14 +83,8 @@ class OnnxSegmentation(Detector):
             frame.camera.shape,
             self.mask_threshold,
         )
-        kept = suppress_duplicates(masks, self.agnostic_nms)
-        return Detections(
-            masks=masks[kept],
-            boxes=tight_boxes(masks[kept]),
-            scores=candidates.class_scores[best[kept]].max(axis=1).clip(0, 1),
-            class_probabilities=class_probabilities[kept],
-            classes=self.classes,
-        )
+        scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
+        return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms)
 
     def _decode(self, outputs: Outputs) -> tuple[Candidates, Float32, Float32]:
         """The K candidates, their coefficients (K, M), and the prototypes (M, h, w)."""

@@ -18,7 +18,7 @@ from torch.nn import functional
 from framework.data import Detections, Float32, Frame, UInt8
 from framework.detection.device import torch_device
 from framework.detection.fingerprint import fingerprint
-from framework.detection.masks import suppress_duplicates, tight_boxes
+from framework.detection.masks import without_duplicates
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
 from framework.label_spaces import to_coco
@@ -146,14 +146,7 @@ class TransformersSegmentation(Detector):
         order = np.argsort(-scores, kind="stable")
         order = order[scores[order] > self.score_threshold]
         masks, scores, candidates = inside.cpu().numpy()[order], scores[order], candidates[order]
-        kept = suppress_duplicates(masks, self.agnostic_nms)
-        return Detections(
-            masks=masks[kept],
-            boxes=tight_boxes(masks[kept]),
-            scores=scores[kept],
-            class_probabilities=class_probabilities[candidates[kept]],
-            classes=self.classes,
-        )
+        return without_duplicates(masks, scores, class_probabilities[candidates], self.classes, self.agnostic_nms)
 
     def _predict(self, pixels: Tensor) -> tuple[Float32, Tensor]:
         """The queries' class logits (Q, C or C + 1), and their mask logits (Q, h, w) float32 on the device."""

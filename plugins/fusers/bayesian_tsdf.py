@@ -40,9 +40,10 @@ class BayesianTsdf(MapFuser):
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.association.look_up(self.scene, frame, pose, clusters)
         matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
-        seen = self.voxels.integrate(self.scene, frame, pose)
+        seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         evidence = self.evidence(clusters)
-        self.voxels.update(self.scene, seen, points, matches, evidence, RULE)  # the sums of eqs. [7] and [8]
+        measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
+        self.scene.labels.update(seen, measurement)  # the sums of eqs. [7] and [8]
         self.association.observe(self.scene.table, matches, evidence.classes)
         self.association.merge(self.scene, matches)
 

@@ -32,8 +32,9 @@ class MaxConfidence(MapFuser):
         points = list_points_by_pixel(clusters, frame.depth.shape)
         overlaps = self.association.look_up(self.scene, frame, pose, clusters)
         matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
-        seen = self.voxels.integrate(self.scene, frame, pose)
+        seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         evidence = vote_for_best(clusters, np.maximum(clusters.scores, np.finfo(np.float32).tiny))  # 0 is no evidence
-        self.voxels.update(self.scene, seen, points, matches, evidence, RULE)
+        measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
+        self.scene.labels.update(seen, measurement)
         self.association.observe(self.scene.table, matches, evidence.classes)
         self.association.merge(self.scene, matches)

@@ -28,8 +28,7 @@ import numpy as np
 from framework.data import Camera, Float64, UInt8, UInt16
 from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, FrameError
-from framework.files.image_files import decode_color
-from framework.files.image_header import MOST_PIXELS
+from framework.files.image_files import MOST_PIXELS, decode_color
 from framework.files.matrix_file import PrintedMatrix
 
 VERSION = 4
