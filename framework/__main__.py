@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from difflib import get_close_matches
 from importlib import import_module
@@ -20,6 +21,8 @@ COMMANDS = {
     "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
 }
 """What each does. A command is the module of framework.commands with its name."""
+
+PRINTING = ("tables", "figures", "evaluate", "plugins")  # what others may be reading: `| head` ends them without a word
 
 HELP = """\
 {program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video
@@ -53,6 +56,8 @@ def main() -> None:
         sys.exit(f"error: there is no command {word!r}; {suggestion}")
     else:
         word = "run"
+    if word in PRINTING and hasattr(signal, "SIGPIPE"):  # Windows has none
+        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     import_module(f"framework.commands.{word.replace('-', '_')}").main()
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import logging
 import os
-import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -61,12 +60,6 @@ def show_traceback(error: BaseException) -> None:
     """Where an error comes from, for whoever asks with `debug=true`; it precedes the line that says what is wrong."""
     if "debug=true" in sys.argv:
         traceback.print_exception(error)
-
-
-def quiet_when_cut_off() -> None:
-    """Lets `| head` end this process without a word."""
-    if hasattr(signal, "SIGPIPE"):  # not on Windows
-        signal.signal(signal.SIGPIPE, signal.SIG_DFL)
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:

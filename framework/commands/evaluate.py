@@ -16,7 +16,6 @@ from framework.commands.command_line import (
     KNOWN_ERRORS,
     arguments,
     one_line_errors,
-    quiet_when_cut_off,
     show_traceback,
 )
 from framework.configs import one_line
@@ -28,7 +27,6 @@ from framework.tables.layouts import head
 
 
 def main() -> None:
-    quiet_when_cut_off()
     parser = argparse.ArgumentParser(
         description="Evaluates the instances of stored runs anew, from mesh.ply and instances.json, and replaces these "
         "figures in metrics.json; prints what has changed. All others stay, those of the trajectory too: they need "

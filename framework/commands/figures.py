@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from framework.commands.command_line import print_for_directories, quiet_when_cut_off
+from framework.commands.command_line import print_for_directories
 from framework.figures.experiment_figure import write_figure
 
 
 def main() -> None:
-    quiet_when_cut_off()
     print_for_directories(
         "Writes figure.png and figure.pdf into DIR, from the records of the experiment's runs below it.",
         "where an experiment's runs went",

@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 from hydra.types import RunMode
 from omegaconf import OmegaConf
 
-from framework.commands.command_line import arguments, one_line_errors, quiet_when_cut_off
+from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
 from framework.registry import STAGES, find_class, parameter_fields, plugin_fields
@@ -123,7 +123,6 @@ def describe(option: Option) -> str:
 
 
 def main() -> None:
-    quiet_when_cut_off()
     parser = argparse.ArgumentParser(description="Lists the registered plugins.")
     parser.add_argument("stage", nargs="?", choices=STAGES, help="only this stage")
     parser.add_argument("name", nargs="?", help="only this option")

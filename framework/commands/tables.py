@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from framework.commands.command_line import print_for_directories, quiet_when_cut_off
+from framework.commands.command_line import print_for_directories
 from framework.tables.experiment_tables import write_tables
 
 
 def main() -> None:
-    quiet_when_cut_off()
     print_for_directories(
         "Writes table.md, table.tex and table.csv into DIR, from the records of the runs below it.",
         "where a sweep or several runs went",

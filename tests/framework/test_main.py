@@ -49,7 +49,7 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
             "dataset.frames=many",
             ["ERROR", "CornerRoom", "frames", "'many'", "Integer"],
         ),
-        ("refiner._target_=tests.scenes.corner_room.GivenPose", ["ERROR", "refiner", "ClusterRefiner"]),
+        ("refiner._target_=this.GivenPose", ["ERROR", "refiner this.GivenPose", "no registered option of refiner"]),
         ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
         ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
         ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),
