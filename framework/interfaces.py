@@ -153,10 +153,10 @@ class SceneMap(ABC):
         """The objects found so far, by id. Vertex indices refer to `mesh()` of the same map."""
 
     @abstractmethod
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         """Writes the map to one file, whole or not at all."""
 
     @classmethod
     @abstractmethod
-    def load(cls, path: Path) -> SceneMap:
+    def load(cls, path: Path | str) -> SceneMap:
         """The map that `save` wrote. Raises DataError when the file is not such a map or was damaged."""

@@ -20,7 +20,7 @@ from framework.api import load_map
 from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
 from framework.geometry import lift
-from framework.interfaces import Detector
+from framework.interfaces import Detector, SceneMap
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
 from tests import option_files, registered
@@ -50,6 +50,15 @@ def test_the_loop_maps_a_sequence() -> None:
     exec(block("python", "for frame in sequence"), {"sequence": CornerRoom(), "lift": lift, **stages})
     assert len(fuser.scene.vertices) == 6
     assert set(fuser.scene.instances()) == {1, 2}
+
+
+def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"frames": CornerRoom()}
+    exec(block("python", "mapper = Mapper"), names)
+    scene = names["scene"]
+    assert isinstance(scene, SceneMap)
+    assert len(scene.mesh().vertices) > 1000
 
 
 @pytest.fixture

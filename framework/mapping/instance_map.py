@@ -102,7 +102,7 @@ class InstanceMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         return list_instances(self.mesh(), self.table)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         voxels, arrays = self.volume.saved()
         header = {
             "format": FORMAT,
@@ -118,7 +118,7 @@ class InstanceMap(SceneMap):
         write_map(path, header, arrays)
 
     @classmethod
-    def load(cls, path: Path) -> InstanceMap:
+    def load(cls, path: Path | str) -> InstanceMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
         with faults_of(path):
             table, storage, classes = table_of(header["table"]), Storage[header["storage"]], tuple(header["classes"])

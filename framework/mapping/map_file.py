@@ -22,11 +22,11 @@ from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceT
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
 
 
-def write_map(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Writes an .npz as np.load reads it, lightly compressed: a third of the arrays' size. It has no time in it."""
     encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
     with (
-        written_whole(path) as temporary,
+        written_whole(Path(path)) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
     ):
         for name, array in {"header": encoded, **arrays}.items():
@@ -34,7 +34,7 @@ def write_map(path: Path, header: Mapping[str, Any], arrays: Mapping[str, Array]
                 np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def read_map(path: Path, expected_format: object, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
     """The header and the named arrays of a saved map.
 
     Raises DataError for a file that is none, for another format and for a checksum that fails.
@@ -56,7 +56,7 @@ def read_map(path: Path, expected_format: object, names: Sequence[str]) -> tuple
 
 
 @contextmanager
-def faults_of(path: Path) -> Iterator[None]:
+def faults_of(path: Path | str) -> Iterator[None]:
     """Turns what goes wrong while a map is made from a file into a DataError that names the file."""
     try:
         yield

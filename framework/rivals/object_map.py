@@ -213,7 +213,7 @@ class ObjectMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         return list_instances(self.mesh(), self.table)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         voxels, arrays = self.background.saved()
         header = {
             "format": FORMAT,
@@ -228,7 +228,7 @@ class ObjectMap(SceneMap):
         write_map(path, header, arrays)
 
     @classmethod
-    def load(cls, path: Path) -> ObjectMap:
+    def load(cls, path: Path | str) -> ObjectMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
         with faults_of(path):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation(**header["confirmation"]))

@@ -129,7 +129,7 @@ class Open3DMap(SceneMap):
     def instances(self) -> Mapping[int, Instance]:
         return list_instances(self.mesh(), self.table)
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         header = {
             "format": FORMAT,
             "settings": asdict(self.grid.settings),
@@ -141,7 +141,7 @@ class Open3DMap(SceneMap):
         write_map(path, header, self.grid.arrays())
 
     @classmethod
-    def load(cls, path: Path) -> Open3DMap:
+    def load(cls, path: Path | str) -> Open3DMap:
         header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
         with faults_of(path):
             scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))

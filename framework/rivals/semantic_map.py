@@ -132,7 +132,7 @@ class SemanticMap(SceneMap):
             )
         return instances
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         header, arrays = self.volume.saved()
         header |= {
             "format": FORMAT,
@@ -144,7 +144,7 @@ class SemanticMap(SceneMap):
         write_map(path, header, arrays | self.labels.saved())
 
     @classmethod
-    def load(cls, path: Path) -> SemanticMap:
+    def load(cls, path: Path | str) -> SemanticMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
         with faults_of(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))

@@ -198,7 +198,7 @@ class GridMap(SceneMap):
             found[key] = Instance(key, sure, float(sure.max()), len(self.vertices), 0, 0, vertices, box, box)
         return found
 
-    def save(self, path: Path) -> None:
+    def save(self, path: Path | str) -> None:
         mesh = self.mesh()
         with written_whole(path) as temporary:
             np.savez(
@@ -210,7 +210,7 @@ class GridMap(SceneMap):
             )
 
     @classmethod
-    def load(cls, path: Path) -> GridMap:
+    def load(cls, path: Path | str) -> GridMap:
         with np.load(path) as saved:
             return cls([saved["vertices"]], [saved["colors"]], [saved["ids"]], [saved["triangles"]])
 
