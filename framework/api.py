@@ -2,24 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import json
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+from omegaconf import DictConfig
 
 from framework.configs import composed
-from framework.data import (
-    Camera,
-    Detections,
-    Frame,
-    Instance,
-    InstanceMesh,
-    PointClusters,
-    Pose,
-    View,
-)
+from framework.data import Camera, Detections, Frame, Instance, InstanceMesh, PointClusters, Pose, View
+from framework.detection.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
 from framework.journal import Journal
@@ -53,11 +47,22 @@ __all__ = [
 ]
 
 
+def pipeline_of(config: DictConfig) -> Pipeline:
+    """The stages that a config names, the detector behind the cache that it asks for."""
+    return Pipeline(
+        detector=with_cache(build(Detector, config.detector), config),
+        tracker=build(PoseTracker, config.tracker),
+        refiner=build(ClusterRefiner, config.refiner),
+        fuser=build(MapFuser, config.fuser),
+        ahead=config.ahead,
+    )
+
+
 class Mapper:
     """Maps frames as they come: `Mapper("detector=maskrcnn2go", "fuser.voxel_size=0.02")`.
 
     The arguments are those of a run on the command line, with its defaults; `dataset` is left out, since the frames are
-    yours. Raises ConfigError for a name or a value that there is not.
+    yours, and `ahead` and `resume` mean nothing here. Raises ConfigError for a name or a value that there is not.
     """
 
     scene: SceneMap  # the map: mesh(), render(), instances(), save()
@@ -65,12 +70,7 @@ class Mapper:
     def __init__(self, *overrides: str) -> None:
         config = composed("~dataset", *overrides)
         Settings.of(config).apply()
-        self.pipeline = Pipeline(
-            detector=build(Detector, config.detector),
-            tracker=build(PoseTracker, config.tracker),
-            refiner=build(ClusterRefiner, config.refiner),
-            fuser=build(MapFuser, config.fuser),
-        )
+        self.pipeline = pipeline_of(config)
         self.scene = self.pipeline.fuser.scene
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
 
@@ -81,6 +81,8 @@ class Mapper:
         FrameError when the frame cannot be used, which leaves the map as it was, and MapFullError at the end of
         `fuser.max_blocks`.
         """
+        self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
+        self._journal.tracked.clear()
         return self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
 
     def instances(self) -> Mapping[int, Instance]:
@@ -94,18 +96,16 @@ def load_map(path: Path | str) -> SceneMap:
     Raises DataError when the file is none or was damaged.
     """
     from framework.mapping import instance_map
+    from framework.mapping.map_file import faults_of
     from framework.rivals import object_map, open3d_map, semantic_map
 
-    kinds: dict[object, type[SceneMap]] = {
-        instance_map.FORMAT: instance_map.InstanceMap,
+    kinds: dict[str, type[SceneMap]] = {
+        str(instance_map.FORMAT): instance_map.InstanceMap,
         object_map.FORMAT: object_map.ObjectMap,
         open3d_map.FORMAT: open3d_map.Open3DMap,
         semantic_map.FORMAT: semantic_map.SemanticMap,
     }
-    path = Path(path)
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            found = json.loads(file["header"].tobytes())["format"]
-    except (OSError, EOFError, ValueError, KeyError, TypeError, RuntimeError, zipfile.BadZipFile) as error:
-        raise DataError(f"{path} is not a map that can be read: {error}") from error
+    with faults_of(path), zipfile.ZipFile(path) as archive:
+        header = np.lib.format.read_array(io.BytesIO(archive.read("header.npy")), allow_pickle=False)
+        found = str(json.loads(header.tobytes())["format"])
     return kinds.get(found, instance_map.InstanceMap).load(path)

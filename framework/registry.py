@@ -121,7 +121,7 @@ def _refuse_undefined(stage: str, target: str) -> None:
     module_name, _, class_name = target.rpartition(".")
     if module_name and module_name not in sys.modules:
         known = _names_in(_found(f"{stage} {target}", module_name))
-        if class_name not in known:
+        if class_name not in known and "*" not in known:
             close = _did_you_mean(class_name, known)
             raise ConfigError(f"{stage} {target}: module {module_name} defines no {class_name}{close}")
 
@@ -298,7 +298,7 @@ def _refuse_another(plugins: ModuleSpec) -> None:
 
 
 def _names_in(spec: ModuleSpec) -> list[str]:
-    """The classes that a module's source defines or imports by name."""
+    """The classes that a module's source defines or imports from others; `*` stands for all of another's."""
     get_source = getattr(spec.loader, "get_source", None)
     try:
         nodes = list(ast.walk(ast.parse((get_source(spec.name) if get_source else None) or "")))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import random
 import sys
@@ -88,15 +87,16 @@ class _Awaited(MetaPathFinder):
     name: str
     set_up: Callable[[ModuleType], None]
 
-    def find_spec(self, fullname: str, _path: Any, _target: ModuleType | None = None) -> ModuleSpec | None:
+    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
         if fullname != self.name:
             return None
-        sys.meta_path.remove(self)
-        spec = importlib.util.find_spec(fullname)
+        others = (other.find_spec(fullname, path, target) for other in sys.meta_path if other is not self)
+        spec = next(filter(None, others), None)
         if spec is not None and spec.loader is not None:
             execute = spec.loader.exec_module
 
-            def execute_and_set_up(module: ModuleType) -> None:
+            def execute_and_set_up(module: ModuleType) -> None:  # who only asks for the spec executes nothing
+                sys.meta_path.remove(self)
                 execute(module)
                 self.set_up(module)
 

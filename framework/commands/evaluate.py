@@ -11,13 +11,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from framework.commands.command_line import (
-    EXIT_FAILED,
-    KNOWN_ERRORS,
-    arguments,
-    one_line_errors,
-    show_traceback,
-)
+from framework.commands.command_line import EXIT_FAILED, KNOWN_ERRORS, arguments, one_line_errors, show_traceback
 from framework.configs import one_line
 from framework.evaluation.instances import Transfer
 from framework.records.metrics import MAIN_FIGURES

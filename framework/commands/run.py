@@ -44,25 +44,16 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     `choices` are the options that were chosen, by config group. A run that ended early (Ctrl-C, full map) leaves its
     record too, marked as partial, and then raises what ended it.
     """
-    from framework.detection.cache import (  # here: a misspelt name is answered before these load
-        cache_metrics,
-        with_cache,
-    )
-    from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
-    from framework.pipeline import Pipeline
+    from framework.api import pipeline_of  # here: a misspelt name is answered before these load
+    from framework.detection.cache import cache_metrics
+    from framework.interfaces import RGBDSequence
     from framework.records.run_record import RunRecord
     from framework.registry import STAGES, build
     from framework.settings import Settings
 
     Settings.of(config).apply()
     sequence = build(RGBDSequence, config.dataset)
-    pipeline = Pipeline(
-        detector=with_cache(build(Detector, config.detector), config),
-        tracker=build(PoseTracker, config.tracker),
-        refiner=build(ClusterRefiner, config.refiner),
-        fuser=build(MapFuser, config.fuser),
-        ahead=config.ahead,
-    )
+    pipeline = pipeline_of(config)
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)

@@ -17,7 +17,7 @@ from framework.files.search_paths import candidates
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Another version may give other last digits."""
 
-SHARED_SOURCES = ("detection/*.py", "label_spaces.*")  # in framework/: what detectors are built from
+SHARED_SOURCES = ("detection/**/*.py", "label_spaces.*")  # in framework/: what detectors are built from
 NOT_GIVEN = Path()  # what `path: ""` in a config becomes
 
 

@@ -13,16 +13,7 @@ from framework.data import Camera, Float32, Float64, Frame, Int32
 from framework.geometry import inverse
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.sensor import Sensor, pinhole, ray_direction
-from framework.mapping.voxel_grid import (
-    BLOCK_SIDE,
-    NO_KEY,
-    VoxelGrid,
-    device,
-    find_block,
-    grown,
-    pack_key,
-    unpack_key,
-)
+from framework.mapping.voxel_grid import BLOCK_SIDE, NO_KEY, VoxelGrid, device, find_block, grown, pack_key, unpack_key
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once

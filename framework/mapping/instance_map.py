@@ -121,7 +121,8 @@ class InstanceMap(SceneMap):
     def load(cls, path: Path | str) -> InstanceMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
         with faults_of(path):
-            table, storage, classes = table_of(header["table"]), Storage[header["storage"]], tuple(header["classes"])
+            classes, storage = tuple(header["classes"]), Storage[header["storage"]]
+            table = table_of(header["table"], len(classes))
             volume = TsdfVolume.load(header, arrays, len(arrays["instance_ids"]))
             scene = cls(volume, Confirmation(**header["confirmation"]), table.combine, table.logarithmic, storage)
             scene.begin(classes)

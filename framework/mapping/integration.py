@@ -47,7 +47,7 @@ GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread even
 
 @device
 def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
-    """The pixel number that sees each voxel of a block into pixel (512,), its depth (m) into scratch[:512].
+    """The pixel number that sees each voxel of a block, eq. [6], into pixel (512,), its depth (m) into scratch[:512].
 
     Voxels outside the image get pixel 0 and a depth beyond any reading.
     """

@@ -21,6 +21,10 @@ from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceT
 
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
 
+FAULTS_OF_FILES = (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
+UNREADABLE = (*FAULTS_OF_FILES, LookupError, TypeError, ValueError, AttributeError)
+"""What is raised for a file that is no map, or whose header has something else where a number or a list should be."""
+
 
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
     """Writes an .npz as np.load reads it, lightly compressed: a third of the arrays' size. It has no time in it."""
@@ -50,7 +54,7 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
             if found != expected_format:  # its arrays may have other names
                 raise DataError(f"{path} has map format {found}, this version reads {expected_format}; map again")
             arrays = {name: file[name] for name in names}
-    except (OSError, EOFError, ValueError, KeyError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except UNREADABLE as error:
         raise DataError(f"{path} is not a map that can be read: {error}") from error
     return header, arrays
 
@@ -62,7 +66,7 @@ def faults_of(path: Path | str) -> Iterator[None]:
         yield
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
-    except (LookupError, TypeError, ValueError) as error:
+    except UNREADABLE as error:
         raise DataError(f"{path} is not a map that can be read: {type(error).__name__} {error}; map again") from error
 
 
@@ -107,13 +111,14 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
     }
 
 
-def table_of(plain: Mapping[str, Any]) -> InstanceTable:
-    """The table that `plain_table` wrote down."""
+def table_of(plain: Mapping[str, Any], classes: int) -> InstanceTable:
+    """The table that `plain_table` wrote down, of a map with so many classes."""
     table = InstanceTable(Combine[plain["combine"]], plain["logarithmic"])
     table.last_id = plain["last_id"]
     for entry in plain["instances"]:
         record = InstanceRecord(**entry)
-        record.class_evidence = np.array(record.class_evidence)
+        record.class_evidence = np.array(record.class_evidence, np.float64)
+        check_array(f"class_evidence of {record.id}", record.class_evidence, (classes,), np.float64)
         record.observed_in = set(record.observed_in)
         record.in_view = FrameSet(entry["in_view"])
         table.records[record.id] = record

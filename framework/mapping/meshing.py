@@ -24,15 +24,7 @@ from numba import njit, prange
 
 from framework.data import Float32, Int32
 from framework.mapping.bit_slices import ONE, ahead_x, ahead_y, behind_x, behind_y, count_bits, lowest_bit
-from framework.mapping.voxel_grid import (
-    BLOCK_SIDE,
-    BLOCK_VOXELS,
-    UNSEEN,
-    VoxelGrid,
-    device,
-    find_block,
-    grown,
-)
+from framework.mapping.voxel_grid import BLOCK_SIDE, BLOCK_VOXELS, UNSEEN, VoxelGrid, device, find_block, grown
 from framework.mapping.voxel_walk import voxel_number
 
 # A cell whose corners differ by more voxels of distance than this lies on a silhouette seen from one side, between a

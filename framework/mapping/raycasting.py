@@ -23,14 +23,7 @@ from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.row_interpolation import blend_colors, gather_corners, points_of_row, step_to_surface
 from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
-from framework.mapping.voxel_grid import (
-    BLOCK_SIDE,
-    REGION_SIDE,
-    UNSEEN,
-    VoxelGrid,
-    device,
-    find_block,
-)
+from framework.mapping.voxel_grid import BLOCK_SIDE, REGION_SIDE, UNSEEN, VoxelGrid, device, find_block
 from framework.mapping.voxel_walk import inverses, leave_cell, trilinear, voxel_number
 from framework.sensor_noise import axial_sigma_single
 

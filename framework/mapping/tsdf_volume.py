@@ -14,6 +14,7 @@ from framework.mapping.meshing import Surface, SurfaceNets
 from framework.mapping.raycasting import render_near, render_surface
 from framework.mapping.sensor import Sensor
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
+from framework.parameters import require
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)
@@ -89,6 +90,7 @@ class TsdfVolume:
     def load(cls, header: dict[str, Any], arrays: dict[str, Any], rows: int) -> TsdfVolume:
         """The one that `saved` gave, of a map whose labels have so many rows. Raises DataError where it cannot be."""
         sensor = Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()})
+        require(0 < header["voxel_size"] <= 1, "voxel_size", header["voxel_size"], "in (0, 1] m")
         volume = cls(header["voxel_size"], sensor, header["max_blocks"])
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
         check_known("label_row", arrays["label_row"], range(-1, rows))

@@ -38,13 +38,13 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
 def _content(value: str) -> str:
     """Of a file or folder; "" for a word that names none."""
     try:
-        return content_hash(Path(value))
+        return content_hash(Path(value).expanduser())
     except (ConfigError, OSError, ValueError):
         return ""
 
 
 def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
-    walks = [os.walk(root / scene)]
+    walks = [os.walk(root / scene, followlinks=True)]  # MOST_FILES ends a circle
     if scene:
         walks.insert(0, islice(os.walk(root), 1))  # what all scenes share, such as Replica's cam_params.json
     for folder, folders, files in chain.from_iterable(walks):

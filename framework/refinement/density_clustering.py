@@ -58,6 +58,6 @@ def _near_largest_piece(points: Float32, sampled: Float32, eps: float, min_point
         return np.ones(len(points), np.bool_)
     pieces = found.labels_[core]  # numbered as they are met, so that of equals the first is the largest
     distances, _ = KDTree(sampled[core[pieces == np.bincount(pieces).argmax()]]).query(
-        points, distance_upper_bound=np.nextafter(eps, 1)
+        points, distance_upper_bound=np.nextafter(eps, np.inf)
     )
     return np.asarray(distances <= eps)

@@ -66,6 +66,6 @@ def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int3
         return np.asarray((first & (ranks[b[:, None], nearest[a]] == absent)).sum(axis=1))
 
     a, linked = np.arange(n), np.zeros((n, n), np.uint8)
-    for b in nearest.T:  # column by column, so that memory grows with n k only
+    for b in nearest.T:
         linked[a, b] = unshared(a, b) + unshared(b, a) <= threshold * np.minimum(ranks[a, b], ranks[b, a])
     return np.asarray(connected_components(csr_array(linked), directed=False)[1], np.int32)

@@ -36,15 +36,7 @@ from framework.mapping.evidence import Combine
 from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import (
-    check_known,
-    check_like,
-    faults_of,
-    plain_table,
-    read_map,
-    table_of,
-    write_map,
-)
+from framework.mapping.map_file import check_known, check_like, faults_of, plain_table, read_map, table_of, write_map
 from framework.mapping.meshing import Surface
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
@@ -233,7 +225,7 @@ class ObjectMap(SceneMap):
         with faults_of(path):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation(**header["confirmation"]))
             scene.classes = tuple(header["classes"])
-            scene.table = table_of(header["table"])
+            scene.table = table_of(header["table"], len(scene.classes))
             counts = {int(key): blocks for key, blocks in header["objects"].items()}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
             check_known("objects", np.array([*counts]), scene.table.records)

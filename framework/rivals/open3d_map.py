@@ -15,14 +15,7 @@ from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import (
-    check_known,
-    faults_of,
-    plain_table,
-    read_map,
-    table_of,
-    write_map,
-)
+from framework.mapping.map_file import check_known, faults_of, plain_table, read_map, table_of, write_map
 from framework.rivals.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
 
 FORMAT = "open3d_vbg 3"  # of the saved file; a change of meaning counts it up
@@ -146,7 +139,7 @@ class Open3DMap(SceneMap):
         with faults_of(path):
             scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
             scene.classes = tuple(header["classes"])
-            scene.table = table_of(header["table"])
+            scene.table = table_of(header["table"], len(scene.classes))
             scene.grid.frames = header["frames"]
             scene.grid.fill(arrays)
             check_known("instance", arrays["instance"], [0, *scene.table.records])

@@ -58,6 +58,7 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
         ("detector=nobody", "there is no detector=nobody"),
         ("fuser.voxel_sise=1", "did you mean fuser.voxel_size?"),
         ("fuser.voxel_size=-1", "voxel_size must be in"),
+        ("detection_cache=bogus", "detection_cache must be one of off, read_write, read_only"),
         ("seed=-1", "seed must be a whole number"),
     ],
 )
@@ -96,6 +97,21 @@ def test_what_is_no_map_is_told_in_one_line(content: bytes, tmp_path: Path) -> N
     np.savez(tmp_path / "others.npz", a=np.zeros(3))
     with pytest.raises(DataError, match=r"others\.npz is not a map that can be read"):
         load_map(tmp_path / "others.npz")
+
+
+def test_a_damaged_map_is_told_in_one_line(room: CornerRoom, tmp_path: Path) -> None:
+    mapper = Mapper(*STAGES)
+    mapper.add(room[0])
+    mapper.scene.save(tmp_path / "map.npz")
+    whole = (tmp_path / "map.npz").read_bytes()
+    for position in range(0, 400, 7):
+        damaged = bytearray(whole)
+        damaged[position] ^= 0xFF
+        (tmp_path / "map.npz").write_bytes(damaged)
+        try:
+            load_map(tmp_path / "map.npz")  # not every byte means something
+        except DataError as error:
+            assert "map.npz" in str(error)
 
 
 def test_configs_are_those_of_the_command() -> None:

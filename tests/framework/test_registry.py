@@ -206,6 +206,15 @@ def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "talkative" / "one.py").write_text("print('imported')\nclass Named: pass\n")
 
 
+def test_a_class_of_a_module_that_takes_all_of_another_is_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "takes_all.py").write_text("from plugins.trackers.ground_truth import *\n")
+    tracker = build(PoseTracker, OmegaConf.create({"_target_": "takes_all.GroundTruth"}))
+    assert type(tracker).__name__ == "GroundTruth"
+
+
 @pytest.mark.parametrize("target", ["this.X", "this.s.X", "antigravity.X", "talkative.one.Name", "talkative.two.Named"])
 @pytest.mark.usefixtures("talkative")
 def test_what_does_not_define_the_class_is_not_imported(target: str, capfd: pytest.CaptureFixture[str]) -> None:

@@ -68,6 +68,8 @@ def test_torch_is_seeded_whenever_it_is_imported() -> None:
 from framework.settings import Settings
 Settings(seed=4, device="cpu", threads=1).apply()
 Settings(seed=5, device="cpu", threads=1).apply()
+import importlib.util
+assert importlib.util.find_spec("torch")  # as libraries look whether it is there
 import torch.nn, torch
 print(torch.initial_seed())
 Settings(seed=6, device="cpu", threads=1).apply()

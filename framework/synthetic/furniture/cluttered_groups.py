@@ -6,15 +6,7 @@ import numpy as np
 
 from framework.data import Float64
 from framework.synthetic.furniture import clutter, fixtures, seating, soft_things, tabletops
-from framework.synthetic.furniture.groups import (
-    Group,
-    against_wall,
-    bed_group,
-    beside,
-    put_on,
-    size,
-    with_low_table,
-)
+from framework.synthetic.furniture.groups import Group, against_wall, bed_group, beside, put_on, size, with_low_table
 from framework.synthetic.furniture.piece import Furniture, Rng
 
 PILLOWS = 0.68  # m, from the wall to where a bed is free to lie on

@@ -95,6 +95,15 @@ def test_code_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert seen[0] != seen[1]
 
 
+def test_all_of_detection_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed: list[Path] = []
+    monkeypatch.setattr(module, "path_hash", lambda path: str(hashed.append(path)))
+    fingerprint(Network())
+    folder = Path(module.__file__).parent
+    assert {path for path in folder.rglob("*.py") if path.stat().st_size} <= set(hashed)
+    assert folder / "mask_rcnn" / "roi_align.py" in hashed
+
+
 def test_code_without_a_file_cannot_be_told() -> None:
     notebook = type("Mine", (), {"__module__": "a_notebook"})
     with pytest.raises(ConfigError, match="Mine has no source file"):

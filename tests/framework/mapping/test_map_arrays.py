@@ -80,6 +80,18 @@ def test_numbers_of_rows_instances_and_classes_that_there_are_not_are_refused(
     assert "block_coords" in refused(kind, path, {"block_coords": twice})
 
 
+def test_a_header_with_something_else_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+    kind, path = saved
+    header: dict[str, Any] = json.loads(content(path)["header"].tobytes())
+    others: dict[str, Any] = {"sensor": [1], "settings": [1], "voxel_size": 0, "classes": 3}
+    if "table" in header:
+        table = header["table"]
+        others["table"] = table | {"instances": [one | {"class_evidence": [0.5]} for one in table["instances"]]}
+    for key in header.keys() & others.keys():
+        changed = json.dumps(header | {key: others[key]}).encode()
+        refused(kind, path, {"header": np.frombuffer(changed, np.uint8)})
+
+
 def test_a_header_that_lacks_something_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
     kind, path = saved
     header: dict[str, Any] = json.loads(content(path)["header"].tobytes())
