@@ -21,6 +21,7 @@ from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
 from framework.geometry import lift
 from framework.interfaces import Detector, SceneMap
+from framework.pipeline import Pipeline
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
 from tests import option_files, registered
@@ -59,6 +60,14 @@ def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.Monke
     scene = names["scene"]
     assert isinstance(scene, SceneMap)
     assert len(scene.mesh().vertices) > 1000
+
+
+def test_what_the_tour_names_is_there() -> None:
+    tour = (CHECKOUT / "CONTRIBUTING.md").read_text()
+    named = re.findall(r"`((?:framework|plugins|tests|conf)/[\w/]+\.py)`", tour)
+    assert len(named) > 15
+    assert not [path for path in named if not (CHECKOUT / path).exists()]
+    assert all(hasattr(Pipeline, step) for step in ("read_and_detect", "map_frame"))
 
 
 @pytest.fixture
