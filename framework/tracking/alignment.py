@@ -8,7 +8,8 @@ standard deviations; w_i and v_i are Tukey's biweights. Gauss-Newton steps are t
 T.
 
 Points are done in batches of a fixed size, in passes that the compiler vectorises: loops without branches over fields
-of one array, and other loops that only fetch from images. A point that does not count has weight 0.
+of one array, and other loops that only fetch from images. A point that does not count has weight 0. Sums of points are
+kept in lanes: vectors then need no reordered additions (fast math), so that every compilation rounds alike.
 """
 
 from __future__ import annotations
@@ -25,17 +26,19 @@ from framework.sensor_noise import axial_sigma_single
 from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
-TERMS = 27 + 7  # of a chunk's sums: 21 + 6 of the normal equations, then the counts below
-UPPER = np.triu_indices(6)  # where the first 21 of them belong
 BATCH = 160  # points; divides the usual widths
+LANES = 16  # of a sum: point n of a batch is added to lane n % LANES
+ROW = 5  # sums for each of the six errors' derivatives: its products with itself, the next three and the error
+SUMS = 6 * ROW + 1  # of points, in lanes: those of the normal equations, then that of the change of brightness
+TERMS = SUMS + 6  # of a chunk: its sums, then the counts below
 # where the fields of a batch begin: of its points in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
     field * BATCH for field in range(21)
 )
 POINT_FIELDS = 21
 # ... and of its terms
-J0, J1, J2, J3, J4, J5, W, ERROR, WEIGHTED = (field * BATCH for field in range(9))
-TERM_FIELDS = 9
+J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
+TERM_SIZE = ADDED + SUMS * LANES  # behind the fields, what the batch adds to the lanes
 NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
 
 
@@ -276,13 +279,12 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, brightness, points, J):
-    """The photometric terms of a batch into J; returns (weighed, sum of frame - model intensity, how many)."""
+    """The photometric terms of a batch into J, with frame - model intensity; returns (weighed, compared)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
     fx, fy = model.fx * inverse_scale, model.fy * inverse_scale
     compared = weighed = np.int32(0)
-    darker = zero
     for n in range(BATCH):
         a, b = points[A + n], points[B + n]
         i00, i10, i01, i11 = points[I00 + n], points[I10 + n], points[I01 + n], points[I11 + n]
@@ -302,30 +304,57 @@ def _add_photometry(model, inverse_scale, weights, brightness, points, J):
         _write_term(J, n, weight, error, gx, gy, gz, px, py, pz)
         compared = one_more(compared, seen)
         weighed = one_more(weighed, weighty)
-        darker -= change if seen else zero
-    return weighed, darker, compared
+        J[DARKER + n] = -change if seen else zero
+    return weighed, compared
 
 
 @device
-def _add_products(J, total):
-    """Adds the sums of w J^T J (upper triangle) and w J^T r over a batch to the total."""
-    place = 0
-    for i in range(6):
-        for n in range(BATCH):
-            J[WEIGHTED + n] = J[W + n] * J[i * BATCH + n]
-        for j in range(i, 6):
-            product = np.float32(0.0)
-            for n in range(BATCH):
-                product += J[WEIGHTED + n] * J[j * BATCH + n]
-            total[place] += np.float64(product)
-            place += 1
-        product = np.float32(0.0)
-        for n in range(BATCH):
-            product += J[WEIGHTED + n] * J[ERROR + n]
-        total[21 + i] += np.float64(product)
+def _multiply(J, first, second, third, fourth, row):
+    """The products of a batch's derivatives `first`, weighed, with themselves, with the others and with the error."""
+    zero = np.float32(0.0)
+    added = ADDED + row * ROW * LANES
+    for lane in range(LANES):
+        product0 = product1 = product2 = product3 = product_error = zero
+        for step in range(BATCH // LANES):  # unrolled by the compiler, which then vectorises the loop over lanes
+            n = step * LANES + lane
+            weighted = J[W + n] * J[first + n]
+            product0 += weighted * J[first + n]
+            product1 += weighted * J[second + n]
+            product2 += weighted * J[third + n]
+            product3 += weighted * J[fourth + n]
+            product_error += weighted * J[ERROR + n]
+        J[added + lane] = product0
+        J[added + LANES + lane] = product1
+        J[added + 2 * LANES + lane] = product2
+        J[added + 3 * LANES + lane] = product3
+        J[added + 4 * LANES + lane] = product_error
 
 
-@njit(cache=True, nogil=True, parallel=True, error_model="numpy", fastmath={"reassoc", "contract", "nsz"})
+@device
+def _add_products(J, lanes):
+    """Adds w J^T J, its upper triangle and a little more, and w J^T r of a batch to their lanes."""
+    _multiply(J, J0, J1, J2, J3, 0)
+    _multiply(J, J1, J2, J3, J4, 1)
+    _multiply(J, J2, J3, J4, J5, 2)
+    _multiply(J, J3, J4, J5, J0, 3)
+    _multiply(J, J4, J5, J0, J1, 4)
+    _multiply(J, J5, J0, J1, J2, 5)
+    for n in range(6 * ROW * LANES):
+        lanes[n] += np.float64(J[ADDED + n])
+
+
+@device
+def _add_brightness(J, lanes):
+    """Adds the change of brightness of a batch to its lanes."""
+    for lane in range(LANES):
+        change = np.float32(0.0)
+        for step in range(BATCH // LANES):
+            n = step * LANES + lane
+            change += J[DARKER + n]
+        lanes[6 * ROW * LANES + lane] += np.float64(change)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
 def _accumulate(
     depth, intensity, normals, fx, fy, cx, cy, model, model_intensity, inverse_scale, R, t, weights, brightness, sums
 ):
@@ -339,8 +368,10 @@ def _accumulate(
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)
+        lanes = np.zeros((SUMS, LANES), np.float64)
+        flat_lanes = lanes.ravel()
         points = np.zeros(POINT_FIELDS * BATCH, np.float32)
-        J = np.empty(TERM_FIELDS * BATCH, np.float32)
+        J = np.empty(TERM_SIZE, np.float32)
         pixel = np.empty(BATCH, np.int32)
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
             for u0 in range(0, width, BATCH):
@@ -348,18 +379,21 @@ def _accumulate(
                 _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
                 visible, weighed, close, behind = _add_geometry(model, R, weights, points, J)
-                _add_products(J, total)
-                total[27] += visible
-                total[28] += weighed
-                total[29] += close
-                total[30] += behind
+                _add_products(J, flat_lanes)
+                total[SUMS] += visible
+                total[SUMS + 1] += weighed
+                total[SUMS + 2] += close
+                total[SUMS + 3] += behind
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
-                    weighed, darker, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
-                    _add_products(J, total)
-                    total[31] += weighed
-                    total[32] += np.float64(darker)
-                    total[33] += compared
+                    weighed, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
+                    _add_products(J, flat_lanes)
+                    _add_brightness(J, flat_lanes)
+                    total[SUMS + 4] += weighed
+                    total[SUMS + 5] += compared
+        for i in range(SUMS):
+            for lane in range(LANES):
+                total[i] += lanes[i, lane]
         sums[chunk] = total
 
 
@@ -396,14 +430,18 @@ def linearize(
         sums,
     )
     total = sums.sum(axis=0)
+    products = total[: 6 * ROW].reshape(6, ROW)
     A = np.empty((6, 6))
-    A[UPPER] = A.T[UPPER] = total[:21]
+    for i in range(6):
+        following = (i + np.arange(4)) % 6
+        A[i, following] = A[following, i] = products[i, :4]
+    visible, weighed, close, behind, weighed_colors, compared = (int(count) for count in total[SUMS:])
     return NormalEquations(
         A=A,
-        b=total[21:27],
-        visible=int(total[27]),
-        matched=int(total[28]) if weights.depth_weight > 0 else int(total[31]),
-        close=int(total[29]),
-        behind=int(total[30]),
-        brightness=float(total[32] / max(total[33], 1)),
+        b=products[:, 4].copy(),
+        visible=visible,
+        matched=weighed if weights.depth_weight > 0 else weighed_colors,
+        close=close,
+        behind=behind,
+        brightness=float(total[SUMS - 1] / max(compared, 1)),
     )

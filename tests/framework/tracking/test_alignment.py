@@ -128,7 +128,7 @@ def test_noisy_normals_do_not_resist_a_motion_along_a_wall(level: int) -> None:
         return float(xi[0] / 0.02)
 
     assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
-    assert share_found(with_noisy_normals) < 0.8, "this case does not show what it is for"
+    assert share_found(with_noisy_normals) < 0.85, "this case does not show what it is for"
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 
