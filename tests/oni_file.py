@@ -13,6 +13,7 @@ DEPTH, COLOR = 2, 3  # the format's types of nodes
 NAMES = {DEPTH: "Depth", COLOR: "Image"}
 DEPTH_1_MM, RGB888, YUV422 = 100, 200, 201
 GRAY16, RGB24 = 4, 1  # pixel formats of OpenNI 1
+OPENNI_1_END_NODE = 2**32 - 1
 
 
 def uncompressed(image):
@@ -50,6 +51,7 @@ class Node:
 class OniFile:
     nodes: list[Node]
     wide: bool = True  # 64-bit places, as from version 1.0.1.0 on; else 1.0.0.5 and no tables for seeking
+    end_node: int = 0  # in the record of the end; OpenNI 1 writes OPENNI_1_END_NODE
 
     def write(self, path: Path) -> Path:
         content = self._content([0] * len(self.nodes))
@@ -82,7 +84,7 @@ class OniFile:
             for k, node in enumerate(self.nodes, start=1):
                 entries = [(0, 0, 0), *((time, 0, at) for time, at in zip(node.times, node.positions, strict=True))]
                 content += self._record(0x0E, k, payload=b"".join(struct.pack("<QIQ", *entry) for entry in entries))
-        return content + self._record(0x0B, 0)
+        return content + self._record(0x0B, self.end_node)
 
     def _added(self, k: int, node: Node, table: int) -> bytes:
         height, width = node.images[0].shape[:2]

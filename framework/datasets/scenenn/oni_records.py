@@ -119,7 +119,10 @@ def _read_contents(path: Path, file: BinaryIO) -> Contents:
     notes = []
     end, cut_off, largest_node = FILE_HEADER.size, True, 0
     for record in _records(file, record_header):
-        end, cut_off = record.end, record.kind != Record.END
+        end = record.end
+        if record.kind == Record.END:
+            cut_off = False
+            break
         largest_node = max(largest_node, record.node)
         if record.kind in (Record.NODE_ADDED_1_0_0_4, Record.NODE_ADDED_1_0_0_5, Record.NODE_ADDED):
             stream = _added_stream(path, record)
@@ -129,10 +132,10 @@ def _read_contents(path: Path, file: BinaryIO) -> Contents:
                 notes.append(record.fields_end - place.size)
         elif record.kind == Record.NEW_DATA:
             _count(streams, record)
-    for stream in Stream:
-        if stream not in streams or not streams[stream].count:
-            where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
-            raise DataError(f"{path} has no {stream.name.lower()} image{where}; it needs depth and color")
+    missing = [stream.name.lower() for stream in Stream if stream not in streams or not streams[stream].count]
+    if missing:
+        where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
+        raise DataError(f"{path} has no {' and no '.join(missing)} image{where}; it needs depth and color")
     return Contents(path, streams, end, cut_off, largest_node, wide, tuple(notes))
 
 
@@ -168,7 +171,7 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
             magic != RECORD_MAGIC
             or not header.size <= fields_size <= LARGEST_FIELDS
             or end > size
-            or node > LARGEST_NODE
+            or (node > LARGEST_NODE and kind != Record.END)  # OpenNI 1 ends with node 2^32 - 1, OpenNI 2 with 0
         ):
             return
         yield _Record(kind, node, file.read(fields_size - header.size), position + fields_size, end)

@@ -1,13 +1,14 @@
 """What the records of an .oni say, also where it ends too early."""
 
 import struct
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from framework.datasets.scenenn.oni_records import Stream, playable, read_contents
 from framework.errors import DataError
-from tests.oni_file import COLOR, DEPTH, Node, OniFile
+from tests.oni_file import COLOR, DEPTH, OPENNI_1_END_NODE, Node, OniFile
 
 TIMES = [33_000, 66_000, 99_000]
 
@@ -40,9 +41,27 @@ def test_what_a_recorder_left_behind_the_end_does_not_matter(tmp_path):
     assert contents.end == size
 
 
+def test_the_end_that_openni_1_writes_is_no_damage(tmp_path):
+    path = replace(recording(), end_node=OPENNI_1_END_NODE).write(tmp_path / "a.oni")
+    contents = read_contents(path)
+    assert (contents.cut_off, contents.end, contents.largest_node) == (False, path.stat().st_size, 2)
+
+
+def test_no_other_record_has_such_a_node(tmp_path):
+    content = bytearray(recording().write(tmp_path / "a.oni").read_bytes())
+    second = recording()
+    second.write(tmp_path / "b.oni")
+    at = second.nodes[0].positions[1]
+    content[at + 8 : at + 12] = struct.pack("<I", OPENNI_1_END_NODE)
+    (tmp_path / "a.oni").write_bytes(content)
+    contents = read_contents(tmp_path / "a.oni")
+    assert (contents.cut_off, contents.end) == (True, at)
+
+
+@pytest.mark.parametrize("end_node", [0, OPENNI_1_END_NODE])
 @pytest.mark.parametrize("wide", [True, False])
-def test_a_recording_that_was_cut_off_anywhere_is_mended_to_its_whole_records(tmp_path, wide):
-    content = recording(wide).write(tmp_path / "a.oni").read_bytes()
+def test_a_recording_that_was_cut_off_anywhere_is_mended_to_its_whole_records(tmp_path, wide, end_node):
+    content = replace(recording(wide), end_node=end_node).write(tmp_path / "a.oni").read_bytes()
     path, scratch = tmp_path / "cut.oni", tmp_path / "scratch"
     scratch.mkdir()
     counts = set()
@@ -82,7 +101,7 @@ def test_the_largest_node_that_a_killed_recorder_did_not_note_is_mended(tmp_path
         (b"RIFF" + bytes(40), "is no OpenNI recording: it begins with b'RIFF'"),
         (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 2, 0, 0, 2), "version 1.0.2.0; OpenNI 2 plays 1.0.0.4 to 1.0.1.0"),
         (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2**32 - 1), "is damaged: it says to have 4294967295 nodes"),
-        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2), "has no depth image before byte 24, where it is cut off"),
+        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2), "has no depth and no color image before byte 24, where it is"),
         (None, "could not be read: No such file"),
     ],
 )
