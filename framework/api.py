@@ -78,8 +78,8 @@ class Mapper:
         """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
 
         Returns the camera's pose; one that is lost was not fused, and the next frames may be found again. Raises
-        FrameError when the frame cannot be used, which leaves the map as it was, and MapFullError at the end of
-        `fuser.max_blocks`.
+        FrameError when the frame cannot be used, as one without a pose where poses are given, which leaves the map as
+        it was, and MapFullError at the end of `fuser.max_blocks`.
         """
         self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
         self._journal.tracked.clear()

@@ -17,5 +17,9 @@ class FrameError(DataError):
     """One frame cannot be used and the rest of its sequence can: the pipeline counts it in `frames_skipped`."""
 
 
+class NoPoseError(FrameError):
+    """No pose is given for this frame, which is normal where motion capture has gaps: skipped, and told in the end."""
+
+
 class MapFullError(InstanceMapError):
     """The map has reached its block budget; what was mapped so far is kept."""

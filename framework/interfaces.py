@@ -55,6 +55,10 @@ class RGBDSequence(ABC):
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
+    def has_poses(self) -> bool:
+        """Whether any of the frames may have a true pose; some of them may lack it. Asked before any frame is read."""
+        return True
+
     def scene_truth(self) -> SceneTruth | None:
         """The true instances of the chosen frames' scene, None where nobody labelled it."""
         return None
@@ -80,7 +84,8 @@ class PoseTracker(ABC):
         """The pose of `frame`; called once per frame, in order. `scene` is read only.
 
         `Pose.lost` says that the tracker cannot tell; the frame is then not integrated. The first frame defines the
-        world: its true pose where known, else the identity.
+        world: its true pose where known, else the identity. A tracker of given poses raises NoPoseError for a frame
+        that has none: the frame is skipped.
         """
 
 

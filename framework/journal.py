@@ -15,7 +15,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import Float64, Frame, Pose
-from framework.errors import FrameError, MapFullError
+from framework.errors import FrameError, MapFullError, NoPoseError
 from framework.interfaces import PoseTracker, SceneMap
 
 log = logging.getLogger(__name__)
@@ -50,7 +50,7 @@ class RunResult:
 
     scene: SceneMap
     frames: int  # taken from the sequence: mapped, lost and skipped ones
-    frames_skipped: int  # could not be used: unreadable or inconsistent
+    frames_skipped: int  # could not be used: unreadable, inconsistent, or without a pose where poses are given
     tracked: tuple[TrackedFrame, ...]  # in order, lost frames included
     timings: tuple[StageTime, ...]
     seconds: float  # wall clock of the whole loop
@@ -83,6 +83,8 @@ class Journal:
     pose_source: str
     frames: int = 0
     frames_skipped: int = 0
+    without_pose: int = 0  # of the skipped frames: no pose is given for them
+    first_without_pose: str = ""  # which that was, and why
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
     stopped_by: KeyboardInterrupt | MapFullError | None = None
@@ -105,7 +107,10 @@ class Journal:
     ) -> None:
         self.seconds = time.perf_counter() - self._started
         self._screen.close()
-        if self.frames_skipped > SKIPS_LOGGED:
+        if 0 < self.without_pose < self.frames:
+            told = (self.without_pose, self.frames, self.first_without_pose)
+            log.warning("%d of %d frames skipped, as no pose is given for them; the first: %s", *told)
+        if self._faults > SKIPS_LOGGED:
             log.warning("%d frames skipped in all", self.frames_skipped)
 
     @contextmanager
@@ -128,10 +133,19 @@ class Journal:
     def frame_skipped(self, error: FrameError) -> None:
         """Counts a frame that cannot be used."""
         self.frames_skipped += 1
-        if self.frames_skipped <= SKIPS_LOGGED:
+        if isinstance(error, NoPoseError):
+            self.without_pose += 1
+            self.first_without_pose = self.first_without_pose or str(error)
+            return
+        if self._faults <= SKIPS_LOGGED:
             log.warning("frame skipped: %s", error)
-        if self.frames_skipped == SKIPS_LOGGED:
+        if self._faults == SKIPS_LOGGED:
             log.warning("further skipped frames are only counted")
+
+    @property
+    def _faults(self) -> int:
+        """Skipped frames of which each is worth a word."""
+        return self.frames_skipped - self.without_pose
 
     def frame_tracked(self, frame: Frame, pose: Pose) -> None:
         """Keeps the pose; says when tracking gets lost and when it is found again."""

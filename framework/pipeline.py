@@ -23,6 +23,8 @@ from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker
 from framework.journal import Journal, RunResult, StageTime
 from framework.refinement.refine import refine
 
+WITHOUT_POSES = "add the sequence's poses, or choose a tracker that needs none, tracker=voxel_hashing_icp"
+
 Item = TypeVar("Item")
 Outcome = TypeVar("Outcome")
 
@@ -44,14 +46,16 @@ class Pipeline:
     def run(self, sequence: RGBDSequence) -> RunResult:
         """Maps `sequence` frame by frame.
 
-        A frame that raises FrameError is skipped, a frame whose pose is lost is not fused; both are counted. Ctrl-C
-        (once the frame in work is done) and a full map end the loop early: the result holds what has been mapped so
-        far, and `stopped_by` says why.
+        A frame that raises FrameError, as one without a pose where poses are given (NoPoseError), is skipped, a frame
+        whose pose is lost is not fused; both are counted. Ctrl-C (once the frame in work is done) and a full map end
+        the loop early: the result holds what has been mapped so far, and `stopped_by` says why.
 
         Raises DataError when there is no frame that can be used, and whatever else a stage raises.
         """
         if len(sequence) == 0:
             raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
+        if self.tracker.pose_source == "ground_truth" and not sequence.has_poses():
+            raise DataError(f"{sequence.name}: none of the {len(sequence)} frames has a true pose; {WITHOUT_POSES}")
         journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
         with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
             try:
@@ -64,6 +68,11 @@ class Pipeline:
                         raise KeyboardInterrupt
             except (KeyboardInterrupt, MapFullError) as stop:
                 journal.stopped_by = stop
+        if 0 < journal.frames == journal.without_pose:
+            raise DataError(
+                f"{sequence.name}: no pose is given for any of the {journal.frames} frames; the first:"
+                f" {journal.first_without_pose}; {WITHOUT_POSES}"
+            )
         if journal.frames_skipped == journal.frames:
             raise DataError(f"{sequence.name}: none of the {journal.frames} frames can be used; the log says why")
         return journal.result()

@@ -133,6 +133,11 @@ class Recording(RGBDSequence):
     def __len__(self) -> int:
         return len(self.chosen)
 
+    def has_poses(self) -> bool:
+        frames = [self.contents.frames[index] for index in self.chosen]
+        # a frame whose pose is no pose says so when it is read
+        return any(recorded.T_world_camera is not None or recorded.fault for recorded in frames)
+
     def __getitem__(self, k: int) -> Frame:
         index = self.chosen[k]
         recorded = self.contents.frames[index]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Float64, Frame, Pose
-from framework.errors import DataError
+from framework.errors import DataError, NoPoseError
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import inverse
 from framework.interfaces import PoseTracker, SceneMap
@@ -30,8 +30,8 @@ class TrajectoryFile(PoseTracker):
     A pose belongs to a frame by time, the nearest one counts: other systems drop frames, so that lines and frames need
     not correspond. By default the whole trajectory is moved as one rigid body so that the first frame that has a pose
     defines the world, as `PoseTracker` says; `world=FILE` keeps the file's own, for which the sequence's true poses
-    then mean nothing. Raises DataError, naming file and line, for a file that is not a trajectory: a pose that is not
-    finite or not rigid, timestamps that do not grow.
+    then mean nothing. A frame that no pose belongs to is skipped. Raises DataError, naming file and line, for a file
+    that is not a trajectory: a pose that is not finite or not rigid, timestamps that do not grow.
     """
 
     path: Path
@@ -47,22 +47,18 @@ class TrajectoryFile(PoseTracker):
             raise DataError(f"{self.path} holds no pose: expected a trajectory in TUM format")
         self._timestamps = timestamps + self.time_offset
         self._T_world_file: Float64 | None = np.eye(4) if self.world is World.FILE else None
-        self._T_world_last: Float64 | None = None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        """Raises NoPoseError for a frame that no pose of the file belongs to."""
         nearest = int(np.abs(self._timestamps - frame.timestamp).argmin())
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:
-            reason = f"{self.path.name} has no pose at {frame.timestamp:.3f} s, the nearest is {difference:.3f} s away"
-            return Pose(self._last_or_first(frame), lost=True, reason=reason)
+            raise NoPoseError(
+                f"frame {frame.index}: {self.path.name} has no pose at {frame.timestamp:.3f} s, the nearest is"
+                f" {difference:.3f} s away, farther than tracker.max_time_difference"
+            )
         T_file_camera = self._T_file_camera[nearest]
         if self._T_world_file is None:
-            self._T_world_file = self._last_or_first(frame) @ inverse(T_file_camera)
-        self._T_world_last = self._T_world_file @ T_file_camera
-        return Pose(self._T_world_last)
-
-    def _last_or_first(self, frame: Frame) -> Float64:
-        """The last pose; before there is one, where a tracker's world begins."""
-        if self._T_world_last is not None:
-            return self._T_world_last
-        return np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
+            T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
+            self._T_world_file = T_world_first @ inverse(T_file_camera)
+        return Pose(self._T_world_file @ T_file_camera)

@@ -46,7 +46,7 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
     mapper = Mapper(*STAGES)
     mapper.add(room[0])
     before = mapper.scene.mesh().vertices
-    with pytest.raises(DataError, match="frame 1 has no pose"):
+    with pytest.raises(DataError, match="frame 1 has no true pose"):
         mapper.add(replace(room[1], T_world_camera=None))
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, before)
     assert not mapper.add(room[2]).lost

@@ -77,6 +77,7 @@ class CornerRoom(RGBDSequence):
     frames: int = 6
     unreadable: int = -1  # this frame raises FrameError; -1 = none
     truth: bool = True  # whether poses and instances are known
+    unposed: tuple[int, ...] = ()  # frames whose true pose is not known
     slow_s: float = 0.0  # how long reading a frame takes
     scene: str = ""  # any name: all are the same room
     start: int = 0
@@ -97,7 +98,8 @@ class CornerRoom(RGBDSequence):
             raise FrameError(f"frame {index}: depth/{index:06d}.png is truncated")
         depth, _, color, ids = look(CAMERA, pose_at(index))
         truth = FrameTruth(ids, dict(enumerate(CLASSES, start=1))) if self.truth else None
-        return Frame(index, index / 30, color, depth, CAMERA, pose_at(index) if self.truth else None, truth)
+        posed = self.truth and index not in self.unposed
+        return Frame(index, index / 30, color, depth, CAMERA, pose_at(index) if posed else None, truth)
 
     def scene_truth(self) -> SceneTruth | None:
         if not self.truth:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, NoPoseError
 from framework.files.tum_trajectory import write_tum
 from framework.geometry import exp_se3
 from plugins.trackers.trajectory_file import TrajectoryFile, World
@@ -31,20 +31,21 @@ def path(tmp_path: Path) -> Path:
 def test_poses_are_those_of_the_file_in_the_world_of_the_first_frame(path: Path) -> None:
     tracker = TrajectoryFile(path)
     for k, frame in enumerate(CornerRoom()):
-        pose = tracker.track(frame, SCENE)
-        assert pose.lost == (k == 3)
-        np.testing.assert_allclose(pose.T_world_camera, pose_at(2 if k == 3 else k), atol=1e-9)
+        if k != 3:
+            np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)
 
 
-def test_a_frame_without_a_pose_is_lost_and_says_so(path: Path) -> None:
+def test_a_frame_without_a_pose_cannot_be_used_and_says_why(path: Path) -> None:
     tracker = TrajectoryFile(path)
-    reasons = [tracker.track(frame, SCENE).reason for frame in CornerRoom()]
-    assert reasons[3] == "other_slam.txt has no pose at 0.100 s, the nearest is 0.029 s away"
+    with pytest.raises(NoPoseError) as caught:
+        tracker.track(CornerRoom()[3], SCENE)
+    why = "frame 3: other_slam.txt has no pose at 0.100 s, the nearest is 0.029 s away"
+    assert str(caught.value) == f"{why}, farther than tracker.max_time_difference"
 
 
 def test_without_true_poses_the_first_frame_is_the_identity(path: Path) -> None:
     tracker = TrajectoryFile(path)
-    first, second, *_ = (tracker.track(frame, SCENE) for frame in CornerRoom(truth=False))
+    first, second = (tracker.track(frame, SCENE) for frame in CornerRoom(frames=2, truth=False))
     np.testing.assert_allclose(first.T_world_camera, np.eye(4), atol=1e-12)
     np.testing.assert_allclose(second.T_world_camera, np.linalg.inv(pose_at(0)) @ pose_at(1), atol=1e-9)
 
@@ -59,17 +60,20 @@ def test_a_file_that_begins_late_begins_the_world_at_its_first_pose(tmp_path: Pa
     path = tmp_path / "late.txt"
     write_tum(path, [2 / 30, 3 / 30], [T_FILE_WORLD @ pose_at(k) for k in (2, 3)])
     tracker = TrajectoryFile(path)
-    poses = [tracker.track(frame, SCENE) for frame in CornerRoom(frames=4)]
-    assert [pose.lost for pose in poses] == [True, True, False, False]
-    for k in range(4):
-        np.testing.assert_allclose(poses[k].T_world_camera, pose_at(k), atol=1e-9)
+    for k, frame in enumerate(CornerRoom(frames=4)):
+        if k < 2:
+            with pytest.raises(NoPoseError):
+                tracker.track(frame, SCENE)
+        else:
+            np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)
 
 
 def test_clocks_can_be_brought_together(tmp_path: Path) -> None:
     path = tmp_path / "clock.txt"
     write_tum(path, [1.7e9, 1.7e9 + 1 / 30], [pose_at(0), pose_at(1)])
     frames = [replace(frame, timestamp=frame.timestamp + 12) for frame in CornerRoom(frames=2)]
-    assert all(TrajectoryFile(path).track(frame, SCENE).lost for frame in frames)
+    with pytest.raises(NoPoseError, match="the nearest is"):
+        TrajectoryFile(path).track(frames[0], SCENE)
     tracker = TrajectoryFile(path, time_offset=12 - 1.7e9)
     for k, frame in enumerate(frames):
         np.testing.assert_allclose(tracker.track(frame, SCENE).T_world_camera, pose_at(k), atol=1e-9)

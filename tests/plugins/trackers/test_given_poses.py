@@ -1,0 +1,124 @@
+"""The trackers of given poses in a run: frames without one are skipped, counted and told in one line, by both alike."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import Frame
+from framework.errors import DataError
+from framework.files.tum_trajectory import write_tum
+from framework.interfaces import PoseTracker
+from framework.pipeline import Pipeline
+from framework.records.metrics import run_metrics, trajectory_metrics
+from plugins.detectors.none import NoDetections
+from plugins.trackers.ground_truth import GroundTruth
+from plugins.trackers.trajectory_file import TrajectoryFile
+from tests.scenes.corner_room import CornerRoom, GridFuser, KeepAll, pose_at
+
+GAP = (0, 3, 4)
+FRAMES = 9
+POSED = [k for k in range(FRAMES) if k not in GAP]
+
+
+def pipeline(tracker: PoseTracker, fuser: GridFuser | None = None) -> Pipeline:
+    return Pipeline(NoDetections(), tracker, KeepAll(), fuser or GridFuser(), ahead=0)
+
+
+def true_poses(_: Path) -> PoseTracker:
+    return GroundTruth()
+
+
+def poses_of_a_file(folder: Path) -> PoseTracker:
+    write_tum(folder / "poses.txt", [k / 30 for k in POSED], [pose_at(k) for k in POSED])
+    return TrajectoryFile(folder / "poses.txt")
+
+
+TRACKERS = pytest.mark.parametrize(
+    ("tracker", "first"),
+    [
+        (true_poses, "frame 0 has no true pose at 0.000 s"),
+        (
+            poses_of_a_file,
+            "frame 0: poses.txt has no pose at 0.000 s, the nearest is 0.033 s away, farther than "
+            "tracker.max_time_difference",
+        ),
+    ],
+)
+
+
+@TRACKERS
+def test_frames_without_a_pose_are_skipped_and_told_in_one_line(
+    tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    fuser = GridFuser()
+    result = pipeline(tracker(tmp_path), fuser).run(CornerRoom(frames=FRAMES, unposed=GAP))
+    metrics = run_metrics(result)
+    assert (metrics["frames"], metrics["frames_skipped"], metrics["frames_lost"]) == (FRAMES, len(GAP), 0)
+    assert [frame.index for frame in result.tracked] == POSED
+    for frame in result.tracked:
+        np.testing.assert_allclose(frame.pose.T_world_camera, pose_at(frame.index), atol=1e-9)
+    assert len(fuser.scene.vertices) == len(POSED)
+    assert [record.message for record in caplog.records] == [
+        f"3 of 9 frames skipped, as no pose is given for them; the first: {first}"
+    ]
+
+
+@TRACKERS
+def test_many_of_them_hide_no_other_fault(
+    tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Unreadable frames are told one by one up to a limit, which frames without poses do not count in."""
+    late = 30
+    room = CornerRoom(frames=late + 2, unposed=tuple(range(late)), unreadable=late)
+    given = tracker(tmp_path)
+    if isinstance(given, TrajectoryFile):
+        write_tum(given.path, [(late + 1) / 30], [pose_at(late + 1)])
+        given = TrajectoryFile(given.path)
+    assert pipeline(given).run(room).frames_skipped == late + 1
+    assert [record.message for record in caplog.records] == [
+        f"frame skipped: frame {late}: depth/{late:06d}.png is truncated",
+        *(record.message for record in caplog.records if record.message.startswith(f"{late} of {late + 2} frames")),
+    ]
+    assert len(caplog.records) == 2
+
+
+def test_the_error_of_a_trajectory_takes_frames_with_a_true_pose_only(tmp_path: Path) -> None:
+    """Every pose given is wrong where the true one is not known: neither ATE nor RPE may notice."""
+    poses = [np.linalg.inv(pose_at(9 * k)) if k in GAP else pose_at(k) for k in range(FRAMES)]
+    write_tum(tmp_path / "poses.txt", [k / 30 for k in range(FRAMES)], poses)
+    tracker = TrajectoryFile(tmp_path / "poses.txt")
+    result = pipeline(tracker).run(CornerRoom(frames=FRAMES, unposed=(3, 4)))
+    assert result.frames_skipped == 0
+    errors = trajectory_metrics(result)
+    assert errors["trajectory.ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert errors["trajectory.rpe_rmse_m"] == pytest.approx(0, abs=1e-9)
+
+
+@TRACKERS
+def test_a_run_without_any_pose_is_an_error_of_one_line(
+    tmp_path: Path, tracker: Callable[[Path], PoseTracker], first: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    room = CornerRoom(frames=1, unposed=GAP)
+    with pytest.raises(DataError) as caught:
+        pipeline(tracker(tmp_path)).run(room)
+    assert str(caught.value) == (
+        f"corner_room: no pose is given for any of the 1 frames; the first: {first}; add the sequence's poses, "
+        "or choose a tracker that needs none, tracker=voxel_hashing_icp"
+    )
+    assert not caplog.records
+
+
+def test_a_sequence_that_has_no_poses_is_refused_before_it_is_read() -> None:
+    class Unposed(CornerRoom):
+        def has_poses(self) -> bool:
+            return False
+
+        def __getitem__(self, k: int) -> Frame:
+            raise AssertionError("it was read")
+
+    with pytest.raises(DataError, match="corner_room: none of the 6 frames has a true pose; add the sequence's poses"):
+        pipeline(GroundTruth()).run(Unposed())
