@@ -9,6 +9,7 @@
                                         optional: the mesh, its segments, and the objects made of these
     scannetv2-labels.combined.tsv       optional, in the folder of the scenes or the one above: which class is meant by
                                         what the annotators wrote; without it fewer objects are evaluated
+    scannet-labels.combined.tsv         optional, likewise: the first release's, for annotations of that time
 
 Colour (1296x968) is moved into the depth camera (640x480), which is that of the frames.
 """
@@ -27,7 +28,12 @@ from framework.datasets.color_registration import ColorRegistration, RegisteredI
 from framework.datasets.labeled_mesh import LabeledMesh
 from framework.datasets.labeled_recording import LabeledRecording, mesh_of
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
-from framework.datasets.scannet.scannet_annotation import LABEL_TABLE, read_label_table, read_labeled_mesh
+from framework.datasets.scannet.scannet_annotation import (
+    FIRST_LABEL_TABLE,
+    LABEL_TABLE,
+    read_label_table,
+    read_labeled_mesh,
+)
 from framework.datasets.scannet.sens_file import SensFile, open_sens
 from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
@@ -54,17 +60,18 @@ class ScanNet(LabeledRecording):
     """
 
     def open(self) -> Contents:
-        tables = [parent / LABEL_TABLE for parent in self.folder.resolve().parents[:2]]
-        self._label_table = next((table for table in tables if table.exists()), None)
+        above = self.folder.resolve().parents[:2]
+        tables = [parent / name for name in (FIRST_LABEL_TABLE, LABEL_TABLE) for parent in reversed(above)]
+        self._label_tables = [table for table in tables if table.exists()]
         files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
         self.mesh = mesh_of(files, self._read_mesh)
         if self.mesh is None and self.frame_truth:
             raise DataError(
                 f"dataset.frame_truth needs a labelled mesh: {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
             )
-        if self.mesh and self._label_table is None:
-            log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[0])
-        self.annotation = f"ScanNet v2{'' if self._label_table else ', no label table'}" if self.mesh else ""
+        if self.mesh and not self._label_tables:
+            log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[-1])
+        self.annotation = f"ScanNet v2{'' if self._label_tables else ', no label table'}" if self.mesh else ""
         sens, exported = sorted(self.folder.glob("*.sens")), self.folder / "color"
         if len(sens) > 1:
             raise DataError(f"{self.folder} holds {len(sens)} .sens files, {sens[0].name} and others; leave one")
@@ -77,7 +84,9 @@ class ScanNet(LabeledRecording):
         raise DataError(f"{self.folder} holds neither {self.name}.sens nor color/; dataset.scene is like scene0000_00")
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
-        nyu40 = read_label_table(self._label_table) if self._label_table else {}
+        nyu40: dict[str, str] = {}
+        for table in self._label_tables:  # the second release's, and of two the nearer one, have the last word
+            nyu40 |= read_label_table(table)
         return read_labeled_mesh(mesh, segments, objects, nyu40)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,9 +22,15 @@ from framework.label_spaces import MEANINGS
 LARGEST_FILE = 2**24  # bytes; the largest room's segments take 5 MB, and JSON takes up to 30 times as much memory
 MOST_OBJECT_ID = np.iinfo(np.int32).max - 2  # one is added, and one more id is given to what nobody labelled
 LABEL_TABLE = "scannetv2-labels.combined.tsv"
-COLUMNS = ("raw_category", "nyu40class")  # of the label table
+FIRST_LABEL_TABLE = "scannet-labels.combined.tsv"  # of the first release, 2017, whose annotators wrote other names
+WRITTEN = (
+    "raw_category",
+    "category",
+)  # columns of what annotators wrote; the first release's table has no raw_category
+CLASS = "nyu40class"
 UNTOLD = frozenset(  # names under which annotators and NYU40 put what has no class of its own: it may be anything
-    {"object", "objects", "unknown", "furniture", "decoration", "otherprop", "otherfurniture", "otherstructure"}
+    {"object", "objects", "unknown", "junk", "furniture", "decoration"}
+    | {"otherprop", "otherfurniture", "otherstructure"}
 )
 
 log = logging.getLogger(__name__)
@@ -44,9 +51,11 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     Objects whose name means a class of COCO have its name. Objects of other classes that are known (wall, cabinet,
     ...) are instance 0: whoever finds one of COCO's there is wrong. Objects whose name says no class are instances of
     class None, and so is, as one more instance, all that nobody labelled: whatever is found there is neither right nor
-    wrong, as in ScanNet's own benchmark. `nyu40` is what `read_label_table` gives.
+    wrong, as in ScanNet's own benchmark. `nyu40` is what `read_label_table` gives, empty = there is no table. Names are
+    the same where only spaces and signs differ: the first release has a trashcan, the second one a trash can.
 
-    Raises DataError, naming the file, when one cannot be read or they do not belong together.
+    Raises DataError, naming the file, when one cannot be read or they do not belong together, and, listing them, when
+    names are in no table.
     """
     ply = read_ply(mesh)
     segments = _read_segments(segs)
@@ -54,13 +63,16 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
         raise DataError(f"{segs} has {len(segments)} segIndices, but {mesh.name} {len(ply.vertices)} vertices")
     present, segment_of_vertex = np.unique(segments, return_inverse=True)
     groups = read_aggregation(aggregation)
+    spelling = Spelling.of(nyu40)
+    if nyu40:
+        _check_names(aggregation, groups, spelling)
     unlabeled = max((group.object_id + 2 for group in groups), default=1)
     instance_of_segment = np.full(len(present), unlabeled, np.int32)
     class_names: dict[int, str | None] = {}
     unknown: set[str] = set()
     for group in groups:
         instance = group.object_id + 1
-        name = _known_name(group.label, nyu40)
+        name = _known_name(spelling(group.label), nyu40)
         if not name:
             unknown.add(group.label)
             class_names[instance] = None
@@ -90,12 +102,16 @@ def read_aggregation(path: Path) -> tuple[SegGroup, ...]:
 
 
 def read_label_table(path: Path) -> Mapping[str, str]:
-    """What an annotator may have written -> its class among NYU40's. Raises DataError, naming file and line."""
+    """What an annotator may have written -> its class among NYU40's, "" = none; of the table of either release.
+
+    Raises DataError, naming file and line.
+    """
     header, *rows = read_text(path, LARGEST_FILE).rstrip("\r\n").split("\n")
     columns = header.rstrip("\r").split("\t")
-    if not set(COLUMNS) <= set(columns):
-        raise DataError(f"{path}, line 1: expected columns {' and '.join(COLUMNS)}, separated by tabs")
-    raw, nyu40 = (columns.index(name) for name in COLUMNS)
+    written = next((name for name in WRITTEN if name in columns), "")
+    if not written or CLASS not in columns:
+        raise DataError(f"{path}, line 1: expected columns {' or '.join(WRITTEN)} and {CLASS}, separated by tabs")
+    raw, nyu40 = columns.index(written), columns.index(CLASS)
     table: dict[str, str] = {}
     for n, row in enumerate(rows, start=2):
         words = row.rstrip("\r").split("\t")
@@ -105,12 +121,44 @@ def read_label_table(path: Path) -> Mapping[str, str]:
     return table
 
 
-def _known_name(label: str, nyu40: Mapping[str, str]) -> str:
+@dataclass(frozen=True)
+class Spelling:
+    """How names are spelled where their meaning stands."""
+
+    names: frozenset[str]  # that mean something
+    by_letters: Mapping[str, str]  # their letters and digits alone -> the name
+
+    @classmethod
+    def of(cls, nyu40: Mapping[str, str]) -> Spelling:
+        """Of MEANINGS, UNTOLD and a label table."""
+        names = {**nyu40, **MEANINGS, **dict.fromkeys(UNTOLD)}
+        return cls(frozenset(names), {_letters(name): name for name in names})
+
+    def __call__(self, label: str) -> str:
+        """The name that an annotator meant; what was written where no name is like it."""
+        own = _spelled(label)
+        return own if own in self.names else self.by_letters.get(_letters(own), own)
+
+
+def _letters(name: str) -> str:
+    return re.sub(r"[\W_]", "", name)
+
+
+def _check_names(path: Path, groups: Sequence[SegGroup], spelling: Spelling) -> None:
+    """Raises DataError, listing them, where annotators wrote what no table has."""
+    unknown = sorted({group.label for group in groups if spelling(group.label) not in spelling.names})
+    if unknown:
+        raise DataError(
+            f"{path}: {', '.join(f'{label!r:.60}' for label in unknown)}: in no label table; add a line to"
+            f" {LABEL_TABLE}, or put {FIRST_LABEL_TABLE} beside it, which has the names of ScanNet's first release"
+        )
+
+
+def _known_name(own: str, nyu40: Mapping[str, str]) -> str:
     """The name by which MEANINGS knows what an annotator wrote; "" when that says no class.
 
     Its own name goes before NYU40's, which has one class for microwaves, keyboards and bottles.
     """
-    own = _spelled(label)
     names = (own, nyu40.get(own, ""))
     return next((name for name in names if name in MEANINGS and name not in UNTOLD), "")
 

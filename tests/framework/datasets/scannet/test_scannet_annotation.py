@@ -18,6 +18,7 @@ from framework.datasets.scannet.scannet_annotation import (
 )
 from framework.errors import DataError
 from framework.files.ply import write_ply
+from framework.label_spaces import MEANINGS
 
 SEGMENTS = [3, 3, 70, 70, 5, 5, 9, 9, 11, 12]  # of ten vertices in a row
 TABLE = """id\traw_category\tcategory\tnyu40class
@@ -72,6 +73,10 @@ def test_without_objects_nothing_is_known(tmp_path: Path) -> None:
         ("Monitor ", 1, "tv"),
         ("books", 1, "book"),
         ("trash can", 0, None),
+        ("trashcan", 0, None),
+        ("TV_monitor", 1, "tv"),
+        ("washbasin", 1, "sink"),
+        ("junk", 1, None),
         ("ceiling", 0, None),
         ("object", 1, None),
         ("otherfurniture", 1, None),
@@ -89,6 +94,37 @@ def test_what_a_name_becomes(tmp_path: Path, label: str, instance: int, name: st
 @pytest.mark.parametrize(("label", "name"), [("recliner chair", "chair"), ("gizmo", None), ("laptop", "laptop")])
 def test_the_label_table_tells_rare_names(tmp_path: Path, label: str, name: str | None) -> None:
     assert read(tmp_path, [group(0, label, *SEGMENTS)], table=TABLE).class_names == {1: name}
+
+
+def test_the_table_of_the_first_release_is_read_too(tmp_path: Path) -> None:
+    table = "category\tcount\tnyu40class\nrecliner chair\t3\tchair\nnerf gun\t8\totherprop\nstorage\t8\t\n"
+    mesh = read(tmp_path, [group(0, "reclinerchair", 3), group(1, "nerf gun", 70)], table=table)
+    assert mesh.class_names == {1: "chair", 2: None, 3: None}
+    assert read_label_table(tmp_path / "labels.tsv") == {
+        "recliner chair": "chair",
+        "nerf gun": "otherprop",
+        "storage": "",
+    }
+
+
+def test_names_that_are_in_no_table_are_listed(tmp_path: Path) -> None:
+    objects = [
+        group(k, label, 3) for k, label in enumerate(("zimzum", "laptop", "Gizmo", "unknown", "whatnot", "zimzum"))
+    ]
+    message = (
+        r"s\.aggregation\.json: 'whatnot', 'zimzum': in no label table; add a line to scannetv2-labels\.combined\.tsv"
+    )
+    with pytest.raises(DataError, match=message) as caught:
+        read(tmp_path, objects, table=TABLE)
+    assert "\n" not in str(caught.value)
+
+
+def test_names_that_are_spelled_alike_mean_the_same() -> None:
+    """Spaces and signs may therefore be left out."""
+    meanings: dict[str, set[str | None]] = {}
+    for name, meaning in MEANINGS.items():
+        meanings.setdefault("".join(filter(str.isalnum, name)), set()).add(meaning)
+    assert all(len(meant) == 1 for meant in meanings.values())
 
 
 def test_the_later_of_two_objects_has_a_segment(tmp_path: Path) -> None:
@@ -172,7 +208,7 @@ def test_a_wrong_line_of_the_label_table_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="line 3: expected 3 columns, found 2"):
         read_label_table(path)
     path.write_text("raw\tnyu40class\n")
-    with pytest.raises(DataError, match="line 1: expected columns raw_category and nyu40class"):
+    with pytest.raises(DataError, match="line 1: expected columns raw_category or category and nyu40class"):
         read_label_table(path)
     path.write_bytes(b"\xff\xfe")
     with pytest.raises(DataError, match="could not be read as text"):

@@ -101,7 +101,10 @@ def test_the_largest_node_that_a_killed_recorder_did_not_note_is_mended(tmp_path
         (b"RIFF" + bytes(40), "is no OpenNI recording: it begins with b'RIFF'"),
         (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 2, 0, 0, 2), "version 1.0.2.0; OpenNI 2 plays 1.0.0.4 to 1.0.1.0"),
         (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2**32 - 1), "is damaged: it says to have 4294967295 nodes"),
-        (struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2), "has no depth and no color image before byte 24, where it is"),
+        (
+            struct.pack("<4sBBHIQI", b"NI10", 1, 0, 1, 0, 0, 2),
+            "has no depth and no color image before byte 24, where it is",
+        ),
         (None, "could not be read: No such file"),
     ],
 )
