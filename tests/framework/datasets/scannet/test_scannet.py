@@ -259,6 +259,25 @@ def test_without_the_label_table_it_is_another_annotation(tmp_path: Path, caplog
     assert set(truth.class_names.values()) == {None}, "nobody else knows what a folding chair is"
 
 
+def test_names_of_the_first_release_are_told_by_its_table(tmp_path: Path) -> None:
+    as_sens(tmp_path / SCENE, shots())
+    write_labels(tmp_path / SCENE)
+    table = tmp_path / "scannetv2-labels.combined.tsv"
+    of_both = ScanNet(tmp_path, SCENE).scene_truth()
+    table.write_text("id\traw_category\tnyu40class\n1\twall\twall\n")
+    with pytest.raises(
+        DataError, match=r"'folding chair'.*: in no label table; .* or put scannet-labels\.combined\.tsv"
+    ):
+        ScanNet(tmp_path, SCENE)
+    (tmp_path / "scannet-labels.combined.tsv").write_text(
+        "category\tcount\tnyu40class\nfolding chair\t9\tchair\nwall\t9\tceiling\nthing\t1\totherprop\n"
+    )
+    truth = ScanNet(tmp_path, SCENE).scene_truth()
+    assert truth is not None
+    assert of_both is not None
+    assert truth.class_names == of_both.class_names
+
+
 def test_truth_without_all_of_its_files_is_none_and_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     as_sens(tmp_path / SCENE, shots(1))
     write_labels(tmp_path / SCENE)
