@@ -140,6 +140,14 @@ def test_the_time_of_a_frame_that_cannot_be_used_does_not_matter(folder, caplog)
     assert not caplog.records
 
 
+def test_poses_are_there_unless_no_chosen_frame_has_a_line(folder):
+    for k in range(FRAMES):
+        set_pose_line(folder, k, f"{k} nan nan nan nan nan nan nan")
+    assert RgbdFolder(folder).has_poses()  # reading says what is wrong with them
+    (folder / "poses.txt").unlink()
+    assert not RgbdFolder(folder).has_poses()
+
+
 def test_without_instances_there_is_no_truth(folder):
     shutil.rmtree(folder / "instance")
     (folder / "instances.json").unlink()
