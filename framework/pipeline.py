@@ -17,6 +17,7 @@ from typing import TypeVar
 import numba
 
 from framework.data import Detections, Frame, Pose
+from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
@@ -52,6 +53,7 @@ class Pipeline:
         """
         if len(sequence) == 0:
             raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
+        warn_outside_domain(self.detector, sequence)
         journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
         with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
             try:
