@@ -2,7 +2,7 @@
 
     from instancemap import Camera, Frame, Mapper
 
-    mapper = Mapper("detector=maskrcnn2go", "fuser.voxel_size=0.02")  # what `instancemap ...` takes, with its defaults
+    mapper = Mapper("fuser.voxel_size=0.02")  # what `instancemap ...` takes, with its defaults
     camera = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
     for k, (color, depth) in enumerate(video):  # uint8 (480, 640, 3) RGB; float32 (480, 640) m, 0 = no reading
         pose = mapper.add(Frame(index=k, timestamp=k / 30, color=color, depth=depth, camera=camera))

@@ -28,7 +28,7 @@ HELP = """\
 {program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video
 
 Without a command, KEY=VALUE ... make one run; with -m, or with an experiment, a sweep of runs:
-  {program} dataset=rgbd_folder dataset.root=DIR detector=maskrcnn2go
+  {program} dataset=rgbd_folder dataset.root=DIR
   {program} -m refiner=identity,kmeans,gmm_em seed=0,1,2
 
 Commands; each explains itself with --help:

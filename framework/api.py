@@ -14,6 +14,7 @@ from omegaconf import DictConfig
 from framework.configs import composed
 from framework.data import Camera, Detections, Frame, Instance, InstanceMesh, PointClusters, Pose, View
 from framework.detection.cache import with_cache
+from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
 from framework.journal import Journal
@@ -59,10 +60,11 @@ def pipeline_of(config: DictConfig) -> Pipeline:
 
 
 class Mapper:
-    """Maps frames as they come: `Mapper("detector=maskrcnn2go", "fuser.voxel_size=0.02")`.
+    """Maps frames as they come: `Mapper("detector=mask_rcnn", "fuser.voxel_size=0.02")`.
 
-    The arguments are those of a run on the command line, with its defaults; `dataset` is left out, since the frames are
-    yours, and `ahead` and `resume` mean nothing here. Raises ConfigError for a name or a value that there is not.
+    The arguments are those of a run on the command line, with its defaults for what is recorded; `dataset` is left out,
+    since the frames are yours, and `ahead` and `resume` mean nothing here. Raises ConfigError for a name or a value
+    that there is not.
     """
 
     scene: SceneMap  # the map: mesh(), render(), instances(), save()
@@ -71,6 +73,7 @@ class Mapper:
         config = composed("~dataset", *overrides)
         Settings.of(config).apply()
         self.pipeline = pipeline_of(config)
+        warn_outside_domain(self.pipeline.detector, None)
         self.scene = self.pipeline.fuser.scene
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
 

@@ -43,6 +43,7 @@ class RGBDSequence(ABC):
     camera: Camera
     name: str  # for tables: the scene
     annotation: str = ""  # for tables: which release of the true instances; "" = there is but one
+    domain: str = ""  # what its pictures are, as a detector may ask: "rendered rooms"; "" = photographs, or not known
 
     @abstractmethod
     def __len__(self) -> int:

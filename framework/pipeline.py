@@ -17,6 +17,7 @@ from typing import TypeVar
 import numba
 
 from framework.data import Detections, Frame, Pose
+from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
@@ -56,6 +57,7 @@ class Pipeline:
             raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
         if self.tracker.pose_source == "ground_truth" and not sequence.has_poses():
             raise DataError(f"{sequence.name}: none of the {len(sequence)} frames has a true pose; {WITHOUT_POSES}")
+        warn_outside_domain(self.detector, sequence)
         journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
         with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
             try:

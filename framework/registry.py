@@ -146,9 +146,19 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
             inheriting.append(name)
     for name in inheriting:  # from another option, which was asked, or from what is none
         with suppress(HydraException):  # of an option that cannot be used
-            for entry in loader.compute_defaults_list(f"{stage}/{name}", [], RunMode.RUN).defaults:
-                if entry.package == stage:
-                    yield str(loader.repository.load_config(entry.config_path).config.get("_target_"))
+            for path, package in composition(loader, stage, name).items():
+                if package == stage:
+                    yield str(loader.repository.load_config(path).config.get("_target_"))
+
+
+def composition(loader: Any, stage: str, name: str) -> dict[str, str]:
+    """The configs that an option of a stage is made of, in order, and where each belongs: packages by path.
+
+    They are looked for where a run would choose the option: one that overrides the choice of another stage, as a
+    dataset may, composes nowhere else. Raises HydraException for an option that cannot be used.
+    """
+    entries = loader.compute_defaults_list("config", [f"{stage}={name}"], RunMode.RUN).defaults
+    return {entry.config_path: entry.package for entry in entries if entry.package.partition(".")[0] == stage}
 
 
 def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
@@ -184,7 +194,8 @@ def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
     """The keyword arguments that `node` gives to `plugin_class`, each with the type of its dataclass field.
 
-    Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing mandatory value.
+    Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing mandatory value: a
+    field's metadata may say `where` such a value is to be had.
     """
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
@@ -213,7 +224,8 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
     if missing:
         stage = where.split()[0]
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
-        raise ConfigError(f"{where}: {', '.join(missing)} must be given: {needed}")
+        hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
+        raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
     return {name: plugins[name] if name in stages else schema[name] for name in names}
 
 

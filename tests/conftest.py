@@ -43,17 +43,13 @@ def shared_data(shared: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def ready(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
-    """Builds an option with what only a user has. Skips where a package or ../shared is not there, and only there."""
+def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
+    """Builds an option with what only a user has. Skips where a package is not there, and only there."""
     from tests import option_files, registered
 
     made = functools.cache(lambda *option: option_files.overrides(*option, tmp_path_factory.mktemp(option[1])))
 
     def build(stage: str, name: str) -> Any:
-        if weights := option_files.SHARED_WEIGHTS.get((stage, name)):
-            path = request.getfixturevalue("shared") / "weights" / weights
-            if not path.exists():
-                pytest.skip(f"{path} is not there")
         return registered.built(stage, name, *made(stage, name))
 
     return build

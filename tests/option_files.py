@@ -19,8 +19,6 @@ from tests.scannet_files import shots, write_sens
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector, pose_at
 
 FRAMES = 3
-SHARED_WEIGHTS = {("detector", "maskrcnn2go"): "maskrcnn2go_int8", ("detector", "onnx_boxes"): "yolox_nano"}
-"""In ../shared/weights: real networks, by the options whose default they are."""
 
 
 def overrides(stage: str, name: str, folder: Path) -> list[str]:
@@ -103,6 +101,18 @@ def _mask_rcnn(folder: Path) -> list[str]:
     return [f"detector.weights={tiny_network_file(folder)}"]
 
 
+def _onnx_boxes(folder: Path) -> list[str]:
+    """Two boxes of 16 px in an input of 32, in YOLOX's cells: 4 x 4, 2 x 2 and one."""
+    pytest.importorskip("onnx")
+    from tests.tiny_networks import constant_network
+
+    (folder / "labels.txt").write_text("\n".join(CLASSES))
+    rows = np.zeros((21, 5 + len(CLASSES)))
+    rows[[5, 10]] = [[0.5, 0.5, np.log(2), np.log(2), 0.9, 0.7, 0.1], [0, 0, np.log(2), np.log(2), 0.8, 0.1, 0.6]]
+    weights = constant_network(folder / "tiny.onnx", (1, 3, 32, 32), {"output": rows[None]})
+    return [f"detector.weights={weights}", f"detector.labels={folder / 'labels.txt'}"]
+
+
 def _onnx_segmentation(folder: Path) -> list[str]:
     """Two boxes whose masks are the left and the lower halves of the image."""
     pytest.importorskip("onnx")
@@ -144,6 +154,7 @@ WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("dataset", "synthetic"): _synthetic,
     ("dataset", "tum_rgbd"): _tum_rgbd,
     ("detector", "mask_rcnn"): _mask_rcnn,
+    ("detector", "onnx_boxes"): _onnx_boxes,
     ("detector", "onnx_segmentation"): _onnx_segmentation,
     ("detector", "precomputed"): _precomputed,
     ("detector", "transformers_segmentation"): _transformers_segmentation,

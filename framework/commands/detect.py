@@ -63,8 +63,10 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     Frames that cannot be used are told and left out. Raises DataError when none can.
     """
     from framework.detection.coco_results import results_file
+    from framework.detection.domain import warn_outside_domain
     from framework.evaluation.mask_ap import mask_ap
 
+    warn_outside_domain(detector, sequence)
     with results_file(path, detector.classes) as results:
         precision = mask_ap(_written(results, detector, sequence), detector.classes, SMALLEST)
     log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)

@@ -17,13 +17,12 @@ from typing import Any
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from omegaconf import OmegaConf
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
-from framework.registry import STAGES, find_class, parameter_fields, plugin_fields
+from framework.registry import STAGES, composition, find_class, parameter_fields, plugin_fields
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -62,8 +61,7 @@ def _option(loader: Any, stage: str, name: str) -> Option:
     own = loader.repository.load_config(f"{stage}/{name}")
     target = str(own.config.get("_target_"))
     try:
-        defaults = loader.compute_defaults_list(f"{stage}/{name}", [], RunMode.RUN).defaults
-        inherited = {entry.config_path: entry.package for entry in defaults}  # in order, and the option's own file
+        inherited = composition(loader, stage, name)  # and the option's own file
         files = {path: loader.repository.load_config(path) for path, package in inherited.items() if package == stage}
         given = OmegaConf.to_container(OmegaConf.merge(*(file.config for file in files.values())), resolve=False)
         assert isinstance(given, dict)

@@ -67,6 +67,9 @@ def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tu
     Raises ConfigError for a position that there is not, FrameError when that frame cannot be used, and DataError when
     none of the few can.
     """
+    from framework.detection.domain import warn_outside_domain
+
+    warn_outside_domain(detector, sequence)
     if position is not None:
         if isinstance(position, bool) or not isinstance(position, int) or not 0 <= position < len(sequence):
             raise ConfigError(

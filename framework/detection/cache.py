@@ -14,6 +14,7 @@ import numpy as np
 from omegaconf import DictConfig
 
 from framework.data import Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
+from framework.detection.domain import domain_of
 from framework.detection.fingerprint import fingerprint
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
@@ -70,6 +71,7 @@ class CachedDetector(Detector):
 
     def __post_init__(self) -> None:
         self.classes = self.detector.classes
+        self.domain = domain_of(self.detector)
         self.reads = self.detector.reads if isinstance(self.detector, ReadsFields) else FRAME_FIELDS
         unknown = set(self.reads) - set(FRAME_FIELDS)
         if unknown:

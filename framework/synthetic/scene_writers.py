@@ -26,6 +26,7 @@ from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
 from framework.datasets.scenenn.intrinsics import write_intrinsics
+from framework.datasets.scenenn.scenenn import MADE_BY
 from framework.errors import ConfigError, DataError
 from framework.files.whole_files import written_whole
 from framework.synthetic.benchmark import SceneSpec
@@ -72,7 +73,7 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Recordin
 
 def _begin(root: Path, recording: Recording) -> None:
     """The files that all scenes share; refuses a folder that holds anything else."""
-    made_by = root / "synthesize.json"
+    made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
         try:

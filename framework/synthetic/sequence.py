@@ -11,6 +11,7 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
 from framework.datasets.scene_truth import LabeledDepth, fuse_scene_truth
+from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError
 from framework.interfaces import RGBDSequence
 from framework.synthetic.depth_camera import DepthSensor, noisy_color
@@ -42,6 +43,7 @@ class Synthetic(RGBDSequence):
     stride: int = 1  # take every stride-th frame
     share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
     truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
+    domain = RENDERED_ROOMS
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.share)

@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from framework.data import Bool, Camera, Detections, Frame
 from framework.detection.device import torch_device
+from framework.detection.domain import RENDERED_ROOMS
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import Fact, load_network, save_network
 from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
@@ -69,6 +70,7 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
         "batch": schedule.batch,
         "seed": int(config.seed),
         "bfloat16": schedule.bfloat16,
+        "domain": RENDERED_ROOMS,
         "limits": "trained on rendered rooms only, at 320x240; of photographs it knows nothing",
     }
     save_network(trainer.trained(), folder / NETWORK, card, half=True)

@@ -14,7 +14,7 @@ from framework.data import Detections, Float32, Frame, Int32
 from framework.detection.boxes import to_original_image
 from framework.detection.device import torch_device
 from framework.detection.fusion import fuse_batch_norms
-from framework.detection.mask_rcnn.checkpoint import read_network
+from framework.detection.mask_rcnn.checkpoint import domain_of_network, read_network
 from framework.detection.mask_rcnn.network import select
 from framework.detection.mask_rcnn.published_weights import find_network
 from framework.detection.masks import paste_masks, without_duplicates
@@ -32,7 +32,7 @@ class MaskRCNNDetector(Detector):
     object classes, renormalised without the background; its score is the probability of its own class with the
     background counted. Non-maximum suppression within a class is the network's own; `agnostic_nms` then lets a mask
     fall to a better one of whatever class, so that an object that could be a chair or a couch comes back once, with
-    both in its distribution. After building, `weights` is the file that was read.
+    both in its distribution. After building, `weights` is the file that was read, and `domain` what pictures it is for.
     """
 
     weights: Path = Path(
@@ -68,6 +68,7 @@ class MaskRCNNDetector(Detector):
         try:
             self.weights = find_network(self.weights)
             network = read_network(self.weights)
+            self.domain = domain_of_network(self.weights)
         except DataError as error:
             raise DataError(f"detector.weights: {error}") from error
         architecture = network.architecture

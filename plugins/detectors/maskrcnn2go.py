@@ -53,7 +53,7 @@ class MaskRCNN2Go(Detector):
     be a chair or a couch comes back once, with both in its distribution, and does not start two map instances.
     """
 
-    weights: Path = Path("../shared/weights/maskrcnn2go_int8")  # folder; relative: to the working, then project folder
+    weights: Path = Path("plugins/detectors/maskrcnn2go_int8")  # folder; relative: to the working, then project folder
     score_threshold: float = 0.1  # in [0, 1): low, for weak detections may still update instances that exist
     nms: float = 0.3  # IoU in (0, 1] above which a box falls to a better one of its class
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off

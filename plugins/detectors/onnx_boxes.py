@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from framework.data import Bool, Detections, Frame
@@ -18,7 +18,7 @@ from framework.parameters import require
 
 log = logging.getLogger(__name__)
 
-YOLOX_NANO = "d39bee73564e338080378b0ad567fbb40e818b55bbfaf971de82a0267ed16b8a"
+WHERE = "yolox_nano.onnx (3.7 MB, COCO, Apache-2.0) is at https://github.com/Megvii-BaseDetection/YOLOX/releases"
 
 
 @dataclass
@@ -28,11 +28,11 @@ class OnnxBoxes(Detector):
     The class distribution of a detection is its class scores, times the objectness, divided by their sum; its score is
     the largest of them before the division. A mask is what stands in front in the box and holds together there, see
     `framework.detection.box_masks`; a box with too little depth for that is dropped, and counted in
-    `boxes_without_depth`. The parameters of the default network are those of YOLOX-nano (Megvii, COCO).
+    `boxes_without_depth`. The network is the user's; the defaults are those of Megvii's YOLOX.
     """
 
-    weights: Path = Path("../shared/weights/yolox_nano/yolox_nano.onnx")  # relative: to the working, project folder
-    sha256: str = YOLOX_NANO  # what the file must have; "" = whatever it is
+    weights: Path = field(metadata={"where": WHERE})  # ONNX file; relative: to the working, then project folder
+    sha256: str = ""  # what the file must have; "" = whatever it is
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
     layout: Layout = Layout.yolox  # what the outputs are
     score_threshold: float = 0.1  # in (0, 1): low, for weak detections may still update instances that exist

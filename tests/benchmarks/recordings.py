@@ -24,7 +24,7 @@ class Recording:
 def red_kitchen(shared: Path, frames: int) -> Recording:
     """A real Kinect video with a real detector's masks."""
     sequence = RgbdFolder(shared / "data" / "redkitchen", stop=frames)
-    return _recorded("redkitchen", sequence, MaskRCNN2Go(weights=shared / "weights" / "maskrcnn2go_int8"))
+    return _recorded("redkitchen", sequence, MaskRCNN2Go())
 
 
 def furnished_room(frames: int) -> Recording:

@@ -53,11 +53,11 @@ def test_unpacking_detections(benchmark: BenchmarkFixture) -> None:
 
 def test_the_second_run(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path) -> None:
     """A network on a real video, then the same video again, from the cache."""
-    data, weights = shared / "data" / "redkitchen", shared / "weights" / "maskrcnn2go_int8"
-    if not (data.is_dir() and weights.is_dir()):
-        pytest.skip(f"{data} or {weights} is not there")
+    data = shared / "data" / "redkitchen"
+    if not data.is_dir():
+        pytest.skip(f"{data} is not there")
     frames = list(RgbdFolder(data, stop=FRAMES))
-    detector = MaskRCNN2Go(weights=weights, device="cpu")
+    detector = MaskRCNN2Go(device="cpu")
     detector.detect(frames[0])  # warm
     first = CachedDetector(detector, tmp_path)
     started = time.perf_counter()

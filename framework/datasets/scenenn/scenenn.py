@@ -7,6 +7,7 @@
     NNN/NNN.ply, NNN/NNN.xml    optional: the mesh with a label for each vertex, and what the labels mean
     intrinsic/asus.ini          fx, fy, cx, cy
     release.txt                 optional, one line: the release of the annotation
+    synthesize.json             only where `python -m framework synthesize` made it all: with which parameters
 
 The images are those that the official play-back, or `python -m framework convert-oni`, extracts from oni/NNN.oni.
 """
@@ -29,6 +30,7 @@ from framework.datasets.scenenn.intrinsics import read_intrinsics
 from framework.datasets.scenenn.scenenn_annotation import Annotated, read_annotation
 from framework.datasets.scenenn.timestamps import read_timestamps
 from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
+from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError, FrameError
 from framework.files.ply import read_ply
 from framework.files.whole_files import read_text
@@ -36,6 +38,7 @@ from framework.label_spaces import SCENENN_TO_COCO
 
 DEPTH_SCALE = 1000.0  # units a metre
 MOST_ID = np.iinfo(np.int32).max
+MADE_BY = "synthesize.json"  # in the folder of rendered rooms
 
 log = logging.getLogger(__name__)
 
@@ -60,6 +63,8 @@ class SceneNN(LabeledRecording):
     release: str = ""  # of the annotation, for tables: two exist and give other results; "" = what release.txt says
 
     def open(self) -> Contents:
+        if (self.root / MADE_BY).is_file():
+            self.domain = RENDERED_ROOMS
         number = self.folder.resolve().name
         images = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
         depths = numbered_images(self.folder / "depth", (".png",))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from framework.detection.mask_rcnn.detectron2_checkpoint import from_detectron2, is_detectron2, read_pickle
 from framework.detection.mask_rcnn.network import MaskRCNN
-from framework.detection.mask_rcnn.network_file import load_network
+from framework.detection.mask_rcnn.network_file import describe_network, load_network
 from framework.detection.mask_rcnn.torchvision_checkpoint import from_torchvision, is_torchvision
 from framework.errors import DataError
 
@@ -40,6 +40,11 @@ def read_network(
     if kind is CheckpointKind.DETECTRON2:
         return from_detectron2(state, str(path), classes)
     return from_torchvision(state, str(path), classes, norm_eps)
+
+
+def domain_of_network(path: Path) -> str:
+    """The only pictures that the network in `path` is for, as its card says; "" where it says nothing."""
+    return str(describe_network(path).card.get("domain", "")) if path.suffix == ".safetensors" else ""
 
 
 def _read_torch(path: Path) -> dict[str, Tensor]:

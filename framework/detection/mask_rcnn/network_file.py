@@ -1,7 +1,7 @@
 """Networks as files: safetensors, whose metadata say what the network is and where it comes from.
 
 architecture     the Architecture as JSON
-card             the model card's facts as JSON: data, steps, AP, limits, ...
+card             the model card's facts as JSON: data, steps, AP, limits, ...; `domain`: the only pictures it is for
 tensors_sha256   of all names, shapes and values, so that a damaged file is noticed
 """
 

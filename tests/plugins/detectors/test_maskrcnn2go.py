@@ -11,12 +11,12 @@ import torch
 from framework.data import Camera, Frame
 from framework.detection.masks import mask_overlaps, tight_boxes
 from framework.errors import ConfigError, DataError
+from framework.files.search_paths import PROJECT_ROOT
 from framework.label_spaces import COCO
 from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, Network, _dequantised, _read_network
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
-WEIGHTS = SHARED / "weights" / "maskrcnn2go_int8"
-needs_weights = pytest.mark.skipif(not WEIGHTS.is_dir(), reason=f"{WEIGHTS} is absent")
+WEIGHTS = PROJECT_ROOT / "plugins" / "detectors" / "maskrcnn2go_int8"
 
 
 def picture(color):
@@ -128,7 +128,6 @@ def test_a_network_runs_only_what_its_outputs_need():
 # The network
 
 
-@needs_weights
 @pytest.mark.parametrize(
     ("scene", "index", "expected"),
     [
@@ -144,7 +143,6 @@ def test_expected_objects_are_found(detector, scene, index, expected):
     assert not missing, f"found only {found}"
 
 
-@needs_weights
 def test_the_mask_of_the_true_bed_sits_on_it(detector):
     """Replica's rendering has instance ground truth: the detection that is sure of a bed covers the labelled bed."""
     root = SHARED / "data" / "replica_floor2"
@@ -162,7 +160,6 @@ def test_the_mask_of_the_true_bed_sits_on_it(detector):
     assert np.median(ious) > 0.8  # its pillows carry labels of their own
 
 
-@needs_weights
 def test_mask_grids_are_the_channels_that_the_whole_graph_computes(detector):
     """The shortcut upsamples one class a detection; the graph upsamples all 81."""
     graph, tensors = _read_network(WEIGHTS)
@@ -174,7 +171,6 @@ def test_mask_grids_are_the_channels_that_the_whole_graph_computes(detector):
         np.testing.assert_allclose(detector._mask_grids(pooled, label), expected.numpy(), atol=1e-5)
 
 
-@needs_weights
 def test_detections_keep_the_contract(detector):
     frame = shared_picture("redkitchen", 290)
     detections = detector.detect(frame)
@@ -188,7 +184,6 @@ def test_detections_keep_the_contract(detector):
     assert detections.masks.any(axis=(1, 2)).all()
 
 
-@needs_weights
 def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
     frame = shared_picture("mit76", 0)
     before = frame.color.copy()
@@ -200,7 +195,6 @@ def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
         np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
 
 
-@needs_weights
 def test_no_two_masks_of_one_object(detector):
     frame = shared_picture("redkitchen", 0)
     overlaps = mask_overlaps(detector.detect(frame).masks)
@@ -211,7 +205,6 @@ def test_no_two_masks_of_one_object(detector):
     assert len(MaskRCNN2Go(device="cpu", agnostic_nms=1.0).detect(frame)) > len(overlaps)
 
 
-@needs_weights
 @pytest.mark.parametrize("shape", [(480, 640), (33, 57), (240, 1280), (1, 1), (5, 2000)])
 def test_blank_images_of_any_size_are_fine(detector, shape):
     for value in (0, 255):
@@ -219,7 +212,6 @@ def test_blank_images_of_any_size_are_fine(detector, shape):
         assert detections.masks.shape == (len(detections), *shape)
 
 
-@needs_weights
 def test_another_size_shows_the_same_objects(detector):
     frame = shared_picture("redkitchen", 290)
     small = picture(cv2.resize(frame.color, (400, 300), interpolation=cv2.INTER_AREA))
@@ -228,7 +220,6 @@ def test_another_size_shows_the_same_objects(detector):
     assert found["chair"] > 0.8
 
 
-@needs_weights
 def test_a_relative_path_works_from_any_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert MaskRCNN2Go(device="cpu").classes == COCO
@@ -250,7 +241,6 @@ def test_absent_weights_are_one_line_that_says_where_they_were_looked_for(tmp_pa
         MaskRCNN2Go(weights=tmp_path, device="cpu")
 
 
-@needs_weights
 def test_damaged_weights_are_refused(tmp_path):
     for name in SHA256:
         (tmp_path / name).write_bytes((WEIGHTS / name).read_bytes())

@@ -167,10 +167,10 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
         {"device": "tpu"},
     ],
 )
-def test_a_wrong_parameter_is_named(parameters):
+def test_a_wrong_parameter_is_named(parameters, tmp_path):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
-        OnnxBoxes(**parameters)
+        OnnxBoxes(weights=tmp_path / "absent.onnx", **parameters)
 
 
 # YOLOX-nano
@@ -217,7 +217,13 @@ def test_yolox_nano_computes_what_it_does_in_opencv(shared, nano):
     np.testing.assert_allclose(found, reference.forward(), atol=1e-3)
 
 
-def test_the_shared_network_is_the_config_s(shared, nano):
-    detector = registered.built("detector", "onnx_boxes", "device=cpu")
-    assert detector.classes == COCO
-    assert detector.sha256 == nano._network._network.sha256
+def test_the_other_defaults_are_those_of_this_network(shared, nano):
+    detector = registered.built("detector", "onnx_boxes", "device=cpu", f"detector.weights={shared / WEIGHTS}")
+    assert detector.classes == nano.classes == COCO
+    found = detector.detect(shared_frame(shared, "redkitchen", 0))
+    np.testing.assert_array_equal(found.scores, nano.detect(shared_frame(shared, "redkitchen", 0)).scores)
+
+
+def test_without_weights_it_says_where_some_are():
+    with pytest.raises(ConfigError, match=r"must be given: detector\.weights=\.\.\.; yolox_nano\.onnx .* https://"):
+        registered.built("detector", "onnx_boxes")
