@@ -1,5 +1,6 @@
 """YOLO-style segmentation on networks whose boxes, scores and masks are known."""
 
+import cv2
 import numpy as np
 import pytest
 
@@ -7,6 +8,7 @@ from framework.data import Camera, Frame
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
+from tests.rewritten_exports import LAYOUTS, rewritten
 from tests.test_contracts import (  # noqa: F401  the contract of every detector, on the `detector` below
     test_detector_gives_the_same_for_the_same_frame_in_any_order,
     test_detector_needs_no_truth_or_says_so,
@@ -69,7 +71,7 @@ def test_boxes_scores_and_masks(tmp_path, objectness, transposed):
     ("changed", "message"),
     [
         ({"output1": np.zeros((1, 3, 40, 40))}, "must have 10 columns"),
-        ({"output1": np.zeros((1, 40, 40))}, r"outputs \(1, 4 \+ classes \+ M, K\) and \(1, M, h, w\), found output0"),
+        ({"output1": np.zeros((1, 40, 40))}, r"outputs, \(1, 4 \+ classes \+ M, K\) or .*, found output0"),
         ({"more": np.zeros((1, 2))}, r"found output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )
@@ -97,3 +99,49 @@ def test_a_wrong_parameter_is_named(tmp_path, parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
         OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})
+
+
+IMAGES = ("mit76/color/000000.jpg", "redkitchen/color/000240.jpg", "replica_floor2/color/000048.jpg")
+
+
+@pytest.fixture(scope="module")
+def yolo(shared):
+    """A real network, as its exporter wrote it."""
+    path = shared / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+@pytest.fixture(scope="module")
+def photographs(shared_data):
+    """Frames of three real videos."""
+    colors = [cv2.cvtColor(cv2.imread(str(shared_data / name)), cv2.COLOR_BGR2RGB) for name in IMAGES]
+    cameras = [Camera(c.shape[1], c.shape[0], 500.0, 500.0, 0.0, 0.0) for c in colors]
+    return [Frame(k, 0.0, c, np.ones(c.shape[:2], np.float32), cameras[k]) for k, c in enumerate(colors)]
+
+
+@pytest.fixture(scope="module")
+def expected(yolo, photographs):
+    return [OnnxSegmentation(weights=yolo, device="cpu").detect(frame) for frame in photographs]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_real_network_finds_the_same_in_every_layout(tmp_path, yolo, photographs, expected, layout):
+    detector = OnnxSegmentation(weights=rewritten(yolo, layout, tmp_path / "n.onnx"), device="cpu")
+    assert detector._layout.suppressed == ("suppressed" in layout or "best rows" in layout)
+    for photograph, wanted in zip(photographs, expected, strict=True):
+        found = detector.detect(photograph)
+        assert len(found) == len(wanted) > 2
+        np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-5)
+        np.testing.assert_array_equal(
+            found.class_probabilities.argmax(axis=1), wanted.class_probabilities.argmax(axis=1)
+        )
+        both = (found.masks & wanted.masks).sum(axis=(1, 2)) / (found.masks | wanted.masks).sum(axis=(1, 2))
+        assert both.min() > 0.995
+        if detector._layout.suppressed:  # the score is the label's probability, and the others share the rest
+            best = np.maximum(found.scores, 1 / len(found.classes))
+            np.testing.assert_allclose(found.class_probabilities.max(axis=1), best, rtol=1e-5)
+            np.testing.assert_allclose(found.class_probabilities.min(axis=1), (1 - best) / 79, atol=1e-6)
+        else:
+            np.testing.assert_allclose(found.class_probabilities, wanted.class_probabilities, atol=1e-4)
