@@ -22,6 +22,8 @@ SURELY_CENTERS = 0.5  # likewise, of which sizes have a few per cent: no size gr
 FEWEST_ROWS = 20  # below, the shares above say little
 LARGEST_UNIT = 2.0  # boxes in 0..1 may reach over the border; no box in px lies within 2 px of the upper left corner
 CONFIDENT = 0.5  # score from which a box that ends before it begins is no accident
+STRIDES = (8, 16, 32, 64)  # px; of the cells of the YOLO family, the last in large networks only
+BOXES_A_CELL = (1, 3)  # 3 up to YOLOv7
 SCORE, LABEL, COEFFICIENTS = 4, 5, 6  # columns of a table with suppression, after x1 y1 x2 y2
 
 
@@ -127,7 +129,7 @@ def recognise(
     columns = _first_score(objectness) + classes + count
     is_rows, is_columns = table.shape[2] == columns, table.shape[1] == columns
     suppressed = table.shape[2] == COEFFICIENTS + count and (
-        not (is_rows or is_columns) or _looks_suppressed(table[0], classes)
+        not (is_rows or is_columns) or _looks_suppressed(table[0], classes, shape)
     )
     if not suppressed and is_rows == is_columns:
         raise DataError(_no_such_table(table.shape, columns, count, objectness, is_rows))
@@ -174,9 +176,14 @@ def _are_labels(column: Float32, classes: int) -> bool:
     return bool(((column >= 0) & (column < classes) & (column == np.rint(column))).all())
 
 
-def _looks_suppressed(rows: Float32, classes: int) -> bool:
-    """Whether a table that could be either is one of detections: with labels, and nothing where the score is 0."""
-    return _are_labels(rows[:, LABEL], classes) and not rows[rows[:, SCORE] == 0, :4].any()
+def _looks_suppressed(rows: Float32, classes: int, shape: tuple[int, int]) -> bool:
+    """Whether a table that could be either is one of detections: with labels, and not as many rows as cells.
+
+    Scores are no whole numbers, but for those of networks of 8 bits, where most are 0.
+    """
+    cells = [-(-shape[0] // stride) * -(-shape[1] // stride) for stride in STRIDES]
+    counts = {boxes * sum(cells[:levels]) for boxes in BOXES_A_CELL for levels in (3, 4)}
+    return _are_labels(rows[:, LABEL], classes) and len(rows) not in counts
 
 
 def _no_such_table(shape: tuple[int, ...], columns: int, count: int, objectness: bool, both: bool) -> str:

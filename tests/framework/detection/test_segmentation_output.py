@@ -13,10 +13,13 @@ ULTRALYTICS = ExportMetadata(author="Ultralytics")
 
 
 def cells():
-    """Boxes of all cells of stride 8: centre x, y, width, height, px."""
-    y, x = np.indices((8, 12)).reshape(2, -1)
-    sizes = np.random.default_rng(0).uniform(4, 24, (2, 96))
-    return np.stack([8 * x + 4, 8 * y + 4, *sizes], axis=1)
+    """Boxes of all cells of the strides 8, 16 and 32: centre x, y, width, height, px."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for stride in (8, 16, 32):
+        y, x = np.indices((SHAPE[0] // stride, SHAPE[1] // stride)).reshape(2, -1)
+        rows.append(np.stack([stride * (x + 0.5), stride * (y + 0.5), *rng.uniform(4, 24, (2, len(x)))], axis=1))
+    return np.concatenate(rows)
 
 
 def as_corners(boxes):
@@ -118,11 +121,15 @@ def test_detections_whose_boxes_end_before_they_begin_are_no_corners():
 
 
 def test_two_classes_make_both_tables_equally_wide():
-    """4 + 2 + M = 6 + M: only labels are whole numbers."""
+    """4 + 2 + M = 6 + M: only labels are whole numbers, and only cells are as many as cells."""
     layout, _ = seen(dense(cells(), classes=2).transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
     layout, _ = seen(detections(as_corners(cells())[50:60], 0.7, 1), classes=2)
     assert layout.suppressed
+    below = detections(as_corners(cells())[50:60], 0.0, 0)  # TensorFlow's exports keep boxes below the threshold
+    layout, output = seen(below, classes=2)
+    assert layout.suppressed
+    assert output.candidates.class_scores.sum() == 0
     quantised = dense(cells(), classes=2)
     quantised[:, 4:6] = 0  # cells, where 8 bits have no smaller number
     layout, _ = seen(quantised.transpose(0, 2, 1), classes=2)
@@ -144,7 +151,7 @@ def test_a_map_that_may_lie_either_way():
     assert seen(dense(boxes), **square, metadata=ULTRALYTICS, input_channels_last=True)[0].channels_last
 
 
-MIXED = np.where((np.arange(96) % 3 > 0)[:, None], as_corners(cells()), cells())
+MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells())
 
 
 @pytest.mark.parametrize(
@@ -152,14 +159,14 @@ MIXED = np.where((np.arange(96) % 3 > 0)[:, None], as_corners(cells()), cells())
     [
         (dense(MIXED), {}, r"may be corners or centre and size .*detector\.boxes=CENTER or CORNER"),
         (dense(cells() / 8), {}, "neither in px of its input 64x96 nor in 0..1"),
-        (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 96\): set detector.objectness=true"),
-        (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 96\): set detector.objectness=false"),
+        (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\): set detector.objectness=true"),
+        (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\): set detector.objectness=false"),
         (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression inside, .*other detector\.labels"),
         (detections(as_corners(cells()), 0.9, 3), {}, r"labels from 0 to 2, found 3 to 3: choose other detector"),
         (detections(as_corners(cells()), 1.5, 1), {}, r"scores must be in \[0, 1\], found 0 to 1.5"),
         (np.zeros((1, 11, 11)), {}, "as many candidates as columns, 11"),
         (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"16, 16\) have other proportions; its input is 64x96"),
-        (dense(cells())[0], {}, r"must have two outputs, .*, found output0 \(11, 96\)"),
+        (dense(cells())[0], {}, r"must have two outputs, .*, found output0 \(11, 126\)"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_told_is_refused_in_one_line(table, given, message):
