@@ -71,12 +71,11 @@ def _weights(names: Collection[str]) -> list[str]:
 
 def _download(model: str, revision: str) -> None:
     """Fetches what is needed, with progress bars of huggingface_hub, each file whole or not at all."""
-    for variable in (*HUB_OFFLINE, OFFLINE):
-        if os.environ.get(variable, "0").lower() not in ("", "0", "off", "no", "false"):
-            raise DataError(
-                f"detector.model: {model} is no folder, and {variable} forbids to download it: unset that, or give a"
-                " local folder"
-            )
+    if variable := _forbidden_by():
+        raise DataError(
+            f"detector.model: {model} is no folder, and {variable} forbids to download it: unset that, or give a local"
+            " folder"
+        )
     from huggingface_hub import HfApi, constants
 
     hub = HfApi()
@@ -99,6 +98,12 @@ def _download(model: str, revision: str) -> None:
         ) from error
     for name, path in paths.items():
         _check(path, files[name])
+
+
+def _forbidden_by() -> str:
+    """The environment variable that forbids downloads; empty where none does."""
+    forbidding = [name for name in HUB_OFFLINE if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
+    return (forbidding + [OFFLINE] * bool(os.environ.get(OFFLINE)) + [""])[0]
 
 
 def _licence(info: Any) -> str:
