@@ -56,8 +56,16 @@ def _cached(model: str, revision: str) -> Path | None:
     names = {file.name for file in folder.iterdir() if file.exists()}
     weights = _weights(names)
     if INDEX in weights:
-        weights = [*json.loads((folder / INDEX).read_text("utf-8"))["weight_map"].values()]
+        weights = _listed(folder / INDEX)
     return folder if weights and {PREPROCESSING, *weights} <= names else None
+
+
+def _listed(index: Path) -> list[str]:
+    """The files that a model's weights are divided among."""
+    try:
+        return [*json.loads(index.read_text("utf-8"))["weight_map"].values()]
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise DataError(f"detector.model: {index} is damaged: delete {index.parents[2]}, and run again") from error
 
 
 def _weights(names: Collection[str]) -> list[str]:

@@ -122,6 +122,8 @@ def test_weights_in_several_files(hub):
     hub.sent.clear()
     assert find_model("somebody/something", "main") == folder
     assert hub.sent == ["model-00002-of-00002.safetensors"]
+    (folder / "model.safetensors.index.json").write_text("[]")
+    assert f"is damaged: delete {folder.parents[1]}, and run again" in fault()
 
 
 def test_what_was_not_published_is_not_kept(hub):
