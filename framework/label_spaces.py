@@ -36,6 +36,14 @@ SPACES: Mapping[str, tuple[str, ...]] = {
 COCO = SPACES["coco"]
 """The 80 classes of COCO, in the order of the detectors trained on it."""
 
+NO_CLASS = "n/a"
+"""The name of a number that has no class, in any space."""
+
+_UNUSED_IDS = (0, 12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # 91 classes were planned from 1 on, 80 were annotated
+_COCO_IDS = [k for k in range(91) if k not in _UNUSED_IDS]
+COCO_BY_ID = tuple(COCO[_COCO_IDS.index(k)] if k in _COCO_IDS else NO_CLASS for k in range(91))
+"""COCO's classes by the ids of its annotation files, 0 to 90, as DETR and RF-DETR count them; gaps are NO_CLASS."""
+
 SCENENN_TO_COCO = {name: coco for name, coco in _SECTIONS["scenenn"].items() if coco is not None}
 """The nine classes that the paper evaluates on SceneNN, and what COCO calls them."""
 

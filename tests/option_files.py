@@ -139,6 +139,13 @@ def _transformers_segmentation(folder: Path) -> list[str]:
     return [f"detector.model={write_network(folder, 'mask2former')}", "detector.score_threshold=0.02"]
 
 
+def _rf_detr_seg(folder: Path) -> list[str]:
+    pytest.importorskip("transformers")
+    from tests.tiny_transformers import write_network
+
+    return [f"detector.model={write_network(folder, 'rf_detr')}", "detector.score_threshold=0.02"]
+
+
 def _trajectory_file(folder: Path) -> list[str]:
     frames = range(len(CornerRoom()))
     write_tum(folder / "poses.txt", [k / 30 for k in frames], [pose_at(k) for k in frames])
@@ -157,6 +164,7 @@ WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("detector", "onnx_boxes"): _onnx_boxes,
     ("detector", "onnx_segmentation"): _onnx_segmentation,
     ("detector", "precomputed"): _precomputed,
+    ("detector", "rf_detr_seg"): _rf_detr_seg,
     ("detector", "transformers_segmentation"): _transformers_segmentation,
     ("tracker", "trajectory_file"): _trajectory_file,
 }

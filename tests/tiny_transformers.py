@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -112,14 +113,15 @@ PREPROCESSING: dict[str, dict[str, Any]] = {
 }
 
 
-def write_network(folder: Path, kind: str) -> Path:
-    """One of a family, spread so that classes and masks differ from query to query."""
+def write_network(folder: Path, kind: str, labels: Mapping[int, str] | None = None) -> Path:
+    """One of a family, spread so that classes and masks differ from query to query; its classes are LABELS or these."""
     import transformers
 
     name, parameters = MODELS[kind]
     torch.manual_seed(3)
     model_class = getattr(transformers, name)
-    config = model_class.config_class(**parameters, id2label=dict(enumerate(LABELS)), num_labels=len(LABELS))
+    names = dict(labels or enumerate(LABELS))
+    config = model_class.config_class(**parameters, id2label=names, num_labels=len(names))
     model = model_class(config)
     with torch.no_grad():
         for key, weights in model.named_parameters():

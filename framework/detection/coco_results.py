@@ -28,9 +28,7 @@ from framework.detection.stored_detection import (
 )
 from framework.errors import ConfigError, DataError
 from framework.files.whole_files import written_whole
-from framework.label_spaces import COCO
-
-_UNUSED_IDS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)  # of COCO's annotation files: 91 were planned, 80 were annotated
+from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
 
 class CategoryIds(Enum):
@@ -46,7 +44,7 @@ class CategoryIds(Enum):
             return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
         if tuple(labels) != COCO:
             raise ConfigError("detector.category_ids must be FROM_ONE or FROM_ZERO where labels is not coco")
-        return [k for k in range(1, 91) if k not in _UNUSED_IDS]
+        return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:

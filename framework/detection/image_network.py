@@ -8,14 +8,17 @@ import numpy as np
 
 from framework.data import UInt8
 from framework.detection.letterbox import Letterbox, Placement, network_input
-from framework.detection.onnx_network import OnnxNetwork, Outputs
+from framework.detection.litert_network import LitertNetwork
+from framework.detection.network_outputs import Outputs
+from framework.detection.onnx_network import OnnxNetwork
 from framework.parameters import require
 
 
 class ImageNetwork:
-    """An ONNX network, and how it wants its images; the arguments are parameters of the detectors that have one.
+    """A network in a file, and how it wants its images; the arguments are parameters of the detectors that have one.
 
-    Raises ConfigError for a parameter out of its bounds, and what `OnnxNetwork` raises.
+    A file that ends with .tflite runs in LiteRT, every other one in onnxruntime. Raises ConfigError for a parameter out
+    of its bounds, and what `OnnxNetwork` raises.
     """
 
     def __init__(
@@ -36,10 +39,13 @@ class ImageNetwork:
         require(0 <= padding <= 255, "detector.padding", padding, "in [0, 255]")
         require(bool(np.isfinite([black, white]).all()) and black != white, "detector.white", white, f"not {black}")
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
-        self._network = OnnxNetwork(path, sha256, device, input_size)
+        kind = LitertNetwork if path.suffix.lower() == ".tflite" else OnnxNetwork
+        self._network: LitertNetwork | OnnxNetwork = kind(path, sha256, device, input_size)
         whole = self._network.dtype != "uint8" or (black, white) == (0, 255)
         require(whole, "detector.black and white", f"{black} and {white}", "0 and 255 for a network of whole numbers")
         self.shape = self._network.shape  # (height, width) px
+        self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
+        self.metadata = self._network.metadata
         self._placement, self._padding, self._bgr = placement, padding, bgr
         self._black, self._white = black, white
 

@@ -4,23 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from framework.data import Float32
+from framework.data import Array
+from framework.detection.export_metadata import ExportMetadata
+from framework.detection.network_outputs import Outputs, finite_outputs, one_line
+from framework.detection.weights_file import checked_hash, find_file, input_shape
 from framework.errors import ConfigError, DataError
-from framework.files.hashing import path_hash
-from framework.files.search_paths import candidates
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
 
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # numpy's names
-
-Array = np.ndarray[Any, Any]
-Outputs = dict[str, Float32]
 
 
 class OnnxNetwork:
@@ -41,13 +39,15 @@ class OnnxNetwork:
             ConfigError: onnxruntime or the device is not there, or `input_size` does not fit the network.
         """
         self.path = find_file(path)
-        self.sha256 = _checked_hash(self.path, sha256)
+        self.sha256 = checked_hash(self.path, sha256)
         self._session = _loaded(self.path, device)
+        self.metadata = ExportMetadata.parse(self._session.get_modelmeta().custom_metadata_map)
         image = _image_input(self.path, self._session.get_inputs())
         self._name = image.name
         self.dtype = INPUT_DTYPES[image.type]
         self.channels_last = image.shape[3] == 3 and image.shape[1] != 3  # (1, H, W, 3), as in networks from TensorFlow
-        self.shape = _input_shape(self.path, image, self.channels_last, input_size)
+        sides = image.shape[1:3] if self.channels_last else image.shape[2:]
+        self.shape = input_shape(self.path, _described(image), tuple(map(_length, sides)), input_size, self.metadata)
 
     def __call__(self, image: Array) -> Outputs:
         """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
@@ -59,32 +59,8 @@ class OnnxNetwork:
         try:
             outputs = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
         except Exception as error:  # onnxruntime has no base of its own
-            raise DataError(f"{self.path} failed in onnxruntime: {_one_line(error)}") from error
-        arrays = {name: np.asarray(output, np.float32) for name, output in zip(names, outputs, strict=True)}
-        for name, array in arrays.items():
-            if not np.isfinite(array).all():
-                raise DataError(f"{self.path}: the output {name} holds values that are not finite")
-        return arrays
-
-
-def find_file(path: Path) -> Path:
-    """The file `path`. A relative one is tried from the working folder, then from the project's."""
-    path = path.expanduser()
-    for candidate in candidates(path):
-        if candidate.is_file():
-            return candidate
-    looked = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
-    raise DataError(f"detector.weights: there is no file {looked}; put the network there, or name another")
-
-
-def _checked_hash(path: Path, sha256: str) -> str:
-    try:
-        found = path_hash(path)
-    except OSError as error:
-        raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
-    if sha256 and found != sha256.lower():
-        raise DataError(f"detector.weights: {path} has the sha256 {found}, expected {sha256}")
-    return found
+            raise DataError(f"{self.path} failed in onnxruntime: {one_line(error)}") from error
+        return finite_outputs(self.path, zip(names, outputs, strict=True))
 
 
 def _loaded(path: Path, device: str) -> InferenceSession:
@@ -104,7 +80,7 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
     except Exception as error:  # onnxruntime has no base of its own
-        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {_one_line(error)}") from error
+        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {one_line(error)}") from error
     if device == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
         raise ConfigError("detector.device must be cpu or auto where CUDA cannot be started, found cuda")
     return session
@@ -123,21 +99,6 @@ def _image_input(path: Path, inputs: Sequence[NodeArg]) -> NodeArg:
     return image
 
 
-def _input_shape(path: Path, image: NodeArg, channels_last: bool, input_size: int) -> tuple[int, int]:
-    """(height, width) in px."""
-    height, width = map(_length, image.shape[1:3] if channels_last else image.shape[2:])
-    if height and width:
-        if input_size and (height, width) != (input_size, input_size):
-            raise ConfigError(
-                f"detector.input_size must be 0 or the network's own, found {input_size}: {path} takes"
-                f" {_described(image)}"
-            )
-        return height, width
-    if not input_size:
-        raise ConfigError(f"detector.input_size must be given in px: {path} takes any size: {_described(image)}")
-    return height or input_size, width or input_size
-
-
 def _described(tensor: NodeArg) -> str:
     shape = ", ".join(str(_length(n) or "any") for n in tensor.shape)
     return f"{tensor.name} ({shape}) {INPUT_DTYPES.get(tensor.type, tensor.type)}"
@@ -146,7 +107,3 @@ def _described(tensor: NodeArg) -> str:
 def _length(dimension: int | str | None) -> int:
     """0 = any: such a dimension has a name, or none."""
     return dimension if isinstance(dimension, int) else 0
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:300] or type(error).__name__

@@ -1,38 +1,49 @@
-"""An instance segmentation network of the YOLO family from an ONNX file that the user brings."""
+"""An instance segmentation network of the YOLO family from an ONNX or .tflite file that the user brings."""
 
 from __future__ import annotations
 
+import logging
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.data import Detections, Float32, Frame
-from framework.detection.candidates import Candidates, decode_yolo, described, rows_of
+from framework.data import Detections, Frame
 from framework.detection.image_network import ImageNetwork
 from framework.detection.letterbox import Placement
 from framework.detection.masks import without_duplicates
-from framework.detection.onnx_network import Outputs
+from framework.detection.one_label import spread_rest
 from framework.detection.prototype_masks import masks_from_prototypes
-from framework.errors import DataError
+from framework.detection.segmentation_output import BoxKind, recognise
 from framework.interfaces import Detector
 from framework.label_spaces import read_labels, to_coco
 from framework.parameters import require
 
+log = logging.getLogger(__name__)
+
 
 @dataclass
 class OnnxSegmentation(Detector):
-    """YOLO-style instance segmentation from the user's ONNX file: boxes, class scores, mask coefficients, prototypes.
+    """YOLO-style instance segmentation from the user's file: boxes, class scores, mask coefficients, prototypes.
 
-    The network has the outputs (1, 4 + C + M, K), or its transpose, and (1, M, h, w): K candidates, each a box (centre
-    x, y, width, height, px), C class scores and M coefficients of the prototypes; its own suppression must not be part
-    of it. The class distribution of a detection is its class scores divided by their sum; its score is the largest of
-    them before the division. The defaults are those of exports by Ultralytics; neither their code nor their weights
-    (AGPL) are part of this project.
+    The network has the outputs (1, 4 + C + M, K), or its transpose, and (1, M, h, w), or (1, h, w, M): K candidates,
+    each a box, C class scores and M coefficients of the prototypes. Or suppression is part of it, as in exports with
+    `nms=True` and of networks without duplicates: then the first is (1, K, 6 + M), with x1 y1 x2 y2, score and label.
+    Boxes are in px of the input or in 0..1. Which of these a file is, its shapes and its answer to a black image show,
+    see `framework.detection.segmentation_output`; what they do not show is refused. A file that ends with .tflite runs
+    in LiteRT (the extra `litert`), every other one in onnxruntime (the extra `onnx`).
+
+    The class distribution of a detection is its class scores divided by their sum; its score is the largest of them
+    before the division. With suppression inside, the scores of the other classes are lost: what the score lacks to 1 is
+    shared evenly among them, as `spread` says, and a map learns less from such a network about objects that could be
+    this or that. The other defaults are those of exports by Ultralytics; neither their code nor their weights (AGPL)
+    are part of this project.
     """
 
-    weights: Path  # ONNX file; a relative path is tried from the working, then the project folder
+    weights: Path  # ONNX or .tflite file; a relative path is tried from the working, then the project folder
     sha256: str = ""  # what the file must have; "" = whatever it is
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
     objectness: bool = False  # an objectness stands before the class scores, as in YOLOv5
+    boxes: BoxKind = BoxKind.AUTO  # what the four numbers of a box are
+    spread: float = 1.0  # in [0, 1]: with suppression inside, share of 1 - score that goes to the other classes
     score_threshold: float = 0.1  # in (0, 1): low, for weak detections may still update instances that exist
     nms: float = 0.45  # IoU in (0, 1] above which a box falls to a better one of its class
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
@@ -48,6 +59,7 @@ class OnnxSegmentation(Detector):
     reads = ("color",)
 
     def __post_init__(self) -> None:
+        require(0 <= self.spread <= 1, "detector.spread", self.spread, "in [0, 1]")
         require(0 < self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in (0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
@@ -67,35 +79,45 @@ class OnnxSegmentation(Detector):
             black=self.black,
             white=self.white,
         )
-        self._decode(self._network.try_out())
+        self._layout = recognise(
+            self._network.try_out(),
+            classes=len(self._labels),
+            objectness=self.objectness,
+            boxes=self.boxes,
+            shape=self._network.shape,
+            input_channels_last=self._network.channels_last,
+            metadata=self._network.metadata,
+        )
+        self._tell_of_labels()
 
     def detect(self, frame: Frame) -> Detections:
         outputs, letterbox = self._network(frame.color)
-        candidates, coefficients, prototypes = self._decode(outputs)
+        output = self._layout.read(outputs)
+        candidates = output.candidates
         best = candidates.best(self.score_threshold, self.nms, self.max_detections)
         class_probabilities, known = self._meaning.apply(candidates.class_scores[best])
         best, class_probabilities = best[known], class_probabilities[known]
+        scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
+        if self._layout.suppressed:
+            class_probabilities = spread_rest(class_probabilities, scores, self.spread)
         masks = masks_from_prototypes(
-            coefficients[best],
-            prototypes,
+            output.coefficients[best],
+            output.prototypes,
             letterbox.to_image(candidates.boxes[best]),
             letterbox,
             frame.camera.shape,
             self.mask_threshold,
         )
-        scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
         return without_duplicates(masks, scores, class_probabilities, self.classes, self.agnostic_nms)
 
-    def _decode(self, outputs: Outputs) -> tuple[Candidates, Float32, Float32]:
-        """The K candidates, their coefficients (K, M), and the prototypes (M, h, w)."""
-        tables = [output for output in outputs.values() if output.ndim == 3]
-        maps = [output for output in outputs.values() if output.ndim == 4]
-        if len(outputs) != 2 or len(tables) != 1 or len(maps) != 1 or maps[0].shape[0] != 1:
-            raise DataError(
-                "a segmentation network must have the outputs (1, 4 + classes + M, K) and (1, M, h, w),"
-                f" found {described(outputs)}"
-            )
-        prototypes = maps[0][0]
-        first = (5 if self.objectness else 4) + len(self._labels)  # of the coefficients
-        rows = rows_of(tables[0], first + len(prototypes))
-        return decode_yolo(rows[:, :first], self.objectness), rows[:, first:], prototypes
+    def _tell_of_labels(self) -> None:
+        """What to know of a network's classes before its map is looked at."""
+        if self._layout.suppressed:
+            log.info("%s gives one class a detection: what its score lacks to 1 goes to the others as detector.spread"
+                     " says, now %g", self.weights.name, self.spread)  # fmt: skip
+        names = self._network.metadata.names
+        different = [(k, a, b) for k, (a, b) in enumerate(zip(names, self._labels, strict=False)) if a != b]
+        if different:
+            number, theirs, ours = different[0]
+            log.warning("%s names %d of its %d classes otherwise than detector.labels=%s: %d is %r there, %r here",
+                        self.weights.name, len(different), len(names), self.labels, number, theirs, ours)  # fmt: skip

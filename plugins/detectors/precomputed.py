@@ -16,6 +16,7 @@ from framework.detection.coco_results import CategoryIds, read_results
 from framework.detection.fingerprint import fingerprint
 from framework.detection.mask_folder import read_mask_folder
 from framework.detection.masks import tight_boxes
+from framework.detection.one_label import spread_rest
 from framework.detection.stored_detection import StoredDetection
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
@@ -113,16 +114,8 @@ class Precomputed(Detector):
         if self.classes == self._labels:
             rows = given  # to the bit: normalising could change the last digit
         scores = np.array([one.score for one in stored])
-        rows[only_label] = self._spread(rows[only_label], scores[only_label])
+        rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.spread)
         return rows, known
-
-    def _spread(self, one_hot: Float32, scores: np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> Float32:
-        """Rows (N, C) of 0 and 1 with what the scores (N,) lack to 1 taken from the label and given to the others."""
-        c = one_hot.shape[1]
-        if c == 1:
-            return one_hot
-        own = np.maximum(1 - self.spread * (1 - scores), 1 / c)[:, None]
-        return np.asarray(np.where(one_hot > 0, own, (1 - own) / (c - 1)), np.float32)
 
     def _expect_a_match(self, index: int) -> None:
         if self._matched or index in self._frames:

@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,16 +17,16 @@ from torch.nn import functional
 from framework.data import Detections, Float32, Frame, UInt8
 from framework.detection.device import torch_device
 from framework.detection.fingerprint import fingerprint
+from framework.detection.hub_model import PREPROCESSING, find_model
 from framework.detection.masks import without_duplicates
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
-from framework.label_spaces import to_coco
+from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
 from framework.parameters import require
 
-PREPROCESSING_FILE = "preprocessor_config.json"
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what the files leave out by default
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers, as the files have them
-PLACEHOLDER = re.compile(r"LABEL_\d+")  # how transformers names a class that nobody named
+PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # of a class that nobody named, or of a gap in the numbers
 
 
 @dataclass(frozen=True)
@@ -70,6 +69,7 @@ FAMILIES = {
 class TransformersSegmentation(Detector):
     """Mask2Former, MaskFormer, EoMT, RF-DETR-Seg or DETR by model id or local folder; needs the extra `transformers`.
 
+    A model id that is not in the cache of huggingface_hub is downloaded into it; with HF_HUB_OFFLINE=1 it never is.
     Choose a checkpoint for instance or panoptic segmentation: one for semantic segmentation has one mask for all chairs
     of an image. The classes are those COCO names that the model's labels mean (framework/label_spaces.yaml); what it
     takes for a wall or another label without such a name is no detection.
@@ -83,7 +83,6 @@ class TransformersSegmentation(Detector):
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # id on huggingface.co, or a folder
     revision: str = "main"  # branch, tag or commit of a model id
-    local_files_only: bool = True  # False = a model id that is not in the local cache is downloaded into it
     score_threshold: float = 0.1  # in [0, 1): low, for weak detections may still update instances that exist
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
     max_detections: int = 100  # >= 1, an image: the queries with the best class
@@ -112,7 +111,7 @@ class TransformersSegmentation(Detector):
             f"at least {self.short_side} px" if self.short_side else "0 where short_side is 0",
         )
         self._device = torch_device(self.device)
-        checkpoint = Checkpoint(self.model, self.revision, self.local_files_only)
+        checkpoint = Checkpoint(self.model, self.revision)
         self._family = checkpoint.family
         self._preprocessing = checkpoint.read_preprocessing()
         if self.short_side:
@@ -291,12 +290,12 @@ def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int
 
 
 class Checkpoint:
-    """A model in the local cache, on huggingface.co or in a folder. Its faults are one line that says what to do.
+    """A model on huggingface.co or in a folder. Its faults are one line that says what to do.
 
     Code that comes with a model is never run.
     """
 
-    def __init__(self, model: str, revision: str, local_files_only: bool) -> None:
+    def __init__(self, model: str, revision: str) -> None:
         try:
             import transformers
         except ImportError as error:
@@ -304,10 +303,8 @@ class Checkpoint:
                 "the package transformers is not installed: pip install instancemap[transformers]"
             ) from error
         self._transformers = transformers
-        folder = Path(model).expanduser()
-        self.model = str(folder) if folder.is_dir() else model
-        self.options = {"revision": revision, "local_files_only": local_files_only}
-        self.config = self._read("its config.json", transformers.AutoConfig.from_pretrained, self.model, **self.options)
+        self.folder = find_model(model, revision)
+        self.config = self._read("its config.json", transformers.AutoConfig.from_pretrained)
         kind = self.config.model_type
         require(kind in FAMILIES, "detector.model", f"{model}, which is {kind}", f"one of {', '.join(FAMILIES)}")
         self.family = FAMILIES[kind]
@@ -315,23 +312,34 @@ class Checkpoint:
     @property
     def labels(self) -> Sequence[str]:
         """The names of the model's classes; those that the model leaves without a name are not an object class."""
-        names = [self.config.id2label[k] for k in range(len(self.config.id2label))]
-        unnamed = [PLACEHOLDER.fullmatch(name) is not None for name in names]
-        if all(unnamed):
-            raise DataError(f"detector.model: {self.model} does not name its classes: fill id2label in its config.json")
-        return ["n/a" if no_name else name for name, no_name in zip(names, unnamed, strict=True)]
+        named = {k: name for k, name in self.config.id2label.items() if not PLACEHOLDER.fullmatch(name)}
+        names = [named.get(k, NO_CLASS) for k in range(max(self.config.id2label) + 1)]
+        if self.config.model_type == "rf_detr" and self._is_coco(names):
+            return COCO_BY_ID
+        if not named:
+            raise DataError(
+                f"detector.model: {self.folder} does not name its classes: fill id2label in its config.json"
+            )
+        return names
+
+    @staticmethod
+    def _is_coco(names: Sequence[str]) -> bool:
+        """Whether an RF-DETR has the head of those trained on COCO, which counts as COCO's annotations do, with gaps.
+
+        What its config calls the classes does not matter then: it may have no names, or all of COCO's without the gaps.
+        """
+        return len(names) == len(COCO_BY_ID) and {name.lower() for name in names} - {NO_CLASS} in (set(COCO), set())
 
     @property
     def commit(self) -> str:
-        """Of a model id, what `revision` names at present; empty for a folder."""
-        return str(getattr(self.config, "_commit_hash", None) or "")
+        """Of a model id, what `revision` named when it was downloaded; empty for a folder of one's own."""
+        return self.folder.name if self.folder.parent.name == "snapshots" else ""
 
     def read_preprocessing(self) -> Preprocessing:
         """How the model wants its images."""
-        read = self._transformers.utils.cached_file
-        path = self._read(f"its {PREPROCESSING_FILE}", read, self.model, PREPROCESSING_FILE, **self.options)
+        path = self.folder / PREPROCESSING
         try:
-            content = json.loads(Path(path).read_text("utf-8"))
+            content = json.loads(path.read_text("utf-8"))
         except (OSError, ValueError) as error:
             raise DataError(f"detector.model: {path} could not be read: {error}") from error
         return Preprocessing.parse(content, str(path))
@@ -339,32 +347,21 @@ class Checkpoint:
     def read_network(self) -> torch.nn.Module:
         """The network in float32 on the CPU, for inference. Raises DataError unless the weights fit and fill it."""
         auto_class = getattr(self._transformers, self.family.auto_class)
-        network, loading = self._read(
-            "its weights", auto_class.from_pretrained, self.model, output_loading_info=True, **self.options
-        )
+        network, loading = self._read("its weights", auto_class.from_pretrained, output_loading_info=True)
         # transformers warns only, and leaves them random
         missing = sorted(set(loading["missing_keys"]) & {name for name, _ in network.named_parameters()})
         if missing:
             raise DataError(
-                f"detector.model: {self.model} has no weights for {len(missing)} of the network's tensors,"
+                f"detector.model: {self.folder} has no weights for {len(missing)} of the network's tensors,"
                 f" {', '.join(missing[:3])}, ...: it is not a checkpoint for segmentation"
             )
         module: torch.nn.Module = network.float().eval()
         return module
 
-    def _read(self, what: str, read: Any, *arguments: Any, **options: Any) -> Any:
+    def _read(self, what: str, read: Any, **options: Any) -> Any:
         try:
-            return read(*arguments, **options)
-        except Exception as error:  # whatever transformers, the hub's client and safetensors raise on foreign files
-            reason = " ".join(str(error).split())
-            if Path(self.model).is_dir():
-                raise DataError(f"detector.model: {what} could not be read from {self.model}: {reason}") from error
-            advice = (
-                "download it once with detector.local_files_only=false, or give a local folder"
-                if self.options["local_files_only"]
-                else "check the name and the network, or give a local folder"
-            )
+            return read(str(self.folder), local_files_only=True, **options)
+        except Exception as error:  # whatever transformers and safetensors raise on foreign files
             raise DataError(
-                f"detector.model: {self.model} is no folder, and not in the local cache ({what}): {advice};"
-                f" transformers says: {reason}"
+                f"detector.model: {what} could not be read from {self.folder}: {' '.join(str(error).split())}"
             ) from error

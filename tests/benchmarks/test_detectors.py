@@ -71,12 +71,25 @@ MASK2FORMER = partial(
     random_transformer, "Mask2FormerForUniversalSegmentation", {"backbone_config": SWIN_TINY},
     {"size": {"shortest_edge": 800, "longest_edge": 1333}, "size_divisor": 32},
 )  # fmt: skip
-RF_DETR = partial(random_transformer, "RfDetrForInstanceSegmentation", {}, {"size": {"height": 448, "width": 448}})
+
+
+def rf_detr_seg(side: int, windows: int) -> Callable[[Path], list[str]]:
+    """As published for Nano (312 px, one window) and Small (384 px, two)."""
+    backbone = {
+        "model_type": "rf_detr_dinov2", "hidden_size": 384, "num_attention_heads": 6, "image_size": side,
+        "patch_size": 12, "num_windows": windows, "out_features": ["stage3", "stage6", "stage9", "stage12"],
+    }  # fmt: skip
+    parameters = {"backbone_config": backbone, "decoder_layers": 4, "num_queries": 100, "decoder_n_points": 2}
+    preprocessing = {"size": {"height": side, "width": side}}
+    return partial(random_transformer, "RfDetrForInstanceSegmentation", parameters, preprocessing)
+
+
 RANDOM: dict[str, tuple[str, Callable[[Path], list[str]]]] = {
     "mask_rcnn, ResNet-50": ("mask_rcnn", partial(random_mask_rcnn, "resnet50")),
     "mask_rcnn, ResNet-101": ("mask_rcnn", partial(random_mask_rcnn, "resnet101")),
     "transformers_segmentation, Mask2Former Swin-T": ("transformers_segmentation", MASK2FORMER),
-    "transformers_segmentation, RF-DETR-Seg": ("transformers_segmentation", RF_DETR),
+    "rf_detr_seg, Nano": ("rf_detr_seg", rf_detr_seg(312, 1)),
+    "rf_detr_seg, Small": ("rf_detr_seg", rf_detr_seg(384, 2)),
 }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import http.client
+import logging
 import os
 import urllib.request
 from collections.abc import Iterator
@@ -23,6 +24,8 @@ OFFLINE = "INSTANCEMAP_OFFLINE"
 TIMEOUT = 30.0  # s without an answer
 BLOCK = 1 << 20  # bytes
 
+log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class PublishedNetwork:
@@ -31,6 +34,7 @@ class PublishedNetwork:
     url: str
     algorithm: str  # of hashlib
     digest: str  # hex, the first digits or all
+    licence: str
 
     @property
     def file(self) -> Path:
@@ -41,16 +45,19 @@ class PublishedNetwork:
 DETECTRON2 = "https://dl.fbaipublicfiles.com/detectron2/COCO-InstanceSegmentation/"
 PUBLISHED = {
     "resnet50_fpn_coco": PublishedNetwork(
-        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth", "sha256", "bf2d0c1e"
+        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
+        "sha256",
+        "bf2d0c1e",
+        "BSD-3-Clause",
     ),
     "resnet50_fpn_coco_detectron2": PublishedNetwork(
-        f"{DETECTRON2}mask_rcnn_R_50_FPN_3x/137849600/model_final_f10217.pkl", "md5", "f10217"
+        f"{DETECTRON2}mask_rcnn_R_50_FPN_3x/137849600/model_final_f10217.pkl", "md5", "f10217", "CC BY-SA 3.0"
     ),
     "resnet101_fpn_coco_detectron2": PublishedNetwork(
-        f"{DETECTRON2}mask_rcnn_R_101_FPN_3x/138205316/model_final_a3ec72.pkl", "md5", "a3ec72"
+        f"{DETECTRON2}mask_rcnn_R_101_FPN_3x/138205316/model_final_a3ec72.pkl", "md5", "a3ec72", "CC BY-SA 3.0"
     ),
 }
-"""torchvision's first one (COCO mask AP 34.6) and detectron2's (CC BY-SA 3.0; 37.2 and 38.6), as published."""
+"""torchvision's first one (COCO mask AP 34.6) and detectron2's (37.2 and 38.6), as published."""
 
 
 def networks_folder() -> Path:
@@ -102,7 +109,7 @@ def download(published: PublishedNetwork) -> None:
         raise DataError(f"{path.parent} could not be made: {error.strerror}") from error
     digest = hashlib.new(published.algorithm)
     with written_whole(path) as temporary, temporary.open("wb") as file:
-        for block in _received(published.url, path.name, by_hand):
+        for block in _received(published, by_hand):
             file.write(block)
             digest.update(block)
         found = digest.hexdigest()[: len(published.digest)]
@@ -113,14 +120,17 @@ def download(published: PublishedNetwork) -> None:
             )
 
 
-def _received(url: str, name: str, by_hand: str) -> Iterator[bytes]:
-    """The blocks of what `url` sends; a fault of the connection, and no other, is a DataError that says `by_hand`."""
+def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
+    """The blocks that its server sends; a fault of the connection, and no other, is a DataError that says `by_hand`."""
+    url, name = published.url, published.file.name
     try:
         with (
             urllib.request.urlopen(url, timeout=TIMEOUT) as response,
             tqdm(total=response.length, unit="B", unit_scale=True, desc=name, disable=None) as progress,
         ):
             announced, received = response.length or 0, 0
+            size = f"{announced / 1e6:.0f} MB" if announced else "of a size that is not said"
+            log.info("downloading %s, %s, licence %s, into %s", url, size, published.licence, published.file.parent)
             while block := response.read(BLOCK):
                 received += len(block)
                 progress.update(len(block))

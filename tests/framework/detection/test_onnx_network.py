@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from framework.detection.onnx_network import OnnxNetwork, find_file
+from framework.detection.onnx_network import OnnxNetwork
+from framework.detection.weights_file import find_file
 from framework.errors import ConfigError, DataError
 from tests.tiny_networks import constant_network, doubling_network, save
 

@@ -1,12 +1,15 @@
 """YOLO-style segmentation on networks whose boxes, scores and masks are known."""
 
+import cv2
 import numpy as np
+import onnx
 import pytest
 
 from framework.data import Camera, Frame
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
+from tests.rewritten_exports import LAYOUTS, rewritten
 from tests.test_contracts import (  # noqa: F401  the contract of every detector, on the `detector` below
     test_detector_gives_the_same_for_the_same_frame_in_any_order,
     test_detector_needs_no_truth_or_says_so,
@@ -54,7 +57,10 @@ def detector(tmp_path):
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])
 def test_boxes_scores_and_masks(tmp_path, objectness, transposed):
-    found = tiny(tmp_path, objectness, transposed).detect(frame())
+    check_cup_and_chair(tiny(tmp_path, objectness, transposed).detect(frame()))
+
+
+def check_cup_and_chair(found):
     # A pixel u of the image has its centre at (u + 0.5) / 2 in the input and at a half of that, less 0.5, in cells.
     cup = ((U + 0.5) / 4 - 0.5 < 10.4) & (U >= 10) & (U < 70) & (V >= 20) & (V < 60)
     chair = (((V + 0.5) / 2 + 10) / 2 - 0.5 > 25.4) & (U >= 100) & (U < 140) & (V >= 60) & (V < 100)
@@ -65,11 +71,62 @@ def test_boxes_scores_and_masks(tmp_path, objectness, transposed):
     np.testing.assert_allclose(found.class_probabilities, [[6 / 7, 1 / 7], [1 / 9, 8 / 9]], rtol=1e-5)
 
 
+def test_a_tflite_file_as_tensorflow_writes_it(tmp_path):
+    """Channels last, and boxes in 0..1."""
+    pytest.importorskip("ai_edge_litert")
+    from tests.tiny_litert import constant_litert_network
+
+    table, prototypes = outputs().values()
+    table[:, :4] /= SIZE
+    (tmp_path / "labels.txt").write_text("\n".join(LABELS))
+    weights = constant_litert_network(
+        tmp_path / "n.tflite", (1, SIZE, SIZE, 3), {"a": np.moveaxis(prototypes, 1, -1), "b": table}
+    )
+    detector = OnnxSegmentation(weights=weights, labels=str(tmp_path / "labels.txt"), device="cpu")
+    check_cup_and_chair(detector.detect(frame()))
+
+
+def suppressed(folder, **parameters):
+    """The same candidates in a network with suppression inside, where each has one class."""
+    table, prototypes = outputs(transposed=True).values()
+    (folder / "labels.txt").write_text("\n".join(LABELS))
+    center, size, scores = table[0, :, :2], table[0, :, 2:4], table[0, :, 4:7]
+    label, best = scores.argmax(axis=1)[:, None], scores.max(axis=1)[:, None]
+    rows = np.concatenate([center - size / 2, center + size / 2, best, label, table[0, :, 7:]], axis=1)
+    weights = constant_network(folder / "n.onnx", (1, 3, SIZE, SIZE), {"a": rows[None], "b": prototypes})
+    return OnnxSegmentation(weights=weights, labels=str(folder / "labels.txt"), device="cpu", **parameters)
+
+
+@pytest.mark.parametrize(("spread", "expected"), [(1.0, [0.6, 0.5]), (0.5, [0.8, 0.7]), (0.0, [1.0, 1.0])])
+def test_one_class_a_detection_leaves_the_rest_to_the_others(tmp_path, spread, expected, caplog):
+    """A score of 0.4 is less than the even share of two classes, with spread 1."""
+    with caplog.at_level("INFO"):
+        found = suppressed(tmp_path, spread=spread).detect(frame())
+    assert "n.onnx gives one class a detection" in caplog.text
+    whole = tiny(tmp_path).detect(frame())
+    np.testing.assert_array_equal(found.masks, whole.masks)
+    np.testing.assert_allclose(found.scores, whole.scores)
+    own = found.class_probabilities[[0, 1], [0, 1]]
+    np.testing.assert_allclose(own, expected, rtol=1e-6)
+    np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1)
+
+
+def test_other_names_in_the_file_are_told(tmp_path, caplog):
+    tiny(tmp_path)
+    assert not caplog.text
+    model = onnx.load(tmp_path / "tiny.onnx")
+    onnx.helper.set_model_props(model, {"names": "{0: 'chair', 1: 'fork', 2: 'wall'}"})
+    onnx.save(model, tmp_path / "named.onnx")
+    OnnxSegmentation(weights=tmp_path / "named.onnx", labels=str(tmp_path / "labels.txt"), device="cpu")
+    assert "named.onnx names 1 of its 3 classes otherwise" in caplog.text
+    assert "1 is 'fork' there, 'cup' here" in caplog.text
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [
         ({"output1": np.zeros((1, 3, 40, 40))}, "must have 10 columns"),
-        ({"output1": np.zeros((1, 40, 40))}, r"outputs \(1, 4 \+ classes \+ M, K\) and \(1, M, h, w\), found output0"),
+        ({"output1": np.zeros((1, 40, 40))}, r"outputs, \(1, 4 \+ classes \+ M, K\) or .*, found output0"),
         ({"more": np.zeros((1, 2))}, r"found output0 \(1, 9, 4\), output1 \(1, 2, 40, 40\), more \(1, 2\)"),
     ],
 )
@@ -83,6 +140,7 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
 @pytest.mark.parametrize(
     "parameters",
     [
+        {"spread": 1.1},
         {"score_threshold": 0.0},
         {"nms": 1.1},
         {"agnostic_nms": 0.0},
@@ -97,3 +155,49 @@ def test_a_wrong_parameter_is_named(tmp_path, parameters):
     (name,) = parameters
     with pytest.raises(ConfigError, match=f"detector.{name} must be .*, found"):
         OnnxSegmentation(**{"weights": tmp_path / "absent.onnx", **parameters})
+
+
+IMAGES = ("mit76/color/000000.jpg", "redkitchen/color/000240.jpg", "replica_floor2/color/000048.jpg")
+
+
+@pytest.fixture(scope="module")
+def yolo(shared):
+    """A real network, as its exporter wrote it."""
+    path = shared / "weights" / "yolo11n_seg" / "yolo11n_seg.onnx"
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    return path
+
+
+@pytest.fixture(scope="module")
+def photographs(shared_data):
+    """Frames of three real videos."""
+    colors = [cv2.cvtColor(cv2.imread(str(shared_data / name)), cv2.COLOR_BGR2RGB) for name in IMAGES]
+    cameras = [Camera(c.shape[1], c.shape[0], 500.0, 500.0, 0.0, 0.0) for c in colors]
+    return [Frame(k, 0.0, c, np.ones(c.shape[:2], np.float32), cameras[k]) for k, c in enumerate(colors)]
+
+
+@pytest.fixture(scope="module")
+def expected(yolo, photographs):
+    return [OnnxSegmentation(weights=yolo, device="cpu").detect(frame) for frame in photographs]
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_real_network_finds_the_same_in_every_layout(tmp_path, yolo, photographs, expected, layout):
+    detector = OnnxSegmentation(weights=rewritten(yolo, layout, tmp_path / "n.onnx"), device="cpu")
+    assert detector._layout.suppressed == ("suppressed" in layout or "best rows" in layout)
+    for photograph, wanted in zip(photographs, expected, strict=True):
+        found = detector.detect(photograph)
+        assert len(found) == len(wanted) > 2
+        np.testing.assert_allclose(found.scores, wanted.scores, atol=1e-5)
+        np.testing.assert_array_equal(
+            found.class_probabilities.argmax(axis=1), wanted.class_probabilities.argmax(axis=1)
+        )
+        both = (found.masks & wanted.masks).sum(axis=(1, 2)) / (found.masks | wanted.masks).sum(axis=(1, 2))
+        assert both.min() > 0.995
+        if detector._layout.suppressed:  # the score is the label's probability, and the others share the rest
+            best = np.maximum(found.scores, 1 / len(found.classes))
+            np.testing.assert_allclose(found.class_probabilities.max(axis=1), best, rtol=1e-5)
+            np.testing.assert_allclose(found.class_probabilities.min(axis=1), (1 - best) / 79, atol=1e-6)
+        else:
+            np.testing.assert_allclose(found.class_probabilities, wanted.class_probabilities, atol=1e-4)

@@ -12,8 +12,10 @@ from torch.nn import functional
 
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
+from framework.label_spaces import COCO, COCO_BY_ID
 from plugins.detectors.transformers_segmentation import (
     FAMILIES,
+    Checkpoint,
     Preprocessing,
     TransformersSegmentation,
     class_distributions,
@@ -272,10 +274,58 @@ def one_line(caught):
     return "\n" not in str(caught.value)
 
 
-def test_a_model_that_is_not_here_says_what_to_do():
-    with pytest.raises(DataError, match=r"nobody/nothing.*detector\.local_files_only=false") as caught:
+@pytest.mark.parametrize("variable", ["HF_HUB_OFFLINE", "INSTANCEMAP_OFFLINE"])
+def test_offline_a_model_that_is_not_here_says_what_to_do(monkeypatch, variable):
+    monkeypatch.delenv("INSTANCEMAP_OFFLINE", raising=False)
+    monkeypatch.setenv(variable, "1")
+    with pytest.raises(
+        DataError, match=rf"nobody/nothing is no folder, and {variable} forbids .* local folder"
+    ) as caught:
         built("nobody/nothing")
     assert one_line(caught)
+
+
+def coco_rf_detr(folder, names):
+    """A tiny RF-DETR-Seg with the head of those trained on COCO, whose config calls the classes `names`."""
+    write_network(folder, "rf_detr", names)
+    return built(folder, score_threshold=0.02, agnostic_nms=1.0)
+
+
+IN_A_ROW = {**dict(enumerate(COCO)), **dict.fromkeys(range(80, 91), "N/A")}
+
+
+@pytest.mark.parametrize("names", [dict(enumerate(COCO_BY_ID)), {k: f"LABEL_{k}" for k in range(91)}, IN_A_ROW])
+def test_an_rf_detr_counts_as_cocos_annotations_do(tmp_path, names):
+    """As transformers' own test of it: number 17 is the cat, 75 the remote; and as its own decoding."""
+    detector = coco_rf_detr(tmp_path, names)
+    assert detector.classes == COCO
+    labels = Checkpoint(str(tmp_path), "main").labels
+    by_id = {1: "person", 11: "fire hydrant", 13: "stop sign", 17: "cat", 44: "bottle", 46: "wine glass", 70: "toilet",
+             67: "dining table", 72: "tv", 75: "remote", 82: "refrigerator", 84: "book", 90: "toothbrush"}  # fmt: skip
+    assert {k: labels[k] for k in by_id} == by_id
+    assert {labels[k] for k in (0, 12, 45, 66, 68, 83)} == {"n/a"}
+    image = frame(1)
+    pixels, _ = detector._preprocessing(image.color, torch.device("cpu"))
+    with torch.inference_mode():
+        output = detector._network(pixel_values=pixels)
+    probabilities, masks = output.logits.sigmoid()[0], output.pred_masks
+    whole = functional.interpolate(masks, image.camera.shape, mode="bilinear", align_corners=False)[0] > 0
+    expected = [
+        (float(row.max()), labels[int(row.argmax())], mask.numpy())
+        for row, mask in zip(probabilities, whole, strict=True)
+        if labels[int(row.argmax())] != "n/a" and row.max() > 0.02 and mask.any()
+    ]
+    expected.sort(key=lambda one: -one[0])
+    found = detector.detect(image)
+    assert len(found) == len(expected) > 2
+    np.testing.assert_allclose(found.scores, [score for score, _, _ in expected], rtol=1e-4)
+    assert [COCO[k] for k in found.class_probabilities.argmax(axis=1)] == [name for _, name, _ in expected]
+    assert np.mean(found.masks == np.array([mask for _, _, mask in expected])) > 0.999
+
+
+def test_an_rf_detr_of_other_classes_keeps_its_own(tmp_path):
+    names = {k: "chair" if k % 2 else "tv" for k in range(91)}
+    assert coco_rf_detr(tmp_path, names).classes == ("chair", "tv")
 
 
 def test_a_fixed_size_is_not_changed(folders):

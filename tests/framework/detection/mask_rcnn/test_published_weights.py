@@ -54,7 +54,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def offer(monkeypatch, url, digest=SHA256[:8], algorithm="sha256"):
-    monkeypatch.setitem(PUBLISHED, "offered", PublishedNetwork(url, algorithm, digest))
+    monkeypatch.setitem(PUBLISHED, "offered", PublishedNetwork(url, algorithm, digest, "MIT"))
 
 
 def fault(name="offered"):
@@ -64,9 +64,11 @@ def fault(name="offered"):
     return str(caught.value)
 
 
-def test_a_published_network_is_downloaded_once(server, cache, monkeypatch):
+def test_a_published_network_is_downloaded_once_with_its_licence_and_size_said(server, cache, monkeypatch, caplog):
     offer(monkeypatch, f"{server.address}/network.pth")
-    path = find_network(Path("offered"))
+    with caplog.at_level("INFO"):
+        path = find_network(Path("offered"))
+    assert f"downloading {server.address}/network.pth, 5 MB, licence MIT, into {cache}" in caplog.text
     assert path == cache / "network.pth"
     assert path.read_bytes() == CONTENT
     assert find_network(Path("offered")) == path
@@ -83,6 +85,14 @@ def test_what_was_not_published_is_not_kept(server, cache, monkeypatch):
     offer(monkeypatch, f"{server.address}/network.pth", "00000000")
     assert f"sha256 begins with {SHA256[:8]}, expected 00000000" in fault()
     assert not list(cache.iterdir())
+
+
+def test_after_half_a_file_the_next_try_begins_anew(server, cache, monkeypatch):
+    offer(monkeypatch, f"{server.address}/cut.pth")
+    fault()
+    offer(monkeypatch, f"{server.address}/network.pth")
+    assert find_network(Path("offered")).read_bytes() == CONTENT
+    assert [file.name for file in cache.iterdir()] == ["network.pth"]
 
 
 def test_half_a_file_is_not_kept(server, cache, monkeypatch):

@@ -1,0 +1,175 @@
+"""Which layout a network's outputs have: told from shapes and values, or refused with the reason."""
+
+import numpy as np
+import pytest
+
+from framework.detection.export_metadata import ExportMetadata
+from framework.detection.segmentation_output import BoxKind, recognise
+from framework.errors import DataError
+
+SHAPE = (64, 96)  # of the input
+CLASSES, MASKS = 3, 4
+ULTRALYTICS = ExportMetadata(author="Ultralytics")
+
+
+def cells():
+    """Boxes of all cells of the strides 8, 16 and 32: centre x, y, width, height, px."""
+    rng = np.random.default_rng(0)
+    rows = []
+    for stride in (8, 16, 32):
+        y, x = np.indices((SHAPE[0] // stride, SHAPE[1] // stride)).reshape(2, -1)
+        rows.append(np.stack([stride * (x + 0.5), stride * (y + 0.5), *rng.uniform(4, 24, (2, len(x)))], axis=1))
+    return np.concatenate(rows)
+
+
+def as_corners(boxes):
+    return np.concatenate([boxes[:, :2] - boxes[:, 2:] / 2, boxes[:, :2] + boxes[:, 2:] / 2], axis=1)
+
+
+def as_unit(boxes):
+    return boxes / [*SHAPE[::-1], *SHAPE[::-1]]
+
+
+def dense(boxes, classes=CLASSES, objectness=False):
+    """The table (1, 4 + C + M, K)."""
+    rng = np.random.default_rng(1)
+    numbers = classes + MASKS + objectness
+    return np.concatenate([boxes, rng.uniform(1e-6, 0.1, (len(boxes), numbers))], axis=1).T[None].astype(np.float32)
+
+
+def detections(boxes, score, label):
+    """The table (1, K, 6 + M)."""
+    rest = np.full((len(boxes), MASKS), 0.5)
+    return np.concatenate([boxes, np.full((len(boxes), 1), score), np.full((len(boxes), 1), label), rest], 1)[None]
+
+
+def prototypes(channels_last=False):
+    maps = np.arange(MASKS * 16 * 24, dtype=np.float32).reshape(1, MASKS, 16, 24)
+    return np.moveaxis(maps, 1, -1) if channels_last else maps
+
+
+def seen(table, maps=None, **given):
+    """The layout, and what the outputs mean in it."""
+    outputs = {"output0": np.asarray(table, np.float32), "output1": prototypes() if maps is None else maps}
+    arguments = {
+        "classes": CLASSES,
+        "objectness": False,
+        "boxes": BoxKind.AUTO,
+        "shape": SHAPE,
+        "input_channels_last": False,
+        "metadata": ExportMetadata(),
+        **given,
+    }
+    layout = recognise(outputs, **arguments)
+    return layout, layout.read(outputs)
+
+
+@pytest.mark.parametrize("channels_last", [False, True])
+@pytest.mark.parametrize("transpose", [False, True])
+@pytest.mark.parametrize("corner", [False, True])
+@pytest.mark.parametrize("unit", [False, True])
+@pytest.mark.parametrize("objectness", [False, True])
+def test_cells_in_every_layout_are_the_same_boxes(channels_last, transpose, corner, unit, objectness):
+    boxes = as_corners(cells()) if corner else cells()
+    table = dense(as_unit(boxes) if unit else boxes, objectness=objectness)
+    layout, output = seen(
+        table.transpose(0, 2, 1) if transpose else table, prototypes(channels_last), objectness=objectness
+    )
+    assert layout.boxes is (BoxKind.CORNER if corner else BoxKind.CENTER)
+    assert (layout.unit, layout.channels_last, layout.rows_first) == (unit, channels_last, transpose)
+    assert not layout.suppressed
+    np.testing.assert_allclose(output.candidates.boxes, as_corners(cells()), atol=1e-3)
+    np.testing.assert_array_equal(output.prototypes, prototypes()[0])
+    scores = table[0, 4:5].T * table[0, 5:8].T if objectness else table[0, 4:7].T
+    np.testing.assert_array_equal(output.candidates.class_scores, scores)
+    np.testing.assert_array_equal(output.coefficients, table[0, -MASKS:].T)
+
+
+@pytest.mark.parametrize("unit", [False, True])
+@pytest.mark.parametrize("count", [1, 40])
+def test_detections_have_one_class_each(unit, count):
+    boxes = as_corners(cells())[50 : 50 + count]
+    layout, output = seen(detections(as_unit(boxes) if unit else boxes, 0.7, 2))
+    assert layout.suppressed
+    assert layout.unit == unit
+    np.testing.assert_allclose(output.candidates.boxes, boxes, atol=1e-3)
+    np.testing.assert_allclose(output.candidates.class_scores, np.tile([0, 0, 0.7], (count, 1)), rtol=1e-6)
+
+
+@pytest.mark.parametrize("count", [0, 30])
+def test_a_network_that_sees_nothing_in_black_shows_its_unit_later(count):
+    """What suppression leaves over is no row, or rows of zeros."""
+    layout, output = seen(np.zeros((1, count, 6 + MASKS)))
+    assert layout.suppressed
+    assert layout.unit is None
+    assert output.candidates.class_scores.sum() == 0
+    boxes = as_corners(cells())[60:61]
+    for given in (boxes, as_unit(boxes)):
+        table = np.concatenate([detections(given, 0.9, 1), np.zeros((1, 3, 6 + MASKS))], axis=1)
+        later = layout.read({"output0": np.asarray(table, np.float32), "output1": prototypes()})
+        np.testing.assert_allclose(later.candidates.boxes[:1], boxes, atol=1e-3)
+
+
+def test_detections_whose_boxes_end_before_they_begin_are_no_corners():
+    boxes = cells()[50:53]
+    with pytest.raises(DataError, match=r"ends before it begins: set detector\.boxes=CENTER"):
+        seen(detections(boxes, 0.9, 1))
+    _, output = seen(detections(boxes, 0.9, 1), boxes=BoxKind.CENTER)
+    np.testing.assert_allclose(output.candidates.boxes, as_corners(boxes), atol=1e-4)
+    layout, _ = seen(detections(cells(), 0.9, 1))  # enough of them show it
+    assert layout.boxes is BoxKind.CENTER
+
+
+def test_two_classes_make_both_tables_equally_wide():
+    """4 + 2 + M = 6 + M: only labels are whole numbers, and only cells are as many as cells."""
+    layout, _ = seen(dense(cells(), classes=2).transpose(0, 2, 1), classes=2)
+    assert not layout.suppressed
+    layout, _ = seen(detections(as_corners(cells())[50:60], 0.7, 1), classes=2)
+    assert layout.suppressed
+    below = detections(as_corners(cells())[50:60], 0.0, 0)  # TensorFlow's exports keep boxes below the threshold
+    layout, output = seen(below, classes=2)
+    assert layout.suppressed
+    assert output.candidates.class_scores.sum() == 0
+    quantised = dense(cells(), classes=2)
+    quantised[:, 4:6] = 0  # cells, where 8 bits have no smaller number
+    layout, _ = seen(quantised.transpose(0, 2, 1), classes=2)
+    assert not layout.suppressed
+
+
+def test_what_is_given_is_not_guessed():
+    layout, output = seen(dense(as_corners(cells())), boxes=BoxKind.CENTER)
+    assert layout.boxes is BoxKind.CENTER
+    np.testing.assert_allclose(output.candidates.boxes, as_corners(as_corners(cells())), atol=1e-3)
+
+
+def test_a_map_that_may_lie_either_way():
+    square = {"shape": (16, 16), "maps": np.zeros((1, 4, 4, 4), np.float32)}
+    boxes = cells() / 6
+    with pytest.raises(DataError, match=r"may be \(1, M, h, w\) or \(1, h, w, M\): export for another size"):
+        seen(dense(boxes), **square)
+    assert not seen(dense(boxes), **square, metadata=ULTRALYTICS)[0].channels_last
+    assert seen(dense(boxes), **square, metadata=ULTRALYTICS, input_channels_last=True)[0].channels_last
+
+
+MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells())
+
+
+@pytest.mark.parametrize(
+    ("table", "given", "message"),
+    [
+        (dense(MIXED), {}, r"may be corners or centre and size .*detector\.boxes=CENTER or CORNER"),
+        (dense(cells() / 8), {}, "neither in px of its input 64x96 nor in 0..1"),
+        (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\): set detector.objectness=true"),
+        (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\): set detector.objectness=false"),
+        (dense(cells(), classes=7), {}, r"11 columns .* or 10 with suppression inside, .*other detector\.labels"),
+        (detections(as_corners(cells()), 0.9, 3), {}, r"labels from 0 to 2, found 3 to 3: choose other detector"),
+        (detections(as_corners(cells()), 1.5, 1), {}, r"scores must be in \[0, 1\], found 0 to 1.5"),
+        (np.zeros((1, 11, 11)), {}, "as many candidates as columns, 11"),
+        (dense(cells()), {"maps": np.zeros((1, 4, 16, 16))}, r"16, 16\) have other proportions; its input is 64x96"),
+        (dense(cells())[0], {}, r"must have two outputs, .*, found output0 \(11, 126\)"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_told_is_refused_in_one_line(table, given, message):
+    with pytest.raises(DataError, match=message) as refused:
+        seen(table, **given)
+    assert "\n" not in str(refused.value)

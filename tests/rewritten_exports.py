@@ -1,0 +1,140 @@
+"""A network file in the other layouts that exporters write, by changing its graph."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+from onnx import TensorProto, helper, numpy_helper
+
+MOST = 300  # detections, where suppression is inside
+
+
+class Surgery:
+    """Puts nodes behind the two outputs of a YOLO segmentation network, boxes as centre and size in px."""
+
+    def __init__(self, source: Path) -> None:
+        self.model = onnx.load(source)
+        self.graph = self.model.graph
+        self.table, self.prototypes = (output.name for output in self.graph.output)
+        self.columns = self.graph.output[0].type.tensor_type.shape.dim[1].dim_value
+        self.side = self.graph.input[0].type.tensor_type.shape.dim[2].dim_value
+        self._names = 0
+
+    def add(self, kind: str, *inputs: str | np.ndarray[Any, Any], outputs: int = 1, **attributes: Any) -> Any:
+        """A node; arrays among its inputs become constants. Returns the name of its output, or their names."""
+        names = [self._constant(one) if isinstance(one, np.ndarray) else one for one in inputs]
+        made = [self._name() for _ in range(outputs)]
+        self.graph.node.append(helper.make_node(kind, names, made, **attributes))
+        return made[0] if outputs == 1 else made
+
+    def columns_of(self, start: int, stop: int) -> str:
+        """Some rows of the table (1, columns, K)."""
+        return self.add("Slice", self.table, np.array([start]), np.array([stop]), np.array([1]))
+
+    def save(self, path: Path) -> Path:
+        """With the present table and prototypes as outputs, of any shape."""
+        del self.graph.output[:]
+        for name, axes in ((self.table, 3), (self.prototypes, 4)):
+            shape = [f"{name}_{k}" for k in range(axes)]
+            self.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, shape))
+        onnx.save(self.model, path)
+        return path
+
+    def _constant(self, value: np.ndarray[Any, Any]) -> str:
+        name = self._name()
+        self.graph.initializer.append(numpy_helper.from_array(value, name))
+        return name
+
+    def _name(self) -> str:
+        self._names += 1
+        return f"rewritten_{self._names}"
+
+
+def transposed(net: Surgery) -> None:
+    net.table = net.add("Transpose", net.table, perm=[0, 2, 1])
+
+
+def channels_last(net: Surgery) -> None:
+    net.prototypes = net.add("Transpose", net.prototypes, perm=[0, 2, 3, 1])
+
+
+def unit(net: Surgery) -> None:
+    scale = np.ones((1, net.columns, 1), np.float32)
+    scale[:, :4] = 1 / net.side
+    net.table = net.add("Mul", net.table, scale)
+
+
+def corners(net: Surgery) -> None:
+    center, half = net.columns_of(0, 2), net.add("Mul", net.columns_of(2, 4), np.array(0.5, np.float32))
+    first, second = net.add("Sub", center, half), net.add("Add", center, half)
+    net.table = net.add("Concat", first, second, net.columns_of(4, net.columns), axis=1)
+
+
+def any_size(net: Surgery) -> None:
+    for dimension, name in zip(net.graph.input[0].type.tensor_type.shape.dim, ("n", "", "h", "w"), strict=True):
+        if name:
+            dimension.dim_param = name
+
+
+def best_rows(net: Surgery) -> None:
+    """The cells with the best scores as detections, without suppression: as of networks that need none."""
+    corners(net)
+    scores = net.columns_of(4, net.columns - 32)
+    best = net.add("ReduceMax", scores, axes=[1], keepdims=0)  # (1, K)
+    _, index = net.add("TopK", best, np.array([MOST]), outputs=2, axis=1)
+    _finish(net, scores, net.add("Squeeze", index, np.array([0])))
+
+
+def suppressed(net: Surgery) -> None:
+    """Suppression within the best class, its threshold that of the detector; then rows of zeros up to MOST."""
+    corners(net)
+    scores = net.columns_of(4, net.columns - 32)
+    best = net.add("ReduceMax", scores, axes=[1], keepdims=1)
+    own = net.add("Cast", net.add("Equal", scores, best), to=TensorProto.FLOAT)
+    boxes = net.add("Transpose", net.columns_of(0, 4), perm=[0, 2, 1])
+    limits = np.array([MOST]), np.array([0.45], np.float32), np.array([0.1], np.float32)
+    chosen = net.add("NonMaxSuppression", boxes, net.add("Mul", scores, own), *limits)  # (n, 3), the last is the row
+    _finish(net, scores, net.add("Gather", chosen, np.array(2), axis=1))
+    padded = net.add("Concat", net.table, np.zeros((1, MOST, 38), np.float32), axis=1)
+    net.table = net.add("Slice", padded, np.array([0]), np.array([MOST]), np.array([1]))
+
+
+def _finish(net: Surgery, scores: str, index: str) -> None:
+    """The table (1, n, 38) of the rows `index` (n,)."""
+    best = net.add("ReduceMax", scores, axes=[1], keepdims=1)
+    label = net.add("Cast", net.add("ArgMax", scores, axis=1, keepdims=1), to=TensorProto.FLOAT)
+    coefficients = net.columns_of(net.columns - 32, net.columns)
+    rows = net.add("Concat", net.columns_of(0, 4), best, label, coefficients, axis=1)
+    net.columns = 38
+    net.table = net.add("Transpose", net.add("Gather", rows, index, axis=2), perm=[0, 2, 1])
+
+
+def unit_rows(net: Surgery) -> None:
+    """Of detections."""
+    scale = np.ones((1, 1, 38), np.float32)
+    scale[..., :4] = 1 / net.side
+    net.table = net.add("Mul", net.table, scale)
+
+
+LAYOUTS: dict[str, tuple[Callable[[Surgery], None], ...]] = {
+    "transposed": (transposed,),
+    "in 0..1, channels last, as in TensorFlow": (unit, channels_last),
+    "corners": (corners,),
+    "corners in 0..1, transposed": (corners, unit, transposed),
+    "any size": (any_size,),
+    "suppressed": (suppressed,),
+    "suppressed in 0..1, channels last": (suppressed, unit_rows, channels_last),
+    "the best rows": (best_rows,),
+}
+
+
+def rewritten(source: Path, name: str, path: Path) -> Path:
+    """The network `source` in the layout `name`, in the file `path`."""
+    net = Surgery(source)
+    for step in LAYOUTS[name]:
+        step(net)
+    return net.save(path)
