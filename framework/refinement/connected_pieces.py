@@ -22,11 +22,36 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_
     Two points are connected when they are at most `reach` px apart and their depths differ by less than `gap` (m) +
     `gap_per_depth` * depth of the nearer one. Points of no cluster are in.
     """
+    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, 2.0, 0.0)
+
+
+def in_hidden_apart_pieces(
+    clusters: PointClusters,
+    frame: Frame,
+    gap: float,
+    gap_per_depth: float,
+    reach: int,
+    min_share: float,
+    steepest: float,
+) -> Bool:
+    """(P,) which points are in their cluster's largest piece, or in one that only an occluder parts from it.
+
+    Pieces are those of `in_largest_piece`. Such a piece has `min_share` of the largest one's points or more, and on the
+    way through the image from most of its points to the nearest ones of the largest piece there is something nearer
+    than both, by more than the gap; the depths at both ends differ by no more than a surface would at `steepest` m of
+    depth a metre aside, and by the gap.
+    """
+    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share, steepest)
+
+
+def _in_pieces(
+    clusters: PointClusters, frame: Frame, gap: float, gap_per_depth: float, reach: int, min_share: float, steepest: float
+) -> Bool:
     order, firsts = members(clusters)
     in_largest = np.empty(firsts[-1], np.bool_)
     _find_largest(
         clusters.pixels[order], firsts, frame.depth, np.float32(gap), np.float32(gap_per_depth), reach,
-        *thread_shares(np.diff(firsts)), in_largest,
+        np.float32(min_share), np.float32(steepest / frame.camera.fx), *thread_shares(np.diff(firsts)), in_largest,
     )  # fmt: skip
     kept = np.ones(len(clusters.cluster), np.bool_)
     kept[order] = in_largest
@@ -36,19 +61,20 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_
 @njit(cache=True, nogil=True, parallel=True)
 def _find_largest(
     pixels: Int32, firsts: Int64, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int,
-    share_order: Int64, share_starts: Int64, in_largest: Bool,
+    min_share: np.float32, steepest: np.float32, share_order: Int64, share_starts: Int64, in_largest: Bool,
 ) -> None:  # fmt: skip
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if firsts[k + 1] > firsts[k]:
                 own = slice(firsts[k], firsts[k + 1])
-                _find_largest_of(pixels[own], depth, gap, gap_per_depth, reach, in_largest[own])
+                _find_largest_of(pixels[own], depth, gap, gap_per_depth, reach, min_share, steepest, in_largest[own])
 
 
 @njit(cache=True, nogil=True)
 def _find_largest_of(
-    pixels: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, in_largest: Bool
-) -> None:
+    pixels: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, min_share: np.float32,
+    steepest: np.float32, in_largest: Bool,
+) -> None:  # fmt: skip
     """Union-find over the runs of connected pixels in each row, of which there are far fewer than pixels.
 
     Cells lie row by row in flat arrays, with empty ones at the end of each row, so that a neighbor is as far away
@@ -74,9 +100,68 @@ def _find_largest_of(
     pieces = np.zeros(count, np.int32)
     for run in range(count):
         pieces[parents[run]] += sizes[run]
-    of_largest = parents[:count] == np.argmax(pieces)
+    largest = np.argmax(pieces)
+    least = max(min_share * np.float32(pieces[largest]), np.float32(2.0))
+    stays = np.zeros(count, np.bool_)
+    stays[largest] = True
+    piece = np.empty(len(pixels), np.int32)
     for i in range(len(pixels)):
-        in_largest[i] = of_largest[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
+        piece[i] = parents[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
+    if min_share <= np.float32(1.0):
+        for other in range(1, count):
+            if other != largest and pieces[other] >= least:
+                stays[other] = _hidden_apart(pixels, piece, largest, other, depth, gap, gap_per_depth, steepest)
+    for i in range(len(pixels)):
+        in_largest[i] = stays[piece[i]]
+
+
+@njit(cache=True, nogil=True)
+def _some_of(piece: Int32, wanted: int, most: int) -> Int64:
+    """Up to `most` places of `wanted`, evenly over all."""
+    places = np.flatnonzero(piece == wanted)
+    step = (len(places) + most - 1) // most
+    return places[step // 2 :: step]
+
+
+@njit(cache=True, nogil=True)
+def _hidden_apart(
+    pixels: Int32, piece: Int32, largest: int, other: int, depth: Float32, gap: np.float32, gap_per_depth: np.float32,
+    steepest: np.float32,
+) -> bool:  # fmt: skip
+    """Whether something nearer stands between most of the points of a piece and the largest one."""
+    ends = pixels[_some_of(piece, largest, 256)]
+    starts = pixels[_some_of(piece, other, 32)]
+    hidden = 0
+    for k in range(len(starts)):
+        u, v = starts[k, 0], starts[k, 1]
+        best, nearest = 0, np.int64(1) << 60
+        for e in range(len(ends)):
+            away = np.int64(ends[e, 0] - u) ** 2 + np.int64(ends[e, 1] - v) ** 2
+            if away < nearest:
+                best, nearest = e, away
+        hidden += _is_hidden_between(
+            depth, u, v, ends[best, 0], ends[best, 1], gap, gap_per_depth, steepest * np.float32(np.sqrt(nearest))
+        )
+    return 2 * hidden > len(starts)
+
+
+@njit(cache=True, nogil=True)
+def _is_hidden_between(
+    depth: Float32, u0: int, v0: int, u1: int, v1: int, gap: np.float32, gap_per_depth: np.float32, slope: np.float32
+) -> bool:
+    """Whether a pixel on the line between two has a reading nearer than both, by the gap; see in_hidden_apart_pieces."""
+    z0, z1 = depth[v0, u0], depth[v1, u1]
+    nearer = min(z0, z1)
+    tolerance = gap + gap_per_depth * nearer
+    if abs(z0 - z1) > tolerance + slope * nearer:
+        return False
+    steps = max(abs(u1 - u0), abs(v1 - v0))
+    for step in range(1, steps):
+        t = step / steps
+        z = depth[v0 + int(round(t * (v1 - v0))), u0 + int(round(t * (u1 - u0)))]
+        if z > np.float32(0.0) and z < nearer - tolerance:
+            return True
+    return False
 
 
 @njit(cache=True, nogil=True)
