@@ -208,17 +208,8 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, lea
     """
     instance_ids, scores = matches.instance_ids, matches.clusters.scores
     for k in np.flatnonzero(instance_ids):
-        table.observe(
-            int(instance_ids[k]), class_evidence[k], float(scores[k]), matches.frame_index,
-            int(matches.overlaps.sizes[k]),
-        )  # fmt: skip
-    import os
-    share = float(os.environ.get("VIEW", "0.5"))
-    in_view = set()
-    for id_, visible in zip(matches.overlaps.instance_ids.tolist(), matches.overlaps.visible.tolist()):
-        record = table.records[id_]
-        if visible >= max(least, share * record.pixel_sum / max(record.detections, 1)):
-            in_view.add(id_)
+        table.observe(int(instance_ids[k]), class_evidence[k], float(scores[k]), matches.frame_index)
+    in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= least].tolist())
     for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
         table.records[instance_id].in_view.add(matches.frame_index)
 

@@ -56,7 +56,6 @@ class InstanceRecord:
     in_view: FrameSet = field(default_factory=FrameSet)  # frames in which it could have been detected
     score_sum: float = 0.0  # over its detections
     detections: int = 0
-    pixel_sum: int = 0  # over its detections
 
     @property
     def observations(self) -> int:
@@ -94,9 +93,7 @@ class InstanceTable:
         self.records[self.last_id] = record
         return record
 
-    def observe(
-        self, instance_id: int, class_evidence: Float64, score: float, frame_index: int, pixels: int = 0
-    ) -> None:
+    def observe(self, instance_id: int, class_evidence: Float64, score: float, frame_index: int) -> None:
         """Counts one detection with the evidence (C,) for its classes."""
         record = self.records[instance_id]
         record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
@@ -104,7 +101,6 @@ class InstanceTable:
         record.observed_in.add(frame_index)
         record.score_sum += score
         record.detections += 1
-        record.pixel_sum += pixels
 
     def merge(self, kept: int, dropped: int) -> None:
         """Adds the history of `dropped` to `kept` and forgets it."""
@@ -115,7 +111,6 @@ class InstanceTable:
         a.in_view |= b.in_view
         a.score_sum += b.score_sum
         a.detections += b.detections
-        a.pixel_sum += b.pixel_sum
         a.first_frame = min(a.first_frame, b.first_frame)
         a.last_frame = max(a.last_frame, b.last_frame)
 

@@ -61,7 +61,9 @@ class LabeledVoxels:
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
     on_top: float = 0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
-    lying_on: float = 0.6  # in [0, 1]: an instance of which a cluster of another class covers so much lies on it; 1 = off
+    lying_on: float = (
+        0.6  # in [0, 1]: an instance of which a cluster of another class covers so much lies on it; 1 = off
+    )
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     def __post_init__(self) -> None:
@@ -102,7 +104,7 @@ class LabeledVoxels:
         )
 
     def lying_on_clusters(self, table: InstanceTable, matches: Matches) -> Bool:
-        """(N, ids + 1) which instances lie on what each cluster is of: a book on a table, also where only this is found.
+        """(N, ids + 1) which instances lie on what each cluster is of, as a book does on a table.
 
         Such an instance counts, is of another class, and most of what is seen of it is under the cluster, at most half
         of the cluster's pixels. A network draws a large mask over the small things that lie on the object: that mask

@@ -13,9 +13,9 @@ from framework.data import Bool, Float32, Frame, Int32, Int64, PointClusters
 from framework.refinement.neighborhood import bounding_box, members, thread_shares
 from framework.refinement.union_find import root, unite
 
-import os
-COMPAT = bool(os.environ.get("COMPAT"))
 CELLS = 512  # that are looked at together
+STARTS, ENDS = 32, 256  # samples of a piece that may stay, and of one that does
+NO_OTHER = 2.0  # min_share that no piece beside the largest has
 
 
 def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_depth: float, reach: int) -> Bool:
@@ -24,10 +24,10 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_
     Two points are connected when they are at most `reach` px apart and their depths differ by less than `gap` (m) +
     `gap_per_depth` * depth of the nearer one. Points of no cluster are in.
     """
-    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, 2.0, 0.0)
+    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share=NO_OTHER, steepest=0.0)
 
 
-def in_hidden_apart_pieces(
+def in_near_pieces(
     clusters: PointClusters,
     frame: Frame,
     gap: float,
@@ -36,46 +36,51 @@ def in_hidden_apart_pieces(
     min_share: float,
     steepest: float,
 ) -> Bool:
-    """(P,) which points are in their cluster's largest piece, or in one that only an occluder parts from it.
+    """(P,) which points are in their cluster's largest piece, or in one that no step in depth parts from what stays.
 
-    Pieces are those of `in_largest_piece`. Such a piece has `min_share` of the largest one's points or more, and on the
-    way through the image from most of its points to the nearest ones of the largest piece there is something nearer
-    than both, by more than the gap; the depths at both ends differ by no more than a surface would at `steepest` m of
-    depth a metre aside, and by the gap.
+    Pieces are those of `in_largest_piece`. Those with `min_share` of the largest one's points or more are gone through,
+    larger ones first. One stays when most of its points differ in depth from the nearest one that stays by no more than
+    the gap, and what a surface may rise on the way there: `steepest` m of depth a metre aside. By samples.
     """
     return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share, steepest)
 
 
 def _in_pieces(
-    clusters: PointClusters, frame: Frame, gap: float, gap_per_depth: float, reach: int, min_share: float, steepest: float
+    clusters: PointClusters,
+    frame: Frame,
+    gap: float,
+    gap_per_depth: float,
+    reach: int,
+    min_share: float,
+    steepest: float,
 ) -> Bool:
     order, firsts = members(clusters)
-    in_largest = np.empty(firsts[-1], np.bool_)
-    _find_largest(
+    stays = np.empty(firsts[-1], np.bool_)
+    _find_pieces(
         clusters.pixels[order], firsts, frame.depth, np.float32(gap), np.float32(gap_per_depth), reach,
-        np.float32(min_share), np.float32(steepest / frame.camera.fx), *thread_shares(np.diff(firsts)), in_largest,
+        np.float32(min_share), np.float32(steepest / frame.camera.fx), *thread_shares(np.diff(firsts)), stays,
     )  # fmt: skip
     kept = np.ones(len(clusters.cluster), np.bool_)
-    kept[order] = in_largest
+    kept[order] = stays
     return kept
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _find_largest(
+def _find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int,
-    min_share: np.float32, steepest: np.float32, share_order: Int64, share_starts: Int64, in_largest: Bool,
+    min_share: np.float32, steepest: np.float32, share_order: Int64, share_starts: Int64, stays: Bool,
 ) -> None:  # fmt: skip
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if firsts[k + 1] > firsts[k]:
                 own = slice(firsts[k], firsts[k + 1])
-                _find_largest_of(pixels[own], depth, gap, gap_per_depth, reach, min_share, steepest, in_largest[own])
+                _find_pieces_of(pixels[own], depth, gap, gap_per_depth, reach, min_share, steepest, stays[own])
 
 
 @njit(cache=True, nogil=True)
-def _find_largest_of(
+def _find_pieces_of(
     pixels: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, min_share: np.float32,
-    steepest: np.float32, in_largest: Bool,
+    steepest: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
     """Union-find over the runs of connected pixels in each row, of which there are far fewer than pixels.
 
@@ -103,69 +108,59 @@ def _find_largest_of(
     for run in range(count):
         pieces[parents[run]] += sizes[run]
     largest = np.argmax(pieces)
-    least = max(min_share * np.float32(pieces[largest]), np.float32(2.0))
-    stays = np.zeros(count, np.bool_)
-    stays[largest] = True
     piece = np.empty(len(pixels), np.int32)
     for i in range(len(pixels)):
         piece[i] = parents[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
-    if min_share <= np.float32(1.0):
-        for other in range(1, count):
-            if other != largest and pieces[other] >= least:
-                stays[other] = _hidden_apart(pixels, piece, largest, other, depth, gap, gap_per_depth, steepest)
+    piece_stays = np.zeros(count, np.bool_)
+    piece_stays[largest] = True
+    least = min_share * np.float32(pieces[largest])
+    if pieces[largest] >= least:
+        _keep_near(pixels, piece, pieces, largest, least, depth, gap, gap_per_depth, steepest, piece_stays)
     for i in range(len(pixels)):
-        in_largest[i] = stays[piece[i]]
+        stays[i] = piece_stays[piece[i]]
 
 
 @njit(cache=True, nogil=True)
-def _some_of(piece: Int32, wanted: int, most: int) -> Int64:
-    """Up to `most` places of `wanted`, evenly over all."""
+def _keep_near(
+    pixels: Int32, piece: Int32, sizes: Int32, largest: int, least: np.float32, depth: Float32, gap: np.float32,
+    gap_per_depth: np.float32, steepest: np.float32, stays: Bool,
+) -> None:  # fmt: skip
+    """Marks the pieces that no step in depth parts from those that stay, the larger ones first."""
+    others = np.flatnonzero((sizes > 0) & (sizes >= least))
+    ends = _some_of(pixels, piece, largest, ENDS)
+    for other in others[np.argsort(-sizes[others], kind="mergesort")]:
+        if not stays[other] and _is_near(
+            _some_of(pixels, piece, other, STARTS), ends, depth, gap, gap_per_depth, steepest
+        ):
+            stays[other] = True
+            ends = np.concatenate((ends, _some_of(pixels, piece, other, ENDS)))
+
+
+@njit(cache=True, nogil=True)
+def _some_of(pixels: Int32, piece: Int32, wanted: int, most: int) -> Int32:
+    """Up to `most` pixels of a piece, evenly over all."""
     places = np.flatnonzero(piece == wanted)
     step = (len(places) + most - 1) // most
-    return places[step // 2 :: step]
+    return pixels[places[step // 2 :: step]]
 
 
 @njit(cache=True, nogil=True)
-def _hidden_apart(
-    pixels: Int32, piece: Int32, largest: int, other: int, depth: Float32, gap: np.float32, gap_per_depth: np.float32,
-    steepest: np.float32,
-) -> bool:  # fmt: skip
-    """Whether something nearer stands between most of the points of a piece and the largest one."""
-    ends = pixels[_some_of(piece, largest, 256)]
-    starts = pixels[_some_of(piece, other, 32)]
-    hidden = 0
+def _is_near(
+    starts: Int32, ends: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, steepest: np.float32
+) -> bool:
+    """Whether most of `starts` are no step in depth away from the nearest of `ends`."""
+    near = 0
     for k in range(len(starts)):
         u, v = starts[k, 0], starts[k, 1]
-        best, nearest = 0, np.int64(1) << 60
+        nearest, away = 0, np.int64(1) << 60
         for e in range(len(ends)):
-            away = np.int64(ends[e, 0] - u) ** 2 + np.int64(ends[e, 1] - v) ** 2
-            if away < nearest:
-                best, nearest = e, away
-        hidden += _is_hidden_between(
-            depth, u, v, ends[best, 0], ends[best, 1], gap, gap_per_depth, steepest * np.float32(np.sqrt(nearest))
-        )
-    return 2 * hidden > len(starts)
-
-
-@njit(cache=True, nogil=True)
-def _is_hidden_between(
-    depth: Float32, u0: int, v0: int, u1: int, v1: int, gap: np.float32, gap_per_depth: np.float32, slope: np.float32
-) -> bool:
-    """Whether a pixel on the line between two has a reading nearer than both, by the gap; see in_hidden_apart_pieces."""
-    z0, z1 = depth[v0, u0], depth[v1, u1]
-    nearer = min(z0, z1)
-    tolerance = gap + gap_per_depth * nearer
-    if abs(z0 - z1) > tolerance + slope * nearer:
-        return False
-    if COMPAT:
-        return True
-    steps = max(abs(u1 - u0), abs(v1 - v0))
-    for step in range(1, steps):
-        t = step / steps
-        z = depth[v0 + int(round(t * (v1 - v0))), u0 + int(round(t * (u1 - u0)))]
-        if z > np.float32(0.0) and z < nearer - tolerance:
-            return True
-    return False
+            distance = np.int64(ends[e, 0] - u) ** 2 + np.int64(ends[e, 1] - v) ** 2
+            if distance < away:
+                nearest, away = e, distance
+        here, there = depth[v, u], depth[ends[nearest, 1], ends[nearest, 0]]
+        rise = gap + (gap_per_depth + steepest * np.float32(np.sqrt(away))) * min(here, there)
+        near += abs(here - there) <= rise
+    return 2 * near > len(starts)
 
 
 @njit(cache=True, nogil=True)
