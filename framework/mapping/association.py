@@ -47,6 +47,8 @@ class Overlaps:
     visible: Int32  # (M,) pixels that see each instance
     sizes: Int32  # (N,) pixels of each cluster
     votes: Int32  # (N, M) pixels of both
+    seen: Int32  # (h, w) the instance at every `stride`-th pixel of every `stride`-th row, 0 = none
+    stride: int
 
     def by(self, rule: OverlapRule, least: int) -> npt.NDArray[np.float64]:
         """(N, M) overlaps in [0, 1] by one of the rules, with `least` as in `over_smaller`."""
@@ -142,6 +144,8 @@ def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1
         visible=visible[seen] * stride**2,
         sizes=votes.sum(axis=1, dtype=np.int32) * stride**2,
         votes=votes[:, :-1] * stride**2,
+        seen=instance_ids,
+        stride=stride,
     )
 
 

@@ -7,16 +7,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Float32, Float64, PointClusters
-from framework.mapping.association import Matches
+from framework.data import Bool, Float32, Float64, PointClusters
+from framework.mapping.association import Matches, class_agreement
 from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.pixel_lists import PixelLists, keep_on_top
+from framework.mapping.pixel_lists import PixelLists, keep_on_top, leave_to_others
 from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
 
+OTHER_CLASS = 0.3  # Bhattacharyya coefficient of two distributions below which they are of different things
 EXACT_BITS = 16  # by which exact storage's units are finer
 
 
@@ -60,10 +61,13 @@ class LabeledVoxels:
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
     on_top: float = 0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
+    lying_on: float = (
+        0.6  # in [0, 1]: an instance of which a cluster of another class covers so much lies on it; 1 = off
+    )
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     def __post_init__(self) -> None:
-        check_bounds(self, on_top=(0.0, 1.0))
+        check_bounds(self, on_top=(0.0, 1.0), lying_on=(0.0, 1.0))
 
     def new_map(self, rule: LabelRule) -> InstanceMap:
         """An empty one for labels by this rule."""
@@ -74,6 +78,9 @@ class LabeledVoxels:
     ) -> Measurement:
         """What a frame's clusters, in the lists of each pixel, say of the voxels by this rule."""
         points = keep_on_top(matches.clusters, points, matches.instance_ids, self.on_top)
+        others = self.lying_on_clusters(table, matches)
+        if others.any():
+            points = leave_to_others(matches.clusters, points, others, matches.overlaps.seen, matches.overlaps.stride)
         matched = np.zeros(table.last_id + 1, np.bool_)
         matched[matches.instance_ids] = True
         class_gain, named, bits = named_classes(evidence.classes, rule.logarithmic)
@@ -95,3 +102,23 @@ class LabeledVoxels:
             combine=int(rule.combine),
             most_units=MOST_UNITS if compact else 1 << 62,
         )
+
+    def lying_on_clusters(self, table: InstanceTable, matches: Matches) -> Bool:
+        """(N, ids + 1) which instances lie on what each cluster is of, as a book does on a table.
+
+        Such an instance counts, is of another class, and most of what is seen of it is under the cluster, at most half
+        of the cluster's pixels. A network draws a large mask over the small things that lie on the object: that mask
+        says nothing about them.
+        """
+        overlaps, clusters = matches.overlaps, matches.clusters
+        lying = np.zeros((len(clusters), table.last_id + 1), np.bool_)
+        if self.lying_on >= 1 or not len(overlaps.instance_ids):
+            return lying
+        counts = self.confirmation.counts(table)[overlaps.instance_ids]
+        known = np.stack([table.class_probabilities(table.records[int(k)]) for k in overlaps.instance_ids])
+        other_class = class_agreement(clusters.class_probabilities, known) < OTHER_CLASS
+        covered = overlaps.votes >= self.lying_on * np.maximum(overlaps.visible, 1)
+        small = 2 * overlaps.visible <= overlaps.sizes[:, None]
+        other = matches.instance_ids[:, None] != overlaps.instance_ids
+        lying[:, overlaps.instance_ids] = counts & other_class & covered & small & other
+        return lying

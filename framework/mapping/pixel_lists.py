@@ -114,3 +114,33 @@ def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32
     kept = PixelLists(np.empty_like(points.first), np.empty_like(points.next))
     _keep_on_top(points.first, points.next, clusters.cluster, sizes, share, kept.first, kept.next)
     return kept
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _leave_to_others(first, following, cluster, lying, seen, stride, kept_first, kept_following):
+    """Copies each pixel's list without the points of clusters on which the instance seen there lies."""
+    for v in prange(first.shape[0]):
+        for u in range(first.shape[1]):
+            kept_first[v, u] = -1
+            last = np.int32(-1)
+            found = seen[v // stride, u // stride]
+            p = first[v, u]
+            while p >= 0:
+                if not lying[cluster[p], found]:
+                    if last < 0:
+                        kept_first[v, u] = p
+                    else:
+                        kept_following[last] = p
+                    kept_following[p] = -1
+                    last = p
+                p = following[p]
+
+
+def leave_to_others(clusters: PointClusters, points: PixelLists, lying: Bool, seen: Int32, stride: int) -> PixelLists:
+    """`points` without those of clusters where the map has an instance that is `lying` (N, ids + 1) on them.
+
+    `seen` holds the map's instance at every stride-th pixel of every stride-th row.
+    """
+    kept = PixelLists(np.empty_like(points.first), np.empty_like(points.next))
+    _leave_to_others(points.first, points.next, clusters.cluster, lying, seen, stride, kept.first, kept.next)
+    return kept

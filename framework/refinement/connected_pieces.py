@@ -14,6 +14,8 @@ from framework.refinement.neighborhood import bounding_box, members, thread_shar
 from framework.refinement.union_find import root, unite
 
 CELLS = 512  # that are looked at together
+STARTS, ENDS = 32, 256  # samples of a piece that may stay, and of one that does
+NO_OTHER = 2.0  # min_share that no piece beside the largest has
 
 
 def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_depth: float, reach: int) -> Bool:
@@ -22,33 +24,64 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_
     Two points are connected when they are at most `reach` px apart and their depths differ by less than `gap` (m) +
     `gap_per_depth` * depth of the nearer one. Points of no cluster are in.
     """
+    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share=NO_OTHER, steepest=0.0)
+
+
+def in_near_pieces(
+    clusters: PointClusters,
+    frame: Frame,
+    gap: float,
+    gap_per_depth: float,
+    reach: int,
+    min_share: float,
+    steepest: float,
+) -> Bool:
+    """(P,) which points are in their cluster's largest piece, or in one that no step in depth parts from what stays.
+
+    Pieces are those of `in_largest_piece`. Those with `min_share` of the largest one's points or more are gone through,
+    larger ones first. One stays when most of its points differ in depth from the nearest one that stays by no more than
+    the gap, and what a surface may rise on the way there: `steepest` m of depth a metre aside. By samples.
+    """
+    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share, steepest)
+
+
+def _in_pieces(
+    clusters: PointClusters,
+    frame: Frame,
+    gap: float,
+    gap_per_depth: float,
+    reach: int,
+    min_share: float,
+    steepest: float,
+) -> Bool:
     order, firsts = members(clusters)
-    in_largest = np.empty(firsts[-1], np.bool_)
-    _find_largest(
+    stays = np.empty(firsts[-1], np.bool_)
+    _find_pieces(
         clusters.pixels[order], firsts, frame.depth, np.float32(gap), np.float32(gap_per_depth), reach,
-        *thread_shares(np.diff(firsts)), in_largest,
+        np.float32(min_share), np.float32(steepest / frame.camera.fx), *thread_shares(np.diff(firsts)), stays,
     )  # fmt: skip
     kept = np.ones(len(clusters.cluster), np.bool_)
-    kept[order] = in_largest
+    kept[order] = stays
     return kept
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _find_largest(
+def _find_pieces(
     pixels: Int32, firsts: Int64, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int,
-    share_order: Int64, share_starts: Int64, in_largest: Bool,
+    min_share: np.float32, steepest: np.float32, share_order: Int64, share_starts: Int64, stays: Bool,
 ) -> None:  # fmt: skip
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if firsts[k + 1] > firsts[k]:
                 own = slice(firsts[k], firsts[k + 1])
-                _find_largest_of(pixels[own], depth, gap, gap_per_depth, reach, in_largest[own])
+                _find_pieces_of(pixels[own], depth, gap, gap_per_depth, reach, min_share, steepest, stays[own])
 
 
 @njit(cache=True, nogil=True)
-def _find_largest_of(
-    pixels: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, in_largest: Bool
-) -> None:
+def _find_pieces_of(
+    pixels: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, reach: int, min_share: np.float32,
+    steepest: np.float32, stays: Bool,
+) -> None:  # fmt: skip
     """Union-find over the runs of connected pixels in each row, of which there are far fewer than pixels.
 
     Cells lie row by row in flat arrays, with empty ones at the end of each row, so that a neighbor is as far away
@@ -74,9 +107,60 @@ def _find_largest_of(
     pieces = np.zeros(count, np.int32)
     for run in range(count):
         pieces[parents[run]] += sizes[run]
-    of_largest = parents[:count] == np.argmax(pieces)
+    largest = np.argmax(pieces)
+    piece = np.empty(len(pixels), np.int32)
     for i in range(len(pixels)):
-        in_largest[i] = of_largest[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
+        piece[i] = parents[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
+    piece_stays = np.zeros(count, np.bool_)
+    piece_stays[largest] = True
+    least = min_share * np.float32(pieces[largest])
+    if pieces[largest] >= least:
+        _keep_near(pixels, piece, pieces, largest, least, depth, gap, gap_per_depth, steepest, piece_stays)
+    for i in range(len(pixels)):
+        stays[i] = piece_stays[piece[i]]
+
+
+@njit(cache=True, nogil=True)
+def _keep_near(
+    pixels: Int32, piece: Int32, sizes: Int32, largest: int, least: np.float32, depth: Float32, gap: np.float32,
+    gap_per_depth: np.float32, steepest: np.float32, stays: Bool,
+) -> None:  # fmt: skip
+    """Marks the pieces that no step in depth parts from those that stay, the larger ones first."""
+    others = np.flatnonzero((sizes > 0) & (sizes >= least))
+    ends = _some_of(pixels, piece, largest, ENDS)
+    for other in others[np.argsort(-sizes[others], kind="mergesort")]:
+        if not stays[other] and _is_near(
+            _some_of(pixels, piece, other, STARTS), ends, depth, gap, gap_per_depth, steepest
+        ):
+            stays[other] = True
+            ends = np.concatenate((ends, _some_of(pixels, piece, other, ENDS)))
+
+
+@njit(cache=True, nogil=True)
+def _some_of(pixels: Int32, piece: Int32, wanted: int, most: int) -> Int32:
+    """Up to `most` pixels of a piece, evenly over all."""
+    places = np.flatnonzero(piece == wanted)
+    step = (len(places) + most - 1) // most
+    return pixels[places[step // 2 :: step]]
+
+
+@njit(cache=True, nogil=True)
+def _is_near(
+    starts: Int32, ends: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, steepest: np.float32
+) -> bool:
+    """Whether most of `starts` are no step in depth away from the nearest of `ends`."""
+    near = 0
+    for k in range(len(starts)):
+        u, v = starts[k, 0], starts[k, 1]
+        nearest, away = 0, np.int64(1) << 60
+        for e in range(len(ends)):
+            distance = np.int64(ends[e, 0] - u) ** 2 + np.int64(ends[e, 1] - v) ** 2
+            if distance < away:
+                nearest, away = e, distance
+        here, there = depth[v, u], depth[ends[nearest, 1], ends[nearest, 0]]
+        rise = gap + (gap_per_depth + steepest * np.float32(np.sqrt(away))) * min(here, there)
+        near += abs(here - there) <= rise
+    return 2 * near > len(starts)
 
 
 @njit(cache=True, nogil=True)

@@ -10,6 +10,7 @@ import pytest
 from framework.data import Camera, Frame, PointClusters
 from framework.errors import ConfigError, DataError
 from plugins.refiners.chain import Chain
+from plugins.refiners.connected import Connected
 from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
@@ -59,12 +60,18 @@ def test_no_link_is_given_pixels_that_the_one_before_it_made_up() -> None:
 @pytest.mark.parametrize(
     ("overrides", "links"),
     [
-        (["refiner.links.gmm_em.std_floor=0.02"], {"plane_removal": PlaneRemoval, "gmm_em": GmmEm}),
-        (["refiner.links.gmm_em=null"], {"plane_removal": PlaneRemoval}),
-        (["refiner@refiner.links.gmm_em=kmeans"], {"plane_removal": PlaneRemoval, "gmm_em": KMeans}),
+        (
+            ["refiner.links.gmm_em.std_floor=0.02"],
+            {"plane_removal": PlaneRemoval, "gmm_em": GmmEm, "connected": Connected},
+        ),
+        (["refiner.links.gmm_em=null"], {"plane_removal": PlaneRemoval, "connected": Connected}),
+        (
+            ["refiner@refiner.links.gmm_em=kmeans"],
+            {"plane_removal": PlaneRemoval, "gmm_em": KMeans, "connected": Connected},
+        ),
         (
             ["+refiner@refiner.links.last=largest_component"],
-            {"plane_removal": PlaneRemoval, "gmm_em": GmmEm, "last": LargestComponent},
+            {"plane_removal": PlaneRemoval, "gmm_em": GmmEm, "connected": Connected, "last": LargestComponent},
         ),
     ],
 )

@@ -12,6 +12,7 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
 from framework.geometry import exp_se3, lift
 from framework.interfaces import ClusterRefiner
+from plugins.refiners.connected import Connected
 from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.identity import Identity
 from plugins.refiners.kmeans import KMeans
@@ -19,7 +20,7 @@ from plugins.refiners.largest_component import LargestComponent
 from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-REFINERS: list[Callable[[], ClusterRefiner]] = [Identity, GmmEm, KMeans, LargestComponent]
+REFINERS: list[Callable[[], ClusterRefiner]] = [Identity, GmmEm, KMeans, LargestComponent, Connected]
 T_WORLD_CAMERA = exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1]))
 
 

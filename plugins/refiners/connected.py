@@ -1,0 +1,44 @@
+"""Cluster refinement by connectivity: what a step in depth parts from the rest of a cluster is another thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from framework.data import Frame, PointClusters
+from framework.interfaces import ClusterRefiner
+from framework.parameters import check_bounds
+from framework.refinement.connected_pieces import in_near_pieces
+from framework.refinement.selection import keep_points
+
+
+@dataclass
+class Connected(ClusterRefiner):
+    """Keeps of each cluster its largest piece that is connected in 3D, and the pieces that no step parts from it.
+
+    Pieces are those of `largest_component`. What a mask has caught beside its object begins at a step in depth: the
+    wall behind a couch, the carpet between a chair's slats. That is dropped. A piece at a depth that the object's own
+    surface may have at that distance stays, whatever is between: the chair before the couch, readings that are missing,
+    the air between the legs of a table.
+    """
+
+    gap: float = 0.1  # m, from 0
+    gap_per_depth: float = 0.02  # m per m, from 0
+    reach: int = 2  # px, from 1; 2 bridges single missing readings
+    min_share: float = 0.05  # in [0, 1], of the largest piece's points; a smaller piece is dropped
+    steepest: float = 2.0  # m of depth a metre aside, from 0, by which two pieces of one object may be apart
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            gap=(0.0, np.inf),
+            gap_per_depth=(0.0, np.inf),
+            reach=(1, 16),
+            min_share=(0.0, 1.0),
+            steepest=(0.0, np.inf),
+        )
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        kept = in_near_pieces(clusters, frame, self.gap, self.gap_per_depth, self.reach, self.min_share, self.steepest)
+        return keep_points(clusters, kept)
