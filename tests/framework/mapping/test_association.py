@@ -8,7 +8,13 @@ from hypothesis import strategies as st
 from framework.data import PointClusters
 from framework.errors import DataError
 from framework.mapping.association import OverlapRule, class_agreement, count_overlaps, match_one_to_one
-from framework.mapping.pixel_lists import PixelLists, cover_another, keep_on_top, list_points_by_pixel
+from framework.mapping.pixel_lists import (
+    PixelLists,
+    cover_another,
+    keep_on_top,
+    leave_to_others,
+    list_points_by_pixel,
+)
 
 SHAPE = (4, 5)
 
@@ -187,3 +193,21 @@ def test_who_keeps_a_pixel_agrees_with_a_slow_reference(seed: int, share: float)
         small = [sizes[k] for k in at_pixel if ids[k]]
         expected.append([k for k in at_pixel if not ids[k] or all(size >= share * sizes[k] for size in small)])
     assert clusters_at(clusters, keep_on_top(clusters, points, ids, share)) == expected
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_who_leaves_a_pixel_to_what_lies_there_agrees_with_a_slow_reference(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
+    points = list_points_by_pixel(clusters, SHAPE)
+    stride = 1 + seed % 2
+    seen = rng.integers(0, 3, tuple(-(-side // stride) for side in SHAPE)).astype(np.int32)
+    lying = rng.random((4, 3)) < 0.4
+    expected = []
+    for pixel, at_pixel in enumerate(clusters_at(clusters, points)):
+        v, u = divmod(pixel, SHAPE[1])
+        expected.append([k for k in at_pixel if not lying[k, seen[v // stride, u // stride]]])
+    assert clusters_at(clusters, leave_to_others(clusters, points, lying, seen, stride)) == expected
+    assert clusters_at(clusters, leave_to_others(clusters, points, lying & False, seen, stride)) == clusters_at(
+        clusters, points
+    ), "the lists given stay as they are"

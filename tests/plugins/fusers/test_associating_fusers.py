@@ -253,3 +253,26 @@ def test_a_floored_distribution_has_no_zero_and_still_sums_to_one() -> None:
     p = np.exp(floored_log(np.float32([[1, 0, 0, 0], [0.25, 0.25, 0.25, 0.25]]), 0.2))
     assert np.allclose(p, [[0.85, 0.05, 0.05, 0.05], [0.25, 0.25, 0.25, 0.25]])
     assert floored_log(np.zeros((0, 0), np.float32), 0.2).shape == (0, 0)
+
+
+@pytest.mark.parametrize(
+    ("lying_on", "same_class", "keeps"), [(0.6, False, True), (1.0, False, False), (0.6, True, False)]
+)
+def test_a_keyboard_keeps_its_voxels_under_the_masks_of_its_desk(
+    lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
+) -> None:
+    """Once it counts: the desk's mask covers it in frames that do not find it. A part of a desk is the desk's."""
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, lying_on=lying_on, on_top=0.0, merge_agreement=1.0)
+    whole = masks_of(frames[0])[0]
+    u = np.flatnonzero(whole.any(axis=0))
+    keyboard = whole & (np.arange(CAMERA.width) < u[0] + (u[-1] - u[0]) // 3)
+    desk, small = (0.99, 0.01), (0.99, 0.01) if same_class else (0.01, 0.99)
+    for k in range(3):
+        fuse_masks(
+            fuser, dataclasses.replace(frames[0], index=k), [whole & ~keyboard, keyboard], [0.9, 0.9], [desk, small]
+        )
+    for k in range(3, 20):
+        fuse_masks(fuser, dataclasses.replace(frames[0], index=k), [whole], [0.9], [desk])
+    seen = fuser.scene.instances_seen(frames[0], frames[0].T_world_camera, 1)
+    assert (seen[keyboard] == 2).mean() > 0.9 if keeps else (seen[keyboard] == 2).mean() < 0.1
+    assert (seen[whole & ~keyboard] == 1).mean() > 0.9
