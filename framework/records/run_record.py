@@ -31,6 +31,8 @@ from framework.rendering.overview import write_overview
 
 log = logging.getLogger(__name__)
 
+LIKELY = 0.3  # confidence from which on an instance is in the picture and in what a run says; files have them all
+
 
 @dataclass(frozen=True)
 class RunRecord:
@@ -86,18 +88,21 @@ class RunRecord:
             **environment(),
         }
         title = headline(metrics)
-        labels = {key: (name or "object", instances[key].confidence) for key, name in names.items()}
+        likely = {key: name or "object" for key, name in names.items() if instances[key].confidence >= LIKELY}
+        labels = {key: (name, instances[key].confidence) for key, name in likely.items()}
         write_overview(self.directory / "overview.png", mesh, labels, poses, title)
         if result.stopped_by is None:
             write_json(self.directory / METRICS, metrics)
         else:
             write_json(self.directory / PARTIAL_METRICS, {"partial": reason(result.stopped_by), **metrics})
-        self._announce(title, Counter(name or "object" for name in names.values()), result)
+        self._announce(title, Counter(likely.values()), len(names) - len(likely), result)
         return metrics
 
-    def _announce(self, title: str, found: Counter[str], result: RunResult) -> None:
+    def _announce(self, title: str, likely: Counter[str], unlikely: int, result: RunResult) -> None:
         log.info("%s", title)
-        log.info("found: %s", ", ".join(f"{count} {name}" for name, count in found.most_common()) or "no instance")
+        found = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
+        rest = f"; {unlikely} of a confidence below {LIKELY} are in the files alone" if unlikely else ""
+        log.info("found: %s%s", found, rest)
         for name in ("overview.png", "mesh.ply", "instances.json"):
             log.info("%s", self.directory / name)
         if result.stopped_by is not None:

@@ -18,6 +18,7 @@ from framework.interfaces import ClusterRefiner
 from framework.refinement import mixture, mixture_tree
 from framework.refinement.neighborhood import Ring, surroundings
 from plugins.refiners.chain import Chain
+from plugins.refiners.connected import Connected
 from plugins.refiners.dbscan import Dbscan
 from plugins.refiners.geometric import Geometric
 from plugins.refiners.gmm_em import GmmEm
@@ -54,7 +55,7 @@ def ten_masks() -> tuple[PointClusters, Frame]:
 
 def default_chain() -> Chain:
     """The links of conf/refiner/chain.yaml, which are to take at most 10 ms together on 2 cores."""
-    return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm()})
+    return Chain({"plane_removal": PlaneRemoval(), "gmm_em": GmmEm(), "connected": Connected()})
 
 
 @pytest.mark.parametrize(
@@ -66,6 +67,7 @@ def default_chain() -> Chain:
         GmmTree(),
         KMeans(),
         LargestComponent(),
+        Connected(),
         PlaneRemoval(),
         Dbscan(),
         RankOrder(),
