@@ -23,8 +23,8 @@ help: ## this list
 		printf '%-18s%s\n' "$$target" "$$says"; done
 
 .PHONY: demo
-demo: $(INSTALLED) ## map the synthetic room, leave the record in outputs/demo
-	@$(BIN)/python -m framework hydra.run.dir=$(DEMO)
+demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
+	@$(BIN)/python -m framework dataset=desk hydra.run.dir=$(DEMO)
 
 .PHONY: test
 test: $(INSTALLED_DEV) ## lint, check types, run the tests

@@ -17,6 +17,7 @@ from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, U
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
+from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
 FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
@@ -95,7 +96,7 @@ class Recording(RGBDSequence):
     frame is read, so that the pipeline counts it and goes on.
     """
 
-    root: Path  # the folder, or the folder of the scenes
+    root: Path  # the folder, or the folder of the scenes; a relative one in the working, else in the project folder
     scene: str = ""  # sub-folder of root; "" = root itself
     start: int = 0  # first frame
     stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
@@ -108,7 +109,7 @@ class Recording(RGBDSequence):
         check_selection(self.start, self.stop, self.stride, self.share)
         if not (math.isfinite(self.max_depth) and self.max_depth >= 0):
             raise ConfigError(f"dataset.max_depth must be 0 (keep all) or positive metres, found {self.max_depth}")
-        self.root = Path(self.root).expanduser()
+        self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
         if not self.folder.is_dir():
             raise DataError(f"dataset.root: the folder {self.folder} does not exist")

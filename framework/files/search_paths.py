@@ -13,3 +13,9 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "co
 def candidates(path: Path) -> tuple[Path, ...]:
     """The path; of a relative one, where it would be in the working, then in the project folder."""
     return (path,) if path.is_absolute() else tuple(dict.fromkeys((Path.cwd() / path, PROJECT_ROOT / path)))
+
+
+def folder_of(path: Path) -> Path:
+    """The first of these places that is a folder, `~` resolved; the path itself where none is."""
+    path = path.expanduser()
+    return next((place for place in candidates(path) if place.is_dir()), path)

@@ -11,6 +11,7 @@ from typing import Any
 
 from framework.detection.fingerprint import content_hash
 from framework.errors import ConfigError
+from framework.files.search_paths import folder_of
 from framework.records.provenance import leaves, relevant
 
 INPUTS = "inputs_sha256"  # the key of metrics.json
@@ -30,7 +31,7 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
             digest.update(f"{key} {_content(value)};".encode())
     dataset = config.get("dataset") or {}
     if root := dataset.get("root"):
-        for entry in islice(_listed(Path(root).expanduser(), str(dataset.get("scene") or "")), MOST_FILES):
+        for entry in islice(_listed(folder_of(Path(root)), str(dataset.get("scene") or "")), MOST_FILES):
             digest.update(f"{entry};".encode())
     return digest.hexdigest()
 
