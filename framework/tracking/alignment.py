@@ -128,6 +128,8 @@ class NormalEquations(NamedTuple):
     matched: int  # of these, points with a weight
     close: int  # of the visible, points whose depth in the view agrees with the model's
     behind: int  # of the visible, points so far behind the model that they could not be seen through it
+    compared: int  # points whose intensity was compared with the model's
+    alike: int  # of these, points with a photometric weight
     brightness: float  # mean of frame - model intensity: the change of exposure
 
 
@@ -443,5 +445,7 @@ def linearize(
         matched=weighed if weights.depth_weight > 0 else weighed_colors,
         close=close,
         behind=behind,
+        compared=compared,
+        alike=weighed_colors,
         brightness=float(total[SUMS - 1] / max(compared, 1)),
     )

@@ -14,14 +14,16 @@ from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angl
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
 from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
+from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.keyframes import Keyframes
-from framework.tracking.pyramid import PyramidLevel, build_pyramid, model_intensities
+from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
 
 LEVELS = 3
 FINE_ENOUGH = 1e-4  # m and rad: a shorter step ends the finest level, four times as long a one the level before, ...
 SAME_PLACE = 0.05  # m and rad: two alignments that end nearer to each other than this have found the same pose
 SMALLEST = 8  # px, of the sides of the coarsest level
 CHANGED_SCENE = 0.95  # share of the points not behind the map's surface that agree with it, where a thing was removed
+EXPECTED_AGREEMENT, EXPECTED_BEHIND = 0.8, 0.1  # shares of the points in view, enough where the prediction leads
 VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
 VISITED_APART = 0.1  # m and rad
 SURER = 2.0  # times min_information is what ends a loss: the next frame may well have more
@@ -32,9 +34,14 @@ class Alignment(NamedTuple):
 
     T_world_camera: Float64
     agreement: float  # share of the points in view that agree with the map
-    beside: float  # likewise, of those that are not behind the map's surface
+    behind: float  # share of the points in view that are behind the map's surface
+    beside: float  # share that agrees, of those that are not behind it
     reason: str  # why it is impossible, empty if it is not
     doubt: str  # why it takes the keyframes' word to trust it, empty if it does not
+
+    @property
+    def trusted(self) -> bool:
+        return not (self.reason or self.doubt)
 
 
 @dataclass
@@ -102,27 +109,48 @@ class VoxelHashingIcp(PoseTracker):
         self._lost_frames = 0  # in a row
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
+        self._T_world_doubted: Float64 | None = None  # the last frame's, where it was lost only by doubt
+        self._last_frame: Frame | None = None  # that was trusted
+        self._coarse_depth = False
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         if self._T_world_last is None or scene.voxel_count == 0:
             return self._first(frame)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
-        if self._lost_frames:
-            alignment = self._align_twice(levels, scene, self._T_world_last)
-        else:
-            T_world_predicted = self._T_world_last @ self._T_last_next
-            alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
-            if _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE) and alignment.beside >= CHANGED_SCENE:
-                alignment = alignment._replace(doubt="")  # what is behind the map's surface was removed from before it
-        if (self._lost_frames or alignment.reason or alignment.doubt) and levels[0].depth.any():
+        self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
+        alignment = self._resumed(levels, scene) if self._lost_frames else self._continued(levels, scene)
+        if not alignment.trusted and levels[0].depth.any():
             alignment = self._searched(alignment, frame, levels, scene)
-        if alignment.reason or alignment.doubt:
+        if not alignment.trusted:
             self._lost_frames += 1
             self._T_last_next = np.eye(4)
+            self._T_world_doubted = None if alignment.reason else alignment.T_world_camera
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         return self._trusted(frame, alignment.T_world_camera)
+
+    def _continued(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+        """Aligns from where a steady motion has led, and is content with less where it ends there."""
+        assert self._T_world_last is not None
+        T_world_predicted = self._T_world_last @ self._T_last_next
+        alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
+        if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
+            return alignment
+        removed = alignment.beside >= CHANGED_SCENE  # what is behind the map's surface was removed from before it
+        if removed or (alignment.agreement >= EXPECTED_AGREEMENT and alignment.behind <= EXPECTED_BEHIND):
+            return alignment._replace(doubt="")
+        return alignment
+
+    def _resumed(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+        """Aligns from the last pose that was in doubt, if any, and from the last that was trusted."""
+        assert self._T_world_last is not None
+        if self._T_world_doubted is not None:
+            alignment = self._align_twice(levels, scene, self._T_world_doubted)
+            if alignment.trusted:
+                return alignment
+        again = self._align_twice(levels, scene, self._T_world_last)
+        return again if again.trusted or self._T_world_doubted is None or alignment.reason else alignment
 
     def _first(self, frame: Frame) -> Pose:
         """The pose that defines the world, of the first frame with something in it to be tracked by."""
@@ -145,17 +173,23 @@ class VoxelHashingIcp(PoseTracker):
 
     def _trusted(self, frame: Frame, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera
+        self._T_world_doubted = None
         self._lost_frames = 0
         if self.relocalize:
+            self._last_frame = frame
             self._keyframes.add(frame, T_world_camera)
             if not any(_near(T, T_world_camera, VISITED_APART) for T in self._visited):
                 self._visited.append(T_world_camera)
         return Pose(T_world_camera)
 
     def _searched(self, alignment: Alignment, frame: Frame, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """The best pose of a frame that is lost or in doubt: asks the keyframes, then goes through visited places."""
-        asks_keyframes = self.relocalize and self._lost_frames % 2 == 0  # the other frames try a visited place
-        found = self._keyframes.relocalize(frame) if asks_keyframes else None
+        """The best pose of a frame that alignment alone does not tell: asks features, then goes through visited places.
+
+        Two independent ways to one pose are trusted: features that lead to where alignment leads, too.
+        """
+        if not self.relocalize:
+            return alignment
+        found = self._told_by_features(frame)
         if found is not None:
             again = self._align(levels, scene, found.T_world_camera, found.T_world_camera)
             if not again.reason and _near(again.T_world_camera, found.T_world_camera, self.max_distance):
@@ -163,19 +197,30 @@ class VoxelHashingIcp(PoseTracker):
                     alignment = again
                 if _near(again.T_world_camera, alignment.T_world_camera, SAME_PLACE):
                     return alignment._replace(doubt="")
-        if (alignment.reason or alignment.doubt) and self._visited and not asks_keyframes:
-            T_world_visited = self._visited[-1 - self._lost_frames // 2 % len(self._visited)]
+        if self._lost_frames and self._visited:
+            T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
             again = self._align_twice(levels, scene, T_world_visited)
-            if not (again.reason or again.doubt):
+            if again.trusted:
                 return again
         return alignment
+
+    def _told_by_features(self, frame: Frame) -> AbsolutePose | None:
+        """The pose by features of the last trusted frame and of keyframes near it, else of those that look alike."""
+        assert self._T_world_last is not None
+        features = self._keyframes.extractor.extract(frame)
+        near = self._keyframes.nearest(self._T_world_last)
+        if self._last_frame is not None:
+            last = self._keyframes.extractor.extract(self._last_frame)
+            near = [self._keyframes.keyframe(self._last_frame, last, self._T_world_last), *near]
+        found = self._keyframes.locate(frame, features, near)
+        return self._keyframes.locate(frame, features, self._keyframes.alike(features)) if found is None else found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
         """Aligns from where the camera was, and again from where that ends: only the view from there tells whether the
         frame determines its pose.
         """
         first = self._align(levels, scene, T_world_from, T_world_from)
-        if first.reason or first.doubt:
+        if not first.trusted:
             return first
         second = self._align(levels, scene, first.T_world_camera, T_world_from)
         if not _near(first.T_world_camera, second.T_world_camera, SAME_PLACE / 2):
@@ -212,11 +257,12 @@ class VoxelHashingIcp(PoseTracker):
         if agreement < self.min_agreement or behind > self.max_behind:
             doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
         beside = equations.close / max(equations.visible - equations.behind, 1)
-        return Alignment(T_world_camera, agreement, beside, reason, doubt)
+        return Alignment(T_world_camera, agreement, behind, beside, reason, doubt)
 
     def _weights_at(self, level: int) -> Weights:
         """What is an outlier where the pose is known to a fraction of a voxel need not be one on the way there."""
         return self._weights._replace(
+            min_normal_dot=np.float32(-1) if self._coarse_depth else self._weights.min_normal_dot,
             max_distance=self._weights.max_distance * np.float32(1 + level),
             geometric_scale=self._weights.geometric_scale * np.float32(2**level),
             photometric_scale=self._weights.photometric_scale * np.float32(2**level),
