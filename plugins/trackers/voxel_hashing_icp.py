@@ -15,6 +15,7 @@ from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
 from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.absolute_pose import AbsolutePose
+from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
 
@@ -24,6 +25,7 @@ SAME_PLACE = 0.05  # m and rad: two alignments that end nearer to each other tha
 SMALLEST = 8  # px, of the sides of the coarsest level
 CHANGED_SCENE = 0.95  # share of the points not behind the map's surface that agree with it, where a thing was removed
 EXPECTED_AGREEMENT, EXPECTED_BEHIND = 0.8, 0.1  # shares of the points in view, enough where the prediction leads
+STEADY = 5  # frames in a row whose prediction was right, after which the next one counts for something
 VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
 VISITED_APART = 0.1  # m and rad
 SURER = 2.0  # times min_information is what ends a loss: the next frame may well have more
@@ -33,6 +35,7 @@ class Alignment(NamedTuple):
     """Where the alignment of a frame has ended."""
 
     T_world_camera: Float64
+    matched: float  # share of the points in view that have a weight
     agreement: float  # share of the points in view that agree with the map
     behind: float  # share of the points in view that are behind the map's surface
     beside: float  # share that agrees, of those that are not behind it
@@ -107,28 +110,31 @@ class VoxelHashingIcp(PoseTracker):
         self._T_world_last: Float64 | None = None  # the last pose that was trusted
         self._T_last_next = np.eye(4)  # its motion since the one before: the constant-velocity prediction
         self._lost_frames = 0  # in a row
+        self._steady_frames = 0  # in a row, of which the prediction was right
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
         self._T_world_doubted: Float64 | None = None  # the last frame's, where it was lost only by doubt
-        self._last_frame: Frame | None = None  # that was trusted
-        self._coarse_depth = False
+        self._last: FrameFeatures | None = None  # of the last frame that was trusted
+        self._coarse_depth = False  # too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        seen = FrameFeatures(frame, self._keyframes.extractor)
         if self._T_world_last is None or scene.voxel_count == 0:
-            return self._first(frame)
+            return self._first(seen)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
         alignment = self._resumed(levels, scene) if self._lost_frames else self._continued(levels, scene)
-        if not alignment.trusted and levels[0].depth.any():
-            alignment = self._searched(alignment, frame, levels, scene)
+        if not (alignment.trusted and self._steady_frames >= STEADY) and levels[0].depth.any():
+            alignment = self._searched(alignment, seen, levels, scene)
         if not alignment.trusted:
             self._lost_frames += 1
+            self._steady_frames = 0
             self._T_last_next = np.eye(4)
             self._T_world_doubted = None if alignment.reason else alignment.T_world_camera
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
-        return self._trusted(frame, alignment.T_world_camera)
+        return self._trusted(seen, alignment.T_world_camera)
 
     def _continued(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
         """Aligns from where a steady motion has led, and is content with less where it ends there."""
@@ -136,9 +142,13 @@ class VoxelHashingIcp(PoseTracker):
         T_world_predicted = self._T_world_last @ self._T_last_next
         alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
         if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
+            self._steady_frames = 0
             return alignment
+        self._steady_frames += 1
         removed = alignment.beside >= CHANGED_SCENE  # what is behind the map's surface was removed from before it
-        if removed or (alignment.agreement >= EXPECTED_AGREEMENT and alignment.behind <= EXPECTED_BEHIND):
+        expected = alignment.agreement >= EXPECTED_AGREEMENT and alignment.behind <= EXPECTED_BEHIND
+        enough = removed or (expected and self._steady_frames >= STEADY)
+        if enough and alignment.matched >= self.min_matched:
             return alignment._replace(doubt="")
         return alignment
 
@@ -152,8 +162,9 @@ class VoxelHashingIcp(PoseTracker):
         again = self._align_twice(levels, scene, self._T_world_last)
         return again if again.trusted or self._T_world_doubted is None or alignment.reason else alignment
 
-    def _first(self, frame: Frame) -> Pose:
+    def _first(self, seen: FrameFeatures) -> Pose:
         """The pose that defines the world, of the first frame with something in it to be tracked by."""
+        frame = seen.frame
         if min(frame.camera.shape) * self.finest < SMALLEST * 2 ** (LEVELS - 1):
             raise DataError(
                 f"images of {frame.camera.width}x{frame.camera.height} px are too small for tracker.finest="
@@ -164,56 +175,72 @@ class VoxelHashingIcp(PoseTracker):
         if readings < max(self.min_visible, 1 / frame.depth.size):
             reason = "the frame has no depth" if readings == 0 else f"the first frame has depth in only {readings:.1%}"
             return Pose(T_world_camera, lost=True, reason=reason)
-        return self._trusted(frame, T_world_camera)
+        return self._trusted(seen, T_world_camera)
 
     def _is_jump(self, T_last_next: Float64) -> bool:
         """Whether this is farther than a camera moves from one frame to the next."""
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
         return bool(step > self.max_step or turn > self.max_turn)
 
-    def _trusted(self, frame: Frame, T_world_camera: Float64) -> Pose:
+    def _trusted(self, seen: FrameFeatures, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera
         self._T_world_doubted = None
         self._lost_frames = 0
         if self.relocalize:
-            self._last_frame = frame
-            self._keyframes.add(frame, T_world_camera)
+            self._last = seen
+            if seen.known:
+                self._keyframes.add_with(seen.frame, seen.found, T_world_camera)
+            else:
+                self._keyframes.add(seen.frame, T_world_camera)
             if not any(_near(T, T_world_camera, VISITED_APART) for T in self._visited):
                 self._visited.append(T_world_camera)
         return Pose(T_world_camera)
 
-    def _searched(self, alignment: Alignment, frame: Frame, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+    def _searched(
+        self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
+    ) -> Alignment:
         """The best pose of a frame that alignment alone does not tell: asks features, then goes through visited places.
 
         Two independent ways to one pose are trusted: features that lead to where alignment leads, too.
         """
         if not self.relocalize:
             return alignment
-        found = self._told_by_features(frame)
+        found = self._told_by_features(seen)
         if found is not None:
-            again = self._align(levels, scene, found.T_world_camera, found.T_world_camera)
-            if not again.reason and _near(again.T_world_camera, found.T_world_camera, self.max_distance):
-                if alignment.reason or again.agreement > alignment.agreement:
-                    alignment = again
-                if _near(again.T_world_camera, alignment.T_world_camera, SAME_PLACE):
-                    return alignment._replace(doubt="")
-        if self._lost_frames and self._visited:
+            alignment = self._checked(alignment, found.T_world_camera, levels, scene)
+        if self._lost_frames and self._visited and not alignment.trusted:
             T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
             again = self._align_twice(levels, scene, T_world_visited)
             if again.trusted:
                 return again
         return alignment
 
-    def _told_by_features(self, frame: Frame) -> AbsolutePose | None:
+    def _checked(
+        self, alignment: Alignment, T_world_found: Float64, levels: list[PyramidLevel], scene: SceneMap
+    ) -> Alignment:
+        """What to make of an alignment where features tell `T_world_found`: two ways to one pose are trusted."""
+        if alignment.trusted and _near(alignment.T_world_camera, T_world_found, self.max_distance):
+            return alignment
+        again = self._align(levels, scene, T_world_found, T_world_found)
+        borne_out = not again.reason and _near(again.T_world_camera, T_world_found, self.max_distance)
+        if borne_out and (alignment.reason or again.trusted or again.agreement > alignment.agreement):
+            return again._replace(doubt="")
+        if alignment.reason:
+            return alignment
+        if _near(alignment.T_world_camera, T_world_found, self.max_distance):
+            return alignment._replace(doubt="")
+        return alignment._replace(doubt=alignment.doubt or "features tell another pose than alignment with the map")
+
+    def _told_by_features(self, seen: FrameFeatures) -> AbsolutePose | None:
         """The pose by features of the last trusted frame and of keyframes near it, else of those that look alike."""
         assert self._T_world_last is not None
-        features = self._keyframes.extractor.extract(frame)
         near = self._keyframes.nearest(self._T_world_last)
-        if self._last_frame is not None:
-            last = self._keyframes.extractor.extract(self._last_frame)
-            near = [self._keyframes.keyframe(self._last_frame, last, self._T_world_last), *near]
-        found = self._keyframes.locate(frame, features, near)
-        return self._keyframes.locate(frame, features, self._keyframes.alike(features)) if found is None else found
+        if self._last is not None:
+            near = [self._keyframes.keyframe(self._last.frame, self._last.found, self._T_world_last), *near]
+        found = self._keyframes.locate(seen.frame, seen.found, near)
+        if found is None:
+            found = self._keyframes.locate(seen.frame, seen.found, self._keyframes.alike(seen.found))
+        return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
         """Aligns from where the camera was, and again from where that ends: only the view from there tells whether the
@@ -250,14 +277,17 @@ class VoxelHashingIcp(PoseTracker):
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
+        matched, agreement, behind = (
+            count / max(equations.visible, 1) for count in (equations.matched, equations.close, equations.behind)
+        )
+        beside = equations.close / max(equations.visible - equations.behind, 1)
         reason = self._why_impossible(levels[0], equations, inverse(T_world_from) @ T_world_camera)
-        agreement = equations.close / max(equations.visible, 1)
-        behind = equations.behind / max(equations.visible, 1)
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_behind:
             doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
-        beside = equations.close / max(equations.visible - equations.behind, 1)
-        return Alignment(T_world_camera, agreement, behind, beside, reason, doubt)
+        elif matched < self.min_matched:
+            doubt = f"{agreement:.0%} of the points in view agree with the map, but {matched:.0%} in their normals, too"
+        return Alignment(T_world_camera, matched, agreement, behind, beside, reason, doubt)
 
     def _weights_at(self, level: int) -> Weights:
         """What is an outlier where the pose is known to a fraction of a voxel need not be one on the way there."""
@@ -275,7 +305,8 @@ class VoxelHashingIcp(PoseTracker):
             return "the frame has no depth"
         if equations.visible < self.min_visible * points:
             return f"{equations.visible / points:.0%} of the frame's points fall on the map"
-        if equations.matched < self.min_matched * equations.visible:
+        few_match = equations.matched < self.min_matched * equations.visible
+        if few_match and equations.close < self.min_agreement * equations.visible:
             return f"{equations.matched / equations.visible:.0%} of the points in view agree with the map"
         if self._is_jump(T_from_camera):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
