@@ -6,8 +6,8 @@
 
 The published correction factors of depth are in the images already. Colour and depth of freiburg1 and freiburg2 have
 the lens distortion of the colour camera, by which half of the pixels are off by 5 px or more, the corners by 37 and 27
-px; both are undistorted when read. Measured on the first 300 frames of freiburg1_rpy, `voxel_hashing_icp` at 1 cm with a
-gate that lets all frames pass: an ATE of 26.7 mm, of 37.4 mm without, of 37.5 mm where only colour is undistorted;
+px; both are undistorted when read. Measured on the first 300 frames of freiburg1_rpy with `voxel_hashing_icp` at 1 cm
+and a gate that lets all frames pass: an ATE of 26.7 mm, without it 37.4 mm, with colour alone undistorted 37.5 mm; with
 `pycolmap_pnp` 35 and 43 mm. freiburg3's images were undistorted when they were published.
 """
 
@@ -93,7 +93,13 @@ class TumRgbd(Recording):
             log.info("%s: %d of %d colour images have no depth image", self.name, len(color) - len(pairs), len(color))
         truth = Trajectory.read(self.folder / "groundtruth.txt", self.max_difference)
         frames = [_recorded(color[i], depth[j], truth) for i, j in pairs]
-        return Contents(CAMERAS[intrinsics], f"dataset.intrinsics={intrinsics.name}", DEPTH_SCALE, frames, DISTORTIONS[intrinsics] if self.undistort else None)
+        return Contents(
+            CAMERAS[intrinsics],
+            f"dataset.intrinsics={intrinsics.name}",
+            DEPTH_SCALE,
+            frames,
+            DISTORTIONS[intrinsics] if self.undistort else None,
+        )
 
 
 @dataclass(frozen=True)

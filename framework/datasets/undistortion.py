@@ -10,13 +10,16 @@ The model is Brown and Conrady's as in OpenCV: a point at (x, y, 1) m in the cam
 from __future__ import annotations
 
 from dataclasses import astuple, dataclass
+from typing import TypeVar
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
-from framework.data import Array, Camera, Float64
+from framework.data import Camera, Float64, UInt8
 from framework.errors import DataError
 
+Value = TypeVar("Value", bound=np.generic)
 FARTHEST_SHIFT = 0.5  # of the image's width: coefficients that move a pixel farther are of another model or a misprint
 
 
@@ -64,13 +67,10 @@ class Undistortion:
         self._u = source[:, 0].reshape(camera.shape).astype(np.float32)
         self._v = source[:, 1].reshape(camera.shape).astype(np.float32)
 
-    def smooth(self, image: Array) -> Array:
-        """An image (H, W, ...) that may be interpolated, as colours may."""
-        return self._sampled(image, cv2.INTER_LINEAR)
+    def smooth(self, image: UInt8) -> UInt8:
+        """Colours (H, W, 3), interpolated."""
+        return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
-    def exact(self, image: Array) -> Array:
-        """An image (H, W) of which each pixel takes the nearest value: of depths or labels nothing lies in between."""
-        return self._sampled(image, cv2.INTER_NEAREST)
-
-    def _sampled(self, image: Array, interpolation: int) -> Array:
-        return cv2.remap(image, self._u, self._v, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+    def exact(self, image: NDArray[Value]) -> NDArray[Value]:
+        """Depths or labels (H, W), of float32 or uint16: the nearest one, as between two nothing lies."""
+        return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), image.dtype)

@@ -4,10 +4,9 @@
 
 The frame's points p_i are moved by T = T_view_camera and projected into the view, which gives each its model point q_i
 with normal n_i, and its model intensity. Residuals are divided by their expected noise, so that both terms count
-standard deviations; w_i and v_i are Tukey's biweights. Beyond `FAR`, depth is taken to be less certain than its noise says,
-in proportion to its distance: what a structured-light camera does wrong there is wrong in whole regions of the image,
-and does not average out. Gauss-Newton steps are twists of the view's frame: T <- exp(xi)
-T.
+standard deviations; w_i and v_i are Tukey's biweights. Beyond `FAR` a depth's standard deviation is its noise times
+depth / FAR: what a structured-light camera gets wrong there is wrong in whole regions of the image and does not average
+out. Gauss-Newton steps are twists of the view's frame: T <- exp(xi) T.
 
 Points are done in batches of a fixed size, in passes that the compiler vectorises: loops without branches over fields
 of one array, and other loops that only fetch from images. A point that does not count has weight 0. Sums of points are
@@ -41,7 +40,7 @@ POINT_FIELDS = 21
 # ... and of its terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
 TERM_SIZE = ADDED + SUMS * LANES  # behind the fields, what the batch adds to the lanes
-FAR = 2.0  # m; with 26.7 instead of 24.7 mm without it on freiburg1_rpy, and 21.2 mm with and without it on redkitchen
+FAR = 2.0  # m; ATE of freiburg1_rpy's first 300 frames 26.7 mm without, 24.7 mm with it; of redkitchen 21.2 mm both
 NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
 
 
@@ -131,8 +130,6 @@ class NormalEquations(NamedTuple):
     matched: int  # of these, points with a weight
     close: int  # of the visible, points whose depth in the view agrees with the model's
     behind: int  # of the visible, points so far behind the model that they could not be seen through it
-    compared: int  # points whose intensity was compared with the model's
-    alike: int  # of these, points with a photometric weight
     brightness: float  # mean of frame - model intensity: the change of exposure
 
 
@@ -450,7 +447,5 @@ def linearize(
         matched=weighed if weights.depth_weight > 0 else weighed_colors,
         close=close,
         behind=behind,
-        compared=compared,
-        alike=weighed_colors,
         brightness=float(total[SUMS - 1] / max(compared, 1)),
     )

@@ -112,7 +112,9 @@ class Keyframes:
         features = features.with_depth()
         points = back_project(frame.camera, features.pixels, features.depth)
         points_world = np.asarray(transform(T_world_camera, points), np.float32)
-        return Keyframe(T_world_camera.copy(), points_world, features.descriptors, self._words.bag(features.descriptors))
+        return Keyframe(
+            T_world_camera.copy(), points_world, features.descriptors, self._words.bag(features.descriptors)
+        )
 
     def is_new(self, T_world_camera: Float64) -> bool:
         """Whether no keyframe was seen from near here. Takes microseconds."""

@@ -13,8 +13,8 @@ from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
-from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.absolute_pose import AbsolutePose
+from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.features import FrameFeatures
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
@@ -24,7 +24,8 @@ FINE_ENOUGH = 1e-4  # m and rad: a shorter step ends the finest level, four time
 SAME_PLACE = 0.05  # m and rad: two alignments that end nearer to each other than this have found the same pose
 SMALLEST = 8  # px, of the sides of the coarsest level
 CHANGED_SCENE = 0.95  # share of the points not behind the map's surface that agree with it, where a thing was removed
-EXPECTED_AGREEMENT, EXPECTED_BEHIND = 0.8, 0.1  # shares of the points in view, enough where the prediction leads
+EXPECTED_AGREEMENT = 0.8  # like min_agreement, where a prediction leads that has been right before
+EXPECTED_BEHIND = 0.1  # like max_behind, likewise
 STEADY = 5  # frames in a row whose prediction was right, after which the next one counts for something
 VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
 VISITED_APART = 0.1  # m and rad
@@ -49,7 +50,24 @@ class Alignment(NamedTuple):
 
 @dataclass
 class VoxelHashingIcp(PoseTracker):
-    """Frame-to-model ICP plus RGB, coarse to fine, with lost detection (after VoxelHashing and ElasticFusion)."""
+    """Frame-to-model ICP plus RGB, coarse to fine, with lost detection (after VoxelHashing and ElasticFusion).
+
+    A pose is trusted for what agrees with the map, more easily where the prediction has led, and for features that lead
+    to the same pose. Agreement alone does not tell: measured on every fourth frame, alignments that began at the pose
+    or up to 1 m and 1 rad beside it, were within 2 cm and 1.5 degrees of it (right) or 8 cm and 6 degrees off (wrong),
+    shares of the points in view:
+
+                                     right, agree / behind, worst 1 %     wrong and not impossible, most that agree
+        freiburg1_rpy, every frame   0.84 / 0.12                          0.99
+        freiburg1_rpy, every fifth   0.80 / 0.17                          0.97
+        redkitchen, every fifth      0.88 / 0.07                          0.49
+        a flat in 5 degree steps     0.87 / 0.09                          0.86
+        a ScanNet room, every fifth  0.96 / 0.04                          0.75
+        a synthetic room, likewise   0.98 / 0.01                          0.95
+
+    So a bound that all right poses pass is one for the place where the camera must be, and another pose takes a second
+    witness.
+    """
 
     finest: float = 0.5  # of the image's size, a power of 1/2: the resolution of the view and of the finest level
     iterations_coarse: int = 8  # >= 0, at 1/4 of the finest resolution
