@@ -41,7 +41,7 @@ class Alignment(NamedTuple):
     behind: float  # share of the points in view that are behind the map's surface
     beside: float  # share that agrees, of those that are not behind it
     reason: str  # why it is impossible, empty if it is not
-    doubt: str  # why it takes the keyframes' word to trust it, empty if it does not
+    doubt: str  # why it takes a second witness to trust it, empty if it does not
 
     @property
     def trusted(self) -> bool:
@@ -87,8 +87,10 @@ class VoxelHashingIcp(PoseTracker):
     min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
     min_information: float = 1e-3  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
     min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
-    max_behind: float = 0.015  # in [0, 1]: ... and behind it; what fails must be confirmed by the keyframes
-    relocalize: bool = True  # by features of keyframes, and from visited places, when lost or in doubt
+    max_behind: float = (
+        0.015  # in [0, 1]: ... and behind it; what fails takes a second witness, see above
+    )
+    relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited places, when lost
     seed: int = 0  # of the relocalization's random samples
 
     def __post_init__(self) -> None:
@@ -171,14 +173,13 @@ class VoxelHashingIcp(PoseTracker):
         return alignment
 
     def _resumed(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Aligns from the last pose that was in doubt, if any, and from the last that was trusted."""
+        """Aligns a lost camera from the last pose that was trusted, and from the last frame's that was in doubt."""
         assert self._T_world_last is not None
-        if self._T_world_doubted is not None:
-            alignment = self._align_twice(levels, scene, self._T_world_doubted)
-            if alignment.trusted:
-                return alignment
-        again = self._align_twice(levels, scene, self._T_world_last)
-        return again if again.trusted or self._T_world_doubted is None or alignment.reason else alignment
+        alignment = self._align_twice(levels, scene, self._T_world_last)
+        if alignment.trusted or self._T_world_doubted is None:
+            return alignment
+        again = self._align_twice(levels, scene, self._T_world_doubted)
+        return alignment if again.reason else again
 
     def _first(self, seen: FrameFeatures) -> Pose:
         """The pose that defines the world, of the first frame with something in it to be tracked by."""
