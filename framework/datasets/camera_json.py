@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 from framework.data import Camera
 from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.undistortion import Distortion
 from framework.errors import DataError
 from framework.files.whole_files import MOST_TEXT, read_bytes
 
@@ -46,6 +48,17 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
         return Camera(int(width), int(height), fx, fy, cx, cy), depth_scale
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
+
+
+def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
+    """The lens distortion that `content` of the file `path` gives, None without one. Raises DataError."""
+    if "distortion" not in content:
+        return None
+    values = content["distortion"]
+    if not isinstance(values, list) or len(values) != len(fields(Distortion)):
+        raise DataError(f"{path}: distortion must be [k1, k2, p1, p2, k3], found {str(values)[:60]}")
+    named = {f"distortion[{k}]": value for k, value in enumerate(values)}
+    return Distortion(*(_number(path, named, key) for key in named))
 
 
 def _number(path: Path, content: Mapping[str, Any], key: str) -> float:

@@ -15,6 +15,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
+from framework.datasets.undistortion import Distortion, Undistortion
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
@@ -86,6 +87,7 @@ class Contents:
     camera_source: Path | str  # what says so, for messages
     depth_scale: float  # units a metre
     frames: Sequence[RecordedFrame]
+    distortion: Distortion | None = None  # of the camera's lens, in colour and depth alike; None = a pinhole
 
 
 @dataclass
@@ -118,6 +120,7 @@ class Recording(RGBDSequence):
         frames = [_within_reach(recorded) for recorded in contents.frames]
         self.contents = replace(contents, frames=_in_order_of_time(self.name, frames))
         self.camera = self.contents.camera
+        self.lens = Undistortion(self.camera, contents.distortion) if contents.distortion else None
         self.chosen = choose_frames(
             len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
         )
@@ -149,7 +152,7 @@ class Recording(RGBDSequence):
         return Frame(
             index=index,
             timestamp=recorded.timestamp,
-            color=color,
+            color=self.lens.smooth(color) if self.lens else color,
             depth=self.metric_depth(index),
             camera=self.camera,
             T_world_camera=recorded.T_world_camera,
@@ -166,7 +169,7 @@ class Recording(RGBDSequence):
         depth[raw == NO_READING] = 0
         if self.max_depth:
             depth[depth > self.max_depth] = 0
-        return depth
+        return self.lens.exact(depth) if self.lens else depth
 
     def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
         """Raises FrameError unless an image has the camera's size."""

@@ -1,6 +1,7 @@
 """A folder of colour and depth images: how users bring their own data.
 
-    camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; metres = value / depth_scale
+    camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; metres = value / depth_scale;
+                        "distortion": [k1, k2, p1, p2, k3], optional, of the lens of all images: undistorted when read
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to colour, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line a frame: timestamp tx ty tz qx qy qz qw
@@ -23,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import FrameTruth, Int32, SceneTruth
-from framework.datasets.camera_json import camera_of, read_json_object
+from framework.datasets.camera_json import camera_of, distortion_of, read_json_object
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
 from framework.datasets.scene_truth import LabeledDepth, fuse_scene_truth
 from framework.errors import ConfigError, DataError, FrameError
@@ -52,7 +53,8 @@ class RgbdFolder(Recording):
 
     def open(self) -> Contents:
         path = self.folder / "camera.json"
-        camera, depth_scale = camera_of(path, _read_json(path), CAMERA_KEYS)
+        content = _read_json(path)
+        camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
@@ -63,14 +65,15 @@ class RgbdFolder(Recording):
             _recorded(ImageFiles(color[number], depth[number]), k, lines[k] if lines else None)
             for k, number in enumerate(color)
         ]
-        return Contents(camera, path, depth_scale, frames)
+        return Contents(camera, path, depth_scale, frames, distortion_of(path, content))
 
     def truth_in(self, index: int) -> FrameTruth | None:
         if not self._instances:
             return None
         path = self._instances[index]
-        ids: Int32 = read_uint16(path).astype(np.int32)
-        self.check_size(path, ids.shape)
+        raw = read_uint16(path)
+        self.check_size(path, raw.shape)
+        ids: Int32 = (self.lens.exact(raw) if self.lens else raw).astype(np.int32)
         unknown = [int(i) for i in np.flatnonzero(np.bincount(ids.ravel())) if i and i not in self._class_names]
         if unknown:
             raise FrameError(f"{path}: instance {unknown[0]} is not in {self.folder / 'instances.json'}")

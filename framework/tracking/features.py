@@ -12,6 +12,7 @@ summed, so that matches do not depend on the number of threads.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -70,6 +71,23 @@ class FeatureExtractor:
         order = np.lexsort(found.T[::-1])[: self.max_features]
         pixels = ((found[order, 1:3] + 0.5) * scale - 0.5).astype(np.float32)
         return Features(pixels, surface_depth(frame.depth, pixels), _root_sift(descriptors[order]))
+
+
+@dataclass
+class FrameFeatures:
+    """The features of one frame, found when somebody first asks for them."""
+
+    frame: Frame
+    extractor: FeatureExtractor
+
+    @cached_property
+    def found(self) -> Features:
+        return self.extractor.extract(self.frame)
+
+    @property
+    def known(self) -> bool:
+        """Whether somebody has asked."""
+        return "found" in self.__dict__
 
 
 def match(query: UInt8, reference: UInt8, max_ratio: float) -> Int32:

@@ -101,14 +101,20 @@ class Keyframes:
         features = features.with_depth()
         if len(features) < self.min_features or not self.is_new(T_world_camera):
             return False
-        points = back_project(frame.camera, features.pixels, features.depth)
-        points_world = np.asarray(transform(T_world_camera, points), np.float32)
-        bag = self._words.bag(features.descriptors)
-        self._keyframes.append(Keyframe(T_world_camera.copy(), points_world, features.descriptors, bag))
+        self._keyframes.append(self.keyframe(frame, features, T_world_camera))
         self._poses = np.concatenate([self._poses, T_world_camera[None]])
         if len(self) > self.max_keyframes:
             self._drop_most_redundant()
         return True
+
+    def keyframe(self, frame: Frame, features: Features, T_world_camera: Float64) -> Keyframe:
+        """What a frame would be as a keyframe; `add` keeps it."""
+        features = features.with_depth()
+        points = back_project(frame.camera, features.pixels, features.depth)
+        points_world = np.asarray(transform(T_world_camera, points), np.float32)
+        return Keyframe(
+            T_world_camera.copy(), points_world, features.descriptors, self._words.bag(features.descriptors)
+        )
 
     def is_new(self, T_world_camera: Float64) -> bool:
         """Whether no keyframe was seen from near here. Takes microseconds."""
@@ -122,13 +128,13 @@ class Keyframes:
 
     def relocalize(self, frame: Frame) -> AbsolutePose | None:
         """The pose of `frame`, wherever it was taken, with the inliers that speak for it; None if it is not known."""
-        if not self._keyframes:
-            return None
         features = self.extractor.extract(frame)
         return self.locate(frame, features, self.alike(features))
 
     def alike(self, features: Features) -> list[Keyframe]:
         """The keyframes that look most like an image with these features, best first."""
+        if not self._keyframes:
+            return []
         bags = np.stack([keyframe.bag for keyframe in self._keyframes])
         order = np.argsort(-similarity(self._words.bag(features.descriptors), bags), kind="stable")
         return [self._keyframes[k] for k in order[: self.candidates]]

@@ -437,3 +437,16 @@ def test_the_truth_of_replica():
     assert (extent > 2).all()
     assert (extent < 25).all()
     assert {truth.class_names[i] for i in np.unique(truth.instance_ids) if i} >= {"bed", None}
+
+
+def test_a_lens_is_undone_in_colour_depth_and_instances_alike(folder):
+    change_camera(folder, distortion=[0.3, 0, 0, 0.01, 0])
+    K, lens = np.array([[20.0, 0, 11.5], [0, 21.0, 7.5], [0, 0, 1]]), np.array([0.3, 0, 0, 0.01, 0])
+    u, v = cv2.initUndistortRectifyMap(K, lens, None, K, (WIDTH, HEIGHT), cv2.CV_32FC1)
+    frame = RgbdFolder(folder)[0]
+    assert np.array_equal(frame.color, cv2.remap(picture(0), u, v, cv2.INTER_LINEAR))
+    ids = cv2.imread(str(folder / "instance/000000.png"), cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(frame.truth.instance_ids, cv2.remap(ids, u, v, cv2.INTER_NEAREST))
+    depth = cv2.remap(depth_mm(0), u, v, cv2.INTER_NEAREST) / 1000
+    np.testing.assert_allclose(frame.depth, depth, atol=1e-6)
+    assert not np.array_equal(frame.color, picture(0))

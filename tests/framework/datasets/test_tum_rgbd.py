@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
@@ -53,8 +54,9 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
     assert (len(sequence), sequence.name) == (FRAMES, "rgbd_dataset_freiburg1_xyz")
     frame = sequence[2]
     assert (frame.index, frame.timestamp) == (2, color_time(2))
-    assert (frame.color == (20, 20, 30)).all()
-    assert (frame.depth == 2).all()  # 5000 units a metre
+    inside = np.s_[40:440, 40:600]  # where the undistorted image has all of what was recorded
+    assert (frame.color[inside] == (20, 20, 30)).all()
+    assert (frame.depth[inside] == 2).all()  # 5000 units a metre
     assert frame.T_world_camera is not None
     np.testing.assert_allclose(frame.T_world_camera[:3, 3], [2 / 30, 0, 0], atol=1e-4)  # times have four digits
     assert frame.camera == CAMERAS[Intrinsics.FREIBURG1]
@@ -62,12 +64,26 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
 
 def test_it_runs_through_the_pipeline(folder: Path) -> None:
     places = f"dataset.root={folder.parent}", f"dataset.scene={folder.name}"
-    result, points_world = mapped(opened("tum_rgbd", *places, "dataset.stop=2"))
+    result, points_world = mapped(opened("tum_rgbd", *places, "dataset.stop=2", "dataset.undistort=false"))
     assert (result.frames, result.frames_skipped, result.frames_lost) == (2, 0, 0)
     np.testing.assert_allclose(points_world[:, 2], 2, atol=1e-6)
     # the first pixel of each frame lies left of the camera, which walks along x
     lefts = points_world[:: 640 * 480, 0]
     np.testing.assert_allclose(lefts, (0 - 318.6) / 517.3 * 2 + np.arange(2) / 30, atol=1e-4)
+
+
+def test_the_published_distortion_is_undone(folder: Path) -> None:
+    """A checker board's corners lie where OpenCV says that the lens' pixels belong."""
+    board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.full((32, 32), 200)).astype(np.uint8)
+    path = next((folder / "rgb").glob("*.png"))
+    cv2.imwrite(str(path), np.stack([board] * 3, axis=-1))
+    K, lens = CAMERAS[Intrinsics.FREIBURG1].K, np.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
+    k = [color_time(k) for k in range(FRAMES)].index(float(path.stem))
+    expected = cv2.undistort(np.stack([board] * 3, axis=-1), K, lens)
+    found = TumRgbd(folder)[k].color.astype(int)
+    assert np.abs(found - expected).mean() < 0.2
+    assert np.abs(board[..., None] - expected.astype(int)).mean() > 10
+    assert (TumRgbd(folder, undistort=False)[k].color == board[..., None]).all()
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])

@@ -3,10 +3,11 @@
 from types import SimpleNamespace
 
 import numpy as np
+import pytest
 
 from framework.data import Camera
 from framework.geometry import back_project
-from framework.tracking.pyramid import build_pyramid, model_intensities
+from framework.tracking.pyramid import build_pyramid, is_coarse, model_intensities
 
 
 def test_halving_does_not_mix_two_surfaces_or_holes_into_the_depth() -> None:
@@ -45,3 +46,24 @@ def test_a_halved_view_of_the_map_closes_holes_of_a_pixel() -> None:
     np.testing.assert_allclose(full, np.where(grey > 0, grey / 255, -1), atol=1e-6)
     np.testing.assert_allclose(half, [[25 / 255, 40 / 255], [-1, -1]], atol=1e-6)  # one mapped pixel is too few
     np.testing.assert_allclose(quarter, [[32.5 / 255]], atol=1e-6)
+
+
+def slope(step: float, nearest: float) -> np.ndarray:
+    """Depth (120, 160) m from `nearest` to 4 m, in whole steps, 0 = as it is."""
+    depth = np.broadcast_to(np.linspace(nearest, 4, 160), (120, 160)) + np.linspace(0, 0.02, 120)[:, None]
+    return (np.floor(depth / step) * step if step else depth).astype(np.float32)
+
+
+@pytest.mark.parametrize("nearest", [0.6, 1.0, 2.0])
+def test_steps_of_eight_bits_are_too_coarse_for_normals_and_those_of_depth_cameras_are_not(nearest: float) -> None:
+    assert is_coarse(slope(0.0392, nearest), otherwise=False)
+    disparity = 8 * 580 * 0.075 / slope(0, nearest)  # of a Kinect, in eighths of a pixel
+    kinect = (8 * 580 * 0.075 / np.rint(disparity)).astype(np.float32)
+    for fine in (slope(0.001, nearest), slope(0, nearest), kinect):
+        assert not is_coarse(fine, otherwise=True)
+
+
+@pytest.mark.parametrize("otherwise", [True, False])
+def test_a_wall_does_not_tell_how_coarse_depth_is(otherwise: bool) -> None:
+    assert is_coarse(np.full((120, 160), 1.0, np.float32), otherwise) == otherwise
+    assert is_coarse(np.zeros((120, 160), np.float32), otherwise) == otherwise

@@ -211,6 +211,17 @@ def test_a_jump_in_a_real_video_is_tracked_or_told(shared_data: Path) -> None:
     assert not np.isnan(off[-5:]).any()
 
 
+def test_a_sparse_video_is_tracked() -> None:
+    """Steps of 6 and 40 cm, of 3 and 22 degrees, in turns: neither the last step nor the last pose tells the next."""
+    video = Synthetic(frames=240, stop=200, width=320, height=240)
+    sparse = [video[k] for k in range(200) if k % 32 in (0, 4)]
+    poses, _ = run(VoxelHashingIcp(), sparse)
+    assert not any(p.lost for p in poses)
+    assert drifts(poses, sparse).max() < WRONG / 2
+    alone, _ = run(VoxelHashingIcp(relocalize=False), sparse[:4])
+    assert any(p.lost for p in alone), "alignment without features is lost"
+
+
 BALL = (np.array([-1.2, 0.8, 2.2]), 0.25)
 
 

@@ -10,9 +10,10 @@ from framework.errors import ConfigError, DataError
 from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.interfaces import SceneMap
 from framework.registry import assemble
+from framework.tracking.absolute_pose import AbsolutePose
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers import voxel_hashing_icp
-from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
+from plugins.trackers.voxel_hashing_icp import STEADY, Alignment, VoxelHashingIcp
 from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 
 
@@ -192,3 +193,99 @@ def test_a_pose_is_lost_where_the_last_step_has_led_astray(monkeypatch: pytest.M
     poses, _ = run(VoxelHashingIcp(**ONE_STEP), frames)
     assert poses[1].lost
     assert "agree with the map" in poses[1].reason
+
+
+def aligned(T_world_camera: np.ndarray, agreement: float = 0.85, behind: float = 0.05) -> Alignment:
+    """An alignment that an imperfect camera has, or a wrong pose."""
+    return Alignment(T_world_camera, 0.7, agreement, behind, agreement / (1 - behind), "", "85% agree")
+
+
+def moved(step: float) -> np.ndarray:
+    return exp_se3(np.array([step, 0.0, 0.0, 0.0, 0.0, 0.0]))
+
+
+def test_less_is_enough_where_the_prediction_leads_once_it_has_been_right_for_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A camera that moves 1 cm a frame, of whose points never more than 85 % agree with the map."""
+    frames = [room().frame(walk(1)[0], k) for k in range(2 * STEADY + 6)]
+    ends = iter(moved(0.01 * k) for k in range(1, len(frames)))
+    tracker = VoxelHashingIcp(finest=1.0, relocalize=False)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02)
+    fuser.fuse(frames[0], tracker.track(dataclasses.replace(frames[0], T_world_camera=None), fuser.scene), NOTHING)
+    perfect = [True] * STEADY + [False] * (len(frames) - STEADY - 1)
+    monkeypatch.setattr(
+        tracker, "_align", lambda *_: (a := aligned(next(ends))) and (a._replace(doubt="") if perfect.pop(0) else a)
+    )
+    lost = [tracker.track(frame, fuser.scene).lost for frame in frames[1 : STEADY + 4]]
+    assert not any(lost), "the prediction has been right before"
+    monkeypatch.setattr(tracker, "_align", lambda *_: aligned(tracker._T_world_last @ moved(0.2)))
+    assert tracker.track(frames[-2], fuser.scene).lost, "20 cm beside the prediction"
+    for worse in (aligned(tracker._T_world_last, agreement=0.7), aligned(tracker._T_world_last, 0.8, behind=0.15)):
+        tracker._lost_frames, tracker._steady_frames = 0, STEADY
+        monkeypatch.setattr(tracker, "_align", lambda *_, worse=worse: worse)
+        assert tracker.track(frames[-1], fuser.scene).lost
+
+
+def test_features_are_asked_until_the_prediction_has_been_right_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [room().frame(T, k) for k, T in enumerate(walk(40)[: STEADY + 4])]
+    tracker, asked = VoxelHashingIcp(finest=1.0), []
+    search = tracker._told_by_features
+    monkeypatch.setattr(tracker, "_told_by_features", lambda seen: asked.append(seen.frame.index) or search(seen))
+    poses, _ = run(tracker, frames)
+    assert not any(pose.lost for pose in poses)
+    assert asked == list(range(1, STEADY))
+
+
+def test_a_pose_that_features_contradict_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All points agree with the map, but features tell a place 30 cm away, from where alignment leads nowhere."""
+    frames = [room().frame(walk(1)[0], k) for k in range(2)]
+    tracker = VoxelHashingIcp(finest=1.0)
+    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
+    fuser.fuse(frames[0], tracker.track(frames[0], fuser.scene), NOTHING)
+    elsewhere = AbsolutePose(walk(1)[0] @ moved(0.3), np.ones(50, np.bool_))
+    monkeypatch.setattr(tracker, "_told_by_features", lambda _: elsewhere)
+    pose = tracker.track(frames[1], fuser.scene)
+    assert pose.lost or np.linalg.norm((inverse(elsewhere.T_world_camera) @ pose.T_world_camera)[:3, 3]) < 0.1
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_without_relocalization_a_doubt_does_not_end_the_run(moving: bool) -> None:
+    """Half of the view is hidden for some frames, during which the camera stands, or turns."""
+    there = walk(30)[:14]
+    frames = [room().frame(T, k) for k, T in enumerate(there)]
+    hidden = [room().frame(there[7 + (k if moving else 0)], 7 + k) for k in range(4)]
+    rng = np.random.default_rng(0)
+    for frame in hidden:
+        frame.depth[:, :80] = rng.uniform(0.5, 4, (120, 80))
+    last = frames[11:] if moving else [room().frame(T, 11 + k) for k, T in enumerate(there[7:])]
+    poses, _ = run(VoxelHashingIcp(finest=1.0, relocalize=False), [*frames[:7], *hidden, *last])
+    assert all(pose.lost for pose in poses[7:11])
+    assert not any(pose.lost for pose in poses[11:])
+    assert drift(poses[-1], last[-1])[0] < 0.006
+
+
+def coarse(frame: Frame) -> Frame:
+    """As if depth had been stored in 8 bits."""
+    steps = (np.floor(frame.depth / 0.0392) + 0.5) * 0.0392
+    return dataclasses.replace(frame, depth=np.where(frame.depth > 0, steps, 0).astype(np.float32))
+
+
+def test_depth_in_coarse_steps_is_tracked_without_its_normals(monkeypatch: pytest.MonkeyPatch) -> None:
+    frames = [coarse(room().frame(T, k)) for k, T in enumerate(walk(40)[::2])]
+    matched: list[float] = []
+    align = VoxelHashingIcp._align
+
+    def recorded(*arguments) -> Alignment:
+        alignment = align(*arguments)
+        matched.append(alignment.matched)
+        return alignment
+
+    monkeypatch.setattr(VoxelHashingIcp, "_align", recorded)
+    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    assert not any(pose.lost for pose in poses)
+    assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, "a step"
+    without_normals, matched[:] = np.mean(matched), []
+    monkeypatch.setattr(voxel_hashing_icp, "is_coarse", lambda *_, **__: False)
+    run(VoxelHashingIcp(finest=1.0), frames)
+    assert np.mean(matched) < 0.9 * without_normals, "normals of steps do not match those of the surface"

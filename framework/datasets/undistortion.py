@@ -1,0 +1,76 @@
+"""Lens distortion: images as a pinhole camera would have taken them.
+
+The model is Brown and Conrady's as in OpenCV: a point at (x, y, 1) m in the camera appears at the pixel
+(fx x' + cx, fy y' + cy) of the recorded image, where with r^2 = x^2 + y^2
+
+    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)
+    y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from typing import TypeVar
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from framework.data import Camera, Float64, UInt8
+from framework.errors import DataError
+
+Value = TypeVar("Value", bound=np.generic)
+FARTHEST_SHIFT = 0.5  # of the image's width: coefficients that move a pixel farther are of another model or a misprint
+
+
+@dataclass(frozen=True)
+class Distortion:
+    """The coefficients of a lens; all 0 = a pinhole."""
+
+    k1: float = 0.0
+    k2: float = 0.0
+    p1: float = 0.0
+    p2: float = 0.0
+    k3: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(astuple(self)).all():
+            raise DataError(f"the distortion's coefficients must be finite, found {astuple(self)}")
+
+    def distorted(self, camera: Camera, pixels: Float64) -> Float64:
+        """Where (N, 2) the recorded image has what a pinhole camera sees at `pixels` (N, 2)."""
+        x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
+        r2 = x * x + y * y
+        radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
+        moved_x = x * radial + 2 * self.p1 * x * y + self.p2 * (r2 + 2 * x * x)
+        moved_y = y * radial + self.p1 * (r2 + 2 * y * y) + 2 * self.p2 * x * y
+        return np.stack([camera.fx * moved_x + camera.cx, camera.fy * moved_y + camera.cy], axis=1)
+
+
+class Undistortion:
+    """Turns recorded images into those of a pinhole camera with the same intrinsics.
+
+    Depth stays z along the optical axis. A pixel that the recorded image does not have becomes 0. Raises DataError when
+    the coefficients cannot be those of such a camera.
+    """
+
+    def __init__(self, camera: Camera, distortion: Distortion) -> None:
+        v, u = np.indices(camera.shape, np.float64)
+        pixels = np.stack([u.ravel(), v.ravel()], axis=1)
+        source = distortion.distorted(camera, pixels)
+        shift = float(np.abs(source - pixels).max())
+        if shift > FARTHEST_SHIFT * camera.width:
+            raise DataError(
+                f"the distortion {astuple(distortion)} (k1, k2, p1, p2, k3) moves a pixel of the {camera.width}x"
+                f"{camera.height} image by {shift:.0f} px: is it of another lens model?"
+            )
+        self._u = source[:, 0].reshape(camera.shape).astype(np.float32)
+        self._v = source[:, 1].reshape(camera.shape).astype(np.float32)
+
+    def smooth(self, image: UInt8) -> UInt8:
+        """Colours (H, W, 3), interpolated."""
+        return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
+
+    def exact(self, image: NDArray[Value]) -> NDArray[Value]:
+        """Depths or labels (H, W), of float32 or uint16: the nearest one, as between two nothing lies."""
+        return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), image.dtype)
