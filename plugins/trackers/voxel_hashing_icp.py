@@ -87,9 +87,7 @@ class VoxelHashingIcp(PoseTracker):
     min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
     min_information: float = 1e-3  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
     min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
-    max_behind: float = (
-        0.015  # in [0, 1]: ... and behind it; what fails takes a second witness, see above
-    )
+    max_behind: float = 0.015  # in [0, 1]: ... and behind it; what fails takes a second witness, see above
     relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited places, when lost
     seed: int = 0  # of the relocalization's random samples
 
