@@ -1,4 +1,4 @@
-"""Maps a video with `instancemap.Mapper` and writes a moving picture of the map as it grows.
+"""Maps a video and writes a moving picture of the map as it grows.
 
 python examples/growing_map.py OUT.webp [key=value ...]     the keys of a run, dataset=desk among them
 """
@@ -12,19 +12,21 @@ import numpy as np
 from PIL import Image
 from tqdm import tqdm
 
+from framework.api import pipeline_of
 from framework.configs import composed
 from framework.data import Int32
 from framework.interfaces import RGBDSequence
+from framework.journal import Journal
+from framework.records.run_record import LIKELY
 from framework.registry import build
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import best_view
-from instancemap import Mapper
+from framework.settings import Settings
 
 EVERY = 2  # frames between two pictures
 WIDTH, HEIGHT = 600, 500  # px of each of the two views
-LIKELY = 0.3  # confidence of the instances that are coloured
 MILLISECONDS, LAST = 100, 2500  # that a picture stays, and the last one
 
 
@@ -34,18 +36,24 @@ def only(instance_ids: Int32, shown: list[int]) -> Int32:
 
 
 def main() -> None:
-    out, overrides = Path(sys.argv[1]), sys.argv[2:]
-    sequence = build(RGBDSequence, composed(*overrides).dataset)
-    mapper = Mapper(*(override for override in overrides if not override.startswith("dataset")))
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    out, config = Path(sys.argv[1]), composed(*sys.argv[2:])
+    Settings.of(config).apply()
+    sequence, pipeline = build(RGBDSequence, config.dataset), pipeline_of(config)
+    scene, journal = pipeline.fuser.scene, Journal(pipeline.fuser.scene, len(sequence), pipeline.tracker.pose_source)
     poses, maps = [], []
     for k in tqdm(range(len(sequence)), unit="frame"):
-        pose = mapper.add(sequence[k])
+        frame = sequence[k]
+        pose = pipeline.map_frame(frame, pipeline.detector.detect(frame), journal)
         if not pose.lost:
             poses.append(pose.T_world_camera)
         if k % EVERY == EVERY - 1 or k == len(sequence) - 1:
-            likely = [key for key, found in mapper.instances().items() if found.confidence >= LIKELY]
-            maps.append((mapper.scene.mesh(), likely))
+            likely = [key for key, found in scene.instances().items() if found.confidence >= LIKELY]
+            maps.append((scene.mesh(), likely))
 
+    if not poses:
+        sys.exit("no frame was tracked")
     path = np.array(poses)
     last, likely = maps[-1]
     surface = Surface.seen_from(last.vertices, last.triangles, path)
@@ -54,7 +62,9 @@ def main() -> None:
     for mesh, likely in maps:  # an instance has the colour of where it was last
         for key in likely:
             centroids[key] = mesh.vertices[mesh.instance_ids == key].mean(axis=0)
-    colors = dict(zip(centroids, instance_colors(np.array(list(centroids.values()), np.float64)), strict=True))
+    colors = dict(
+        zip(centroids, instance_colors(np.array(list(centroids.values()), np.float64).reshape(-1, 3)), strict=True)
+    )
     pictures = []
     for mesh, likely in maps:
         view = LitView(Surface.seen_from(mesh.vertices, mesh.triangles, path), camera, T_world_camera)

@@ -70,6 +70,8 @@ class Pipeline:
                         raise KeyboardInterrupt
             except (KeyboardInterrupt, MapFullError) as stop:
                 journal.stopped_by = stop
+        if journal.stopped_by is not None and journal.frames_skipped == journal.frames:
+            raise journal.stopped_by  # before anything was mapped
         if 0 < journal.frames == journal.without_pose:
             raise DataError(
                 f"{sequence.name}: no pose is given for any of the {journal.frames} frames; the first:"

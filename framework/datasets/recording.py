@@ -114,7 +114,8 @@ class Recording(RGBDSequence):
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
         if not self.folder.is_dir():
-            raise DataError(f"dataset.root: the folder {self.folder} does not exist")
+            project = "" if self.root.is_absolute() else ", neither here nor in a checkout of the project"
+            raise DataError(f"dataset.root: the folder {self.folder} does not exist{project}")
         self.name = self.folder.resolve().name
         contents = self.open()
         frames = [_within_reach(recorded) for recorded in contents.frames]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import json
 import zipfile
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -141,6 +142,9 @@ def _read_metadata(path: Path) -> ExportMetadata:
                 text = file.read(LARGEST_METADATA).decode("utf-8")
         content = json.loads(text) if name.endswith(".json") else ast.literal_eval(text)
         texts = {key: value if isinstance(value, str) else repr(value) for key, value in content.items()}
-    except (zipfile.BadZipFile, StopIteration, ValueError, SyntaxError, AttributeError, OSError):
+    except (
+        *(zipfile.BadZipFile, zlib.error, NotImplementedError, StopIteration, ValueError, SyntaxError, AttributeError),
+        *(OSError, RuntimeError, RecursionError, MemoryError),
+    ):
         return ExportMetadata()  # no archive, or another one: nothing in it is needed
     return ExportMetadata.parse(texts)

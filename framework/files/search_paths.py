@@ -11,11 +11,19 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "co
 
 
 def candidates(path: Path) -> tuple[Path, ...]:
-    """The path; of a relative one, where it would be in the working, then in the project folder."""
+    """The path, `~` resolved; of a relative one, where it would be in the working, then in the project folder."""
+    path = expanded(path)
     return (path,) if path.is_absolute() else tuple(dict.fromkeys((Path.cwd() / path, PROJECT_ROOT / path)))
 
 
 def folder_of(path: Path) -> Path:
-    """The first of these places that is a folder, `~` resolved; the path itself where none is."""
-    path = path.expanduser()
-    return next((place for place in candidates(path) if place.is_dir()), path)
+    """The first of these places that is a folder; the path itself where none is."""
+    return next((place for place in candidates(path) if place.is_dir()), expanded(path))
+
+
+def expanded(path: Path) -> Path:
+    """The path with its `~` resolved; as it is where nobody has that name."""
+    try:
+        return path.expanduser()
+    except RuntimeError:
+        return path

@@ -26,13 +26,15 @@ class Confirmation:
     def __post_init__(self) -> None:
         check_bounds(self, min_observations=(1, 2**31), min_confidence=(0.0, 1.0), min_area=(0.0, 1000.0))
 
+    def is_met(self, record: InstanceRecord) -> bool:
+        """Whether an instance has been observed often enough and is trusted enough."""
+        return record.observations >= self.min_observations and record.confidence >= self.min_confidence
+
     def counts(self, table: InstanceTable) -> Bool:
-        """(ids + 1,) whether an instance has been observed often enough and is trusted enough, by id."""
+        """(ids + 1,) whether an instance meets that, by id."""
         counts = np.zeros(table.last_id + 1, np.bool_)
         for record in table.records.values():
-            counts[record.id] = (
-                record.observations >= self.min_observations and record.confidence >= self.min_confidence
-            )
+            counts[record.id] = self.is_met(record)
         return counts
 
     def count(self, table: InstanceTable) -> int:

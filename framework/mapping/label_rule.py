@@ -61,9 +61,7 @@ class LabeledVoxels:
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
     on_top: float = 0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
-    lying_on: float = (
-        0.6  # in [0, 1]: an instance of which a cluster of another class covers so much lies on it; 1 = off
-    )
+    lying_on: float = 0.6  # in [0, 1]: an instance covered so much by a cluster of another class lies on it; 1 = off
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     def __post_init__(self) -> None:
@@ -114,8 +112,9 @@ class LabeledVoxels:
         lying = np.zeros((len(clusters), table.last_id + 1), np.bool_)
         if self.lying_on >= 1 or not len(overlaps.instance_ids):
             return lying
-        counts = self.confirmation.counts(table)[overlaps.instance_ids]
-        known = np.stack([table.class_probabilities(table.records[int(k)]) for k in overlaps.instance_ids])
+        records = [table.records[int(k)] for k in overlaps.instance_ids]
+        counts = np.array([self.confirmation.is_met(record) for record in records])
+        known = np.stack([table.class_probabilities(record) for record in records])
         other_class = class_agreement(clusters.class_probabilities, known) < OTHER_CLASS
         covered = overlaps.votes >= self.lying_on * np.maximum(overlaps.visible, 1)
         small = 2 * overlaps.visible <= overlaps.sizes[:, None]

@@ -36,7 +36,7 @@ def in_near_pieces(
     min_share: float,
     steepest: float,
 ) -> Bool:
-    """(P,) which points are in their cluster's largest piece, or in one that no step in depth parts from what stays.
+    """(P,) which points are in their cluster's largest piece, or in one that no large step parts from what stays.
 
     Pieces are those of `in_largest_piece`. Those with `min_share` of the largest one's points or more are gone through,
     larger ones first. One stays when most of its points differ in depth from the nearest one that stays by no more than
@@ -148,7 +148,7 @@ def _some_of(pixels: Int32, piece: Int32, wanted: int, most: int) -> Int32:
 def _is_near(
     starts: Int32, ends: Int32, depth: Float32, gap: np.float32, gap_per_depth: np.float32, steepest: np.float32
 ) -> bool:
-    """Whether most of `starts` are no step in depth away from the nearest of `ends`."""
+    """Whether most of `starts` differ from the nearest of `ends` in depth by no more than a surface may rise."""
     near = 0
     for k in range(len(starts)):
         u, v = starts[k, 0], starts[k, 1]

@@ -15,12 +15,17 @@ from framework.refinement.selection import keep_points
 
 @dataclass
 class Connected(ClusterRefiner):
-    """Keeps of each cluster its largest piece that is connected in 3D, and the pieces that no step parts from it.
+    """Keeps of each cluster its largest piece that is connected in 3D, and the pieces that may be parts of the same thing.
 
     Pieces are those of `largest_component`. What a mask has caught beside its object begins at a step in depth: the
-    wall behind a couch, the carpet between a chair's slats. That is dropped. A piece at a depth that the object's own
-    surface may have at that distance stays, whatever is between: the chair before the couch, readings that are missing,
-    the air between the legs of a table.
+    carpet between a chair's slats, the cupboard behind its back. A piece leaves when the step is larger than most of
+    its points are far from what stays, `steepest` times; so a wide piece stays at a step that a narrow one would not,
+    and walls are for `plane_removal`. A piece at a depth that the object's own surface may have at that distance stays,
+    whatever is between: a chair before a couch, readings that are missing, the air between the legs of a table.
+
+    That all points vote was chosen: by the quarter of them that is nearest, which sees the step alone, AP50 was 0.20 lower
+    with maskrcnn2go on replica_floor2 (the leaves of a plant), and the same with YOLO11n-seg there, on ScanNet's
+    scene0000_00 and in a synthetic room.
     """
 
     gap: float = 0.1  # m, from 0

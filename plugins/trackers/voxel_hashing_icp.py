@@ -143,7 +143,10 @@ class VoxelHashingIcp(PoseTracker):
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
         alignment = self._resumed(levels, scene) if self._lost_frames else self._continued(levels, scene)
         if not (alignment.trusted and self._steady_frames >= STEADY) and levels[0].depth.any():
+            T_world_predicted = self._T_world_last @ self._T_last_next
             alignment = self._searched(alignment, seen, levels, scene)
+            if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
+                self._steady_frames = 0  # features led elsewhere
         if not alignment.trusted:
             self._lost_frames += 1
             self._steady_frames = 0
