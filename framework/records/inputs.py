@@ -45,6 +45,9 @@ def _content(value: str) -> str:
 
 
 def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
+    for above in (root / scene).resolve().parents[:2]:
+        for table in sorted(path for path in above.glob("*.tsv") if path.is_file()):  # ScanNet's labels
+            yield above.name, table.name, table.stat().st_size, table.stat().st_mtime_ns
     walks = [os.walk(root / scene, followlinks=True)]  # MOST_FILES ends a circle
     if scene:
         walks.insert(0, islice(os.walk(root), 1))  # what all scenes share, such as Replica's cam_params.json

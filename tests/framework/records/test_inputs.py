@@ -31,3 +31,13 @@ def test_a_recording_is_seen_through_linked_folders(tmp_path: Path) -> None:
     assert inputs_sha256(config) != before
     (tmp_path / "disk" / "around").symlink_to(tmp_path / "root")
     assert inputs_sha256(config) == inputs_sha256(config), "a circle has an end"
+
+
+@pytest.mark.parametrize("scene", ["", "scene0000_00"])
+def test_label_tables_above_a_scene_are_seen(scene: str, tmp_path: Path) -> None:
+    root = tmp_path / "scans"
+    (root / scene).mkdir(parents=True)
+    config = {"dataset": {"root": str(root), "scene": scene}}
+    before = inputs_sha256(config)
+    (tmp_path / "scannetv2-labels.combined.tsv").write_text("new")
+    assert inputs_sha256(config) != before
