@@ -23,3 +23,8 @@ class NoPoseError(FrameError):
 
 class MapFullError(InstanceMapError):
     """The map has reached its block budget; what was mapped so far is kept."""
+
+
+def in_one_line(said: object) -> str:
+    """What a library says of a fault, for a message of ours; the kind of the fault where it says nothing."""
+    return " ".join(str(said).split()) or type(said).__name__

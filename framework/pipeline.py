@@ -70,16 +70,16 @@ class Pipeline:
                         raise KeyboardInterrupt
             except (KeyboardInterrupt, MapFullError) as stop:
                 journal.stopped_by = stop
-        if journal.stopped_by is not None and journal.frames_skipped == journal.frames:
+        if journal.frames_skipped < journal.frames:
+            return journal.result()
+        if journal.stopped_by is not None:
             raise journal.stopped_by  # before anything was mapped
-        if 0 < journal.frames == journal.without_pose:
+        if journal.without_pose == journal.frames:
             raise DataError(
                 f"{sequence.name}: no pose is given for any of the {journal.frames} frames; the first:"
                 f" {journal.first_without_pose}; {WITHOUT_POSES}"
             )
-        if journal.frames_skipped == journal.frames:
-            raise DataError(f"{sequence.name}: none of the {journal.frames} frames can be used; the log says why")
-        return journal.result()
+        raise DataError(f"{sequence.name}: none of the {journal.frames} frames can be used; the log says why")
 
     def detect_ahead(self, sequence: RGBDSequence, journal: Journal) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.

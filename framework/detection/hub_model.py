@@ -13,6 +13,7 @@ from framework.detection.mask_rcnn.published_weights import OFFLINE
 from framework.detection.network_outputs import one_line
 from framework.errors import DataError
 from framework.files.hashing import path_hash
+from framework.files.search_paths import expanded
 
 HUB_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 """Environment variables: set to 1, nothing is downloaded from huggingface.co."""
@@ -29,7 +30,7 @@ def find_model(model: str, revision: str) -> Path:
     A model id that is in the cache is not asked for again. Needs huggingface_hub, which transformers brings. Raises
     DataError, with what to do, when there is no such model, it cannot be downloaded, or is not what was published.
     """
-    folder = Path(model).expanduser()
+    folder = expanded(Path(model))
     if folder.is_dir():
         return folder
     cached = _cached(model, revision)

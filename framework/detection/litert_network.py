@@ -6,7 +6,7 @@ import ast
 import json
 import zipfile
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +16,7 @@ import numpy as np
 from framework.data import Array
 from framework.detection.export_metadata import ExportMetadata
 from framework.detection.network_outputs import Outputs, finite_outputs, one_line
-from framework.detection.weights_file import checked_hash, find_file, input_shape
+from framework.detection.weights_file import Shape, checked_hash, find_file, image_input, input_shape, is_channels_last
 from framework.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -26,6 +26,17 @@ Tensor = Mapping[str, Any]  # what the interpreter tells of an input or output
 INPUT_DTYPES = ("float32", "uint8")  # of images; int8 and uint8 with a scale are made from float32 here
 METADATA_FILES = ("metadata.json", "temp_meta.txt", "TFLITE_ASSOCIATED_FILE/metadata.json")  # Ultralytics'
 LARGEST_METADATA = 2**20  # bytes
+NO_METADATA = (
+    zipfile.BadZipFile,
+    zlib.error,
+    RuntimeError,
+    OSError,
+    ValueError,
+    SyntaxError,
+    AttributeError,
+    MemoryError,
+)
+"""What Python's readers raise on an archive that is none, is damaged, or holds something else."""
 
 
 class LitertNetwork:
@@ -41,11 +52,13 @@ class LitertNetwork:
         self.sha256 = checked_hash(self.path, sha256)
         self.metadata = _read_metadata(self.path)
         self._interpreter = _loaded(self.path, device)
-        image = _image_input(self.path, self._interpreter.get_input_details())
-        shape = _signature(image)
-        self.channels_last = shape[3] == 3 and shape[1] != 3
-        sides = shape[1:3] if self.channels_last else shape[2:]
-        self.shape = input_shape(self.path, _described(image), sides, input_size, self.metadata)
+        image, shape = image_input(self.path, self._interpreter.get_input_details(), _signature, _described)
+        dtype = np.dtype(image["dtype"]).name
+        if not (dtype in INPUT_DTYPES or (dtype == "int8" and _scale(image))):
+            wanted = f"{', '.join(INPUT_DTYPES)} or int8 with a scale"
+            raise DataError(f"{self.path}: the input must be {wanted}, found {_described(image)}")
+        self.channels_last = is_channels_last(shape)
+        self.shape = input_shape(self.path, _described(image), shape, input_size, self.metadata)
         whole = (1, *self.shape, 3) if self.channels_last else (1, 3, *self.shape)
         try:
             self._interpreter.resize_tensor_input(image["index"], whole, strict=True)
@@ -53,7 +66,7 @@ class LitertNetwork:
         except (RuntimeError, ValueError) as error:
             raise DataError(f"{self.path} failed in LiteRT: {one_line(error)}") from error
         self._input = image
-        self.dtype = "float32" if _scale(image) else np.dtype(image["dtype"]).name
+        self.dtype = "float32" if _scale(image) else dtype
 
     def __call__(self, image: Array) -> Outputs:
         """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
@@ -87,22 +100,7 @@ def _loaded(path: Path, device: str) -> Interpreter:
         raise DataError(f"{path} is not a .tflite file that LiteRT can load: {one_line(error)}") from error
 
 
-def _image_input(path: Path, inputs: Sequence[Tensor]) -> Tensor:
-    found = ", ".join(map(_described, inputs))
-    wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
-    if len(inputs) != 1:
-        raise DataError(f"{path}: {wanted}, found {len(inputs)} inputs: {found}")
-    (image,) = inputs
-    shape = _signature(image)
-    if len(shape) != 4 or shape[0] > 1 or 3 not in (shape[1], shape[3]):
-        raise DataError(f"{path}: {wanted}, found {found}")
-    dtype = np.dtype(image["dtype"]).name
-    if not (dtype in INPUT_DTYPES or (dtype == "int8" and _scale(image))):
-        raise DataError(f"{path}: the input must be {', '.join(INPUT_DTYPES)} or int8 with a scale, found {found}")
-    return image
-
-
-def _signature(tensor: Tensor) -> tuple[int, ...]:
+def _signature(tensor: Tensor) -> Shape:
     """The shape, with 0 for any."""
     signature = tensor.get("shape_signature")
     shape = tensor["shape"] if signature is None or len(signature) == 0 else signature
@@ -142,9 +140,6 @@ def _read_metadata(path: Path) -> ExportMetadata:
                 text = file.read(LARGEST_METADATA).decode("utf-8")
         content = json.loads(text) if name.endswith(".json") else ast.literal_eval(text)
         texts = {key: value if isinstance(value, str) else repr(value) for key, value in content.items()}
-    except (
-        *(zipfile.BadZipFile, zlib.error, NotImplementedError, StopIteration, ValueError, SyntaxError, AttributeError),
-        *(OSError, RuntimeError, RecursionError, MemoryError),
-    ):
+    except (StopIteration, *NO_METADATA):
         return ExportMetadata()  # no archive, or another one: nothing in it is needed
     return ExportMetadata.parse(texts)

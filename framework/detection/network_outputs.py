@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Array, Float32
-from framework.errors import DataError
+from framework.errors import DataError, in_one_line
 
 Outputs = dict[str, Float32]
 
@@ -23,5 +23,5 @@ def finite_outputs(path: Path, named: Iterable[tuple[str, Array]]) -> Outputs:
 
 
 def one_line(error: Exception) -> str:
-    """What a library's exception says, for a message."""
-    return " ".join(str(error).split())[:300] or type(error).__name__
+    """The beginning of what a library's exception says, for a message: some add a whole trace."""
+    return in_one_line(error)[:300]

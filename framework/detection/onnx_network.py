@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,7 +11,7 @@ import numpy as np
 from framework.data import Array
 from framework.detection.export_metadata import ExportMetadata
 from framework.detection.network_outputs import Outputs, finite_outputs, one_line
-from framework.detection.weights_file import checked_hash, find_file, input_shape
+from framework.detection.weights_file import Shape, checked_hash, find_file, image_input, input_shape, is_channels_last
 from framework.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -42,12 +41,14 @@ class OnnxNetwork:
         self.sha256 = checked_hash(self.path, sha256)
         self._session = _loaded(self.path, device)
         self.metadata = ExportMetadata.parse(self._session.get_modelmeta().custom_metadata_map)
-        image = _image_input(self.path, self._session.get_inputs())
+        image, shape = image_input(self.path, self._session.get_inputs(), _shape, _described)
+        if image.type not in INPUT_DTYPES:
+            wanted = ", ".join(INPUT_DTYPES.values())
+            raise DataError(f"{self.path}: the input must be one of {wanted}, found {_described(image)}")
         self._name = image.name
         self.dtype = INPUT_DTYPES[image.type]
-        self.channels_last = image.shape[3] == 3 and image.shape[1] != 3  # (1, H, W, 3), as in networks from TensorFlow
-        sides = image.shape[1:3] if self.channels_last else image.shape[2:]
-        self.shape = input_shape(self.path, _described(image), tuple(map(_length, sides)), input_size, self.metadata)
+        self.channels_last = is_channels_last(shape)
+        self.shape = input_shape(self.path, _described(image), shape, input_size, self.metadata)
 
     def __call__(self, image: Array) -> Outputs:
         """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
@@ -86,24 +87,11 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     return session
 
 
-def _image_input(path: Path, inputs: Sequence[NodeArg]) -> NodeArg:
-    found = ", ".join(map(_described, inputs))
-    wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
-    if len(inputs) != 1:
-        raise DataError(f"{path}: {wanted}, found {len(inputs)} inputs: {found}")
-    (image,) = inputs
-    if len(image.shape) != 4 or _length(image.shape[0]) > 1 or 3 not in (image.shape[1], image.shape[3]):
-        raise DataError(f"{path}: {wanted}, found {found}")
-    if image.type not in INPUT_DTYPES:
-        raise DataError(f"{path}: the input must be one of {', '.join(INPUT_DTYPES.values())}, found {found}")
-    return image
-
-
 def _described(tensor: NodeArg) -> str:
-    shape = ", ".join(str(_length(n) or "any") for n in tensor.shape)
+    shape = ", ".join(str(n or "any") for n in _shape(tensor))
     return f"{tensor.name} ({shape}) {INPUT_DTYPES.get(tensor.type, tensor.type)}"
 
 
-def _length(dimension: int | str | None) -> int:
-    """0 = any: such a dimension has a name, or none."""
-    return dimension if isinstance(dimension, int) else 0
+def _shape(tensor: NodeArg) -> Shape:
+    """With 0 for any: such a dimension has a name, or none."""
+    return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)

@@ -60,7 +60,7 @@ class SegmentationLayout:
     def read(self, outputs: Outputs) -> SegmentationOutput:
         """Raises DataError when the outputs do not have this layout, and where boxes cannot be what they seem."""
         table, prototypes = _table_and_prototypes(outputs)
-        rows = table[0] if self.rows_first else table[0].T
+        rows = self._rows(table)
         maps = np.moveaxis(prototypes[0], -1, 0) if self.channels_last else prototypes[0]
         if self.suppressed:
             class_scores, coefficients = self._one_class_scores(rows), rows[:, COEFFICIENTS:]
@@ -75,10 +75,14 @@ class SegmentationLayout:
     def seen_in(self, outputs: Outputs) -> SegmentationLayout:
         """With `boxes` and `unit` as these outputs show them, where they show them. Raises DataError where both fit."""
         table, _ = _table_and_prototypes(outputs)
-        rows = table[0] if self.rows_first else table[0].T
+        rows = self._rows(table)
         used = rows[rows[:, SCORE] > 0] if self.suppressed else rows
         boxes = self.boxes or _box_kind(used[:, :4], self.suppressed)
         return replace(self, boxes=boxes, unit=_is_unit(used[:, :4], self.shape, self.suppressed))
+
+    def _rows(self, table: Float32) -> Float32:
+        rows: Float32 = table[0] if self.rows_first else table[0].T
+        return rows
 
     def _one_class_scores(self, rows: Float32) -> Float32:
         """(K, C): of each row the score of its label, 0 for the other classes."""

@@ -16,7 +16,7 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
 from framework.data import Array, UInt8, UInt16
-from framework.errors import DataError, FrameError
+from framework.errors import DataError, FrameError, in_one_line
 from framework.files.whole_files import read_bytes
 
 MOST_PIXELS = 2**25  # 8K video; decoders allocate what a header claims, and a damaged one can claim 10^10
@@ -87,6 +87,6 @@ def check_image(name: Path | str, data: bytes) -> None:
         width, height = image.size
         image.verify()
     except Exception as error:  # Pillow has no base of its own
-        raise FrameError(f"{name} is damaged: {' '.join(str(error).split())}") from error
+        raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
     if not 0 < width * height <= MOST_PIXELS:
         raise FrameError(f"{name} claims to be {width}x{height} px; it is damaged, or larger than {MOST_PIXELS} px")

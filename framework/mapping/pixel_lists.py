@@ -12,6 +12,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Int32, PointClusters
 from framework.geometry import require_pixels_inside
+from framework.mapping.voxel_grid import device
 
 
 class PixelLists(NamedTuple):
@@ -74,6 +75,17 @@ def cover_another(clusters: PointClusters, points: PixelLists, threshold: float)
     return np.asarray((better & (over_smaller > threshold)).any(axis=1))
 
 
+@device
+def _append(first, following, v, u, last, p):
+    """Puts point p at the end of the list of pixel (u, v), behind `last`, -1 = it is empty; returns p."""
+    if last < 0:
+        first[v, u] = p
+    else:
+        following[last] = p
+    following[p] = -1
+    return p
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _keep_on_top(first, following, cluster, sizes, share, kept_first, kept_following):
     """Copies each pixel's list without the points of clusters that one of less than `share` of their size lies on."""
@@ -91,12 +103,7 @@ def _keep_on_top(first, following, cluster, sizes, share, kept_first, kept_follo
             p = first[v, u]
             while p >= 0:
                 if smallest >= share * sizes[cluster[p]]:
-                    if last < 0:
-                        kept_first[v, u] = p
-                    else:
-                        kept_following[last] = p
-                    kept_following[p] = -1
-                    last = p
+                    last = _append(kept_first, kept_following, v, u, last, p)
                 p = following[p]
 
 
@@ -127,12 +134,7 @@ def _leave_to_others(first, following, cluster, lying, seen, stride, kept_first,
             p = first[v, u]
             while p >= 0:
                 if not lying[cluster[p], found]:
-                    if last < 0:
-                        kept_first[v, u] = p
-                    else:
-                        kept_following[last] = p
-                    kept_following[p] = -1
-                    last = p
+                    last = _append(kept_first, kept_following, v, u, last, p)
                 p = following[p]
 
 

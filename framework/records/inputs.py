@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
+from framework.datasets.scannet.scannet_annotation import FIRST_LABEL_TABLE, LABEL_TABLE
 from framework.detection.fingerprint import content_hash
 from framework.errors import ConfigError
 from framework.files.search_paths import folder_of
@@ -39,23 +40,23 @@ def inputs_sha256(config: Mapping[str, Any]) -> str:
 def _content(value: str) -> str:
     """Of a file or folder; "" for a word that names none."""
     try:
-        return content_hash(Path(value).expanduser())
+        return content_hash(Path(value))
     except (ConfigError, OSError, ValueError):
         return ""
 
 
 def _listed(root: Path, scene: str) -> Iterator[tuple[str, str, int, int]]:
-    for above in (root / scene).resolve().parents[:2]:
-        for table in sorted(path for path in above.glob("*.tsv") if path.is_file()):  # ScanNet's labels
-            yield above.name, table.name, table.stat().st_size, table.stat().st_mtime_ns
-    walks = [os.walk(root / scene, followlinks=True)]  # MOST_FILES ends a circle
+    above = (root / scene).resolve().parents[:2]  # where ScanNet's label tables are
+    walks: list[Iterable[tuple[str, list[str], list[str]]]]
+    walks = [[(str(folder), [], [LABEL_TABLE, FIRST_LABEL_TABLE]) for folder in above]]
     if scene:
-        walks.insert(0, islice(os.walk(root), 1))  # what all scenes share, such as Replica's cam_params.json
+        walks.append(islice(os.walk(root), 1))  # what all scenes share, such as Replica's cam_params.json
+    walks.append(os.walk(root / scene, followlinks=True))  # MOST_FILES ends a circle
     for folder, folders, files in chain.from_iterable(walks):
         folders[:] = sorted(set(folders) - OUTPUTS)
         for name in sorted(files):
             try:
                 found = Path(folder, name).stat()
-            except OSError:  # a link that leads nowhere
+            except OSError:  # a link that leads nowhere, a table that is not there
                 continue
             yield os.path.relpath(folder, root), name, found.st_size, found.st_mtime_ns

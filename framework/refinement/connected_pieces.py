@@ -24,7 +24,7 @@ def in_largest_piece(clusters: PointClusters, frame: Frame, gap: float, gap_per_
     Two points are connected when they are at most `reach` px apart and their depths differ by less than `gap` (m) +
     `gap_per_depth` * depth of the nearer one. Points of no cluster are in.
     """
-    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share=NO_OTHER, steepest=0.0)
+    return in_near_pieces(clusters, frame, gap, gap_per_depth, reach, min_share=NO_OTHER, steepest=0.0)
 
 
 def in_near_pieces(
@@ -42,18 +42,6 @@ def in_near_pieces(
     larger ones first. One stays when most of its points differ in depth from the nearest one that stays by no more than
     the gap, and what a surface may rise on the way there: `steepest` m of depth a metre aside. By samples.
     """
-    return _in_pieces(clusters, frame, gap, gap_per_depth, reach, min_share, steepest)
-
-
-def _in_pieces(
-    clusters: PointClusters,
-    frame: Frame,
-    gap: float,
-    gap_per_depth: float,
-    reach: int,
-    min_share: float,
-    steepest: float,
-) -> Bool:
     order, firsts = members(clusters)
     stays = np.empty(firsts[-1], np.bool_)
     _find_pieces(
@@ -113,25 +101,25 @@ def _find_pieces_of(
         piece[i] = parents[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
     piece_stays = np.zeros(count, np.bool_)
     piece_stays[largest] = True
-    least = min_share * np.float32(pieces[largest])
-    if pieces[largest] >= least:
-        _keep_near(pixels, piece, pieces, largest, least, depth, gap, gap_per_depth, steepest, piece_stays)
+    _keep_near(pixels, piece, pieces, largest, min_share, depth, gap, gap_per_depth, steepest, piece_stays)
     for i in range(len(pixels)):
         stays[i] = piece_stays[piece[i]]
 
 
 @njit(cache=True, nogil=True)
 def _keep_near(
-    pixels: Int32, piece: Int32, sizes: Int32, largest: int, least: np.float32, depth: Float32, gap: np.float32,
+    pixels: Int32, piece: Int32, sizes: Int32, largest: int, min_share: np.float32, depth: Float32, gap: np.float32,
     gap_per_depth: np.float32, steepest: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
-    """Marks the pieces that no step in depth parts from those that stay, the larger ones first."""
-    others = np.flatnonzero((sizes > 0) & (sizes >= least))
+    """Marks the pieces that no large step parts from those that stay, the larger ones first."""
+    large = (sizes > 0) & (sizes >= min_share * np.float32(sizes[largest]))
+    large[largest] = False
+    others = np.flatnonzero(large)
+    if len(others) == 0:
+        return
     ends = _some_of(pixels, piece, largest, ENDS)
     for other in others[np.argsort(-sizes[others], kind="mergesort")]:
-        if not stays[other] and _is_near(
-            _some_of(pixels, piece, other, STARTS), ends, depth, gap, gap_per_depth, steepest
-        ):
+        if _is_near(_some_of(pixels, piece, other, STARTS), ends, depth, gap, gap_per_depth, steepest):
             stays[other] = True
             ends = np.concatenate((ends, _some_of(pixels, piece, other, ENDS)))
 

@@ -372,8 +372,7 @@ def _accumulate(
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
     for chunk in prange(CHUNKS):
         total = np.zeros(TERMS, np.float64)
-        lanes = np.zeros((SUMS, LANES), np.float64)
-        flat_lanes = lanes.ravel()
+        lanes = np.zeros(SUMS * LANES, np.float64)
         points = np.zeros(POINT_FIELDS * BATCH, np.float32)
         J = np.empty(TERM_SIZE, np.float32)
         pixel = np.empty(BATCH, np.int32)
@@ -383,7 +382,7 @@ def _accumulate(
                 _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
                 visible, weighed, close, behind = _add_geometry(model, R, weights, points, J)
-                _add_products(J, flat_lanes)
+                _add_products(J, lanes)
                 total[SUMS] += visible
                 total[SUMS + 1] += weighed
                 total[SUMS + 2] += close
@@ -391,13 +390,13 @@ def _accumulate(
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
                     weighed, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
-                    _add_products(J, flat_lanes)
-                    _add_brightness(J, flat_lanes)
+                    _add_products(J, lanes)
+                    _add_brightness(J, lanes)
                     total[SUMS + 4] += weighed
                     total[SUMS + 5] += compared
         for i in range(SUMS):
             for lane in range(LANES):
-                total[i] += lanes[i, lane]
+                total[i] += lanes[i * LANES + lane]
         sums[chunk] = total
 
 

@@ -19,7 +19,7 @@ from framework.detection.device import torch_device
 from framework.detection.fingerprint import fingerprint
 from framework.detection.hub_model import PREPROCESSING, find_model
 from framework.detection.masks import without_duplicates
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, in_one_line
 from framework.interfaces import Detector
 from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
 from framework.parameters import require
@@ -363,5 +363,5 @@ class Checkpoint:
             return read(str(self.folder), local_files_only=True, **options)
         except Exception as error:  # whatever transformers and safetensors raise on foreign files
             raise DataError(
-                f"detector.model: {what} could not be read from {self.folder}: {' '.join(str(error).split())}"
+                f"detector.model: {what} could not be read from {self.folder}: {in_one_line(error)}"
             ) from error

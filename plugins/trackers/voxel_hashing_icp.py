@@ -141,9 +141,12 @@ class VoxelHashingIcp(PoseTracker):
             return self._first(seen)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
-        alignment = self._resumed(levels, scene) if self._lost_frames else self._continued(levels, scene)
+        T_world_predicted = self._T_world_last @ self._T_last_next
+        if self._lost_frames:
+            alignment = self._resumed(levels, scene)
+        else:
+            alignment = self._continued(levels, scene, T_world_predicted)
         if not (alignment.trusted and self._steady_frames >= STEADY) and levels[0].depth.any():
-            T_world_predicted = self._T_world_last @ self._T_last_next
             alignment = self._searched(alignment, seen, levels, scene)
             if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
                 self._steady_frames = 0  # features led elsewhere
@@ -157,10 +160,9 @@ class VoxelHashingIcp(PoseTracker):
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         return self._trusted(seen, alignment.T_world_camera)
 
-    def _continued(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+    def _continued(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
         """Aligns from where a steady motion has led, and is content with less where it ends there."""
         assert self._T_world_last is not None
-        T_world_predicted = self._T_world_last @ self._T_last_next
         alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
         if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
             self._steady_frames = 0

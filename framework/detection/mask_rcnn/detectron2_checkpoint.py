@@ -20,7 +20,7 @@ from torch import Tensor
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import filled
 from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
-from framework.errors import DataError
+from framework.errors import DataError, in_one_line
 from framework.label_spaces import COCO
 
 PIXEL_MEAN = (123.675, 116.28, 103.53)  # RGB
@@ -95,7 +95,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
         with path.open("rb") as file:
             content = ArraysOnly(file, encoding="latin1").load()
     except Exception as error:  # a damaged pickle can raise almost anything
-        raise DataError(f"{path} is no pickle of numpy arrays: {' '.join(str(error).split())}") from error
+        raise DataError(f"{path} is no pickle of numpy arrays: {in_one_line(error)}") from error
     state = content.get("model", content) if isinstance(content, dict) else None
     if not isinstance(state, dict) or not all(isinstance(array, np.ndarray) for array in state.values()):
         raise DataError(f"{path} must hold a dictionary of numpy arrays, as detectron2 writes it")

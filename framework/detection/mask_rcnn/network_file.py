@@ -22,7 +22,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
-from framework.errors import DataError
+from framework.errors import DataError, in_one_line
 from framework.files.whole_files import written_whole
 
 Fact = str | int | float | bool | None
@@ -56,7 +56,7 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
         try:
             save_file(tensors, temporary, metadata)
         except safetensors.SafetensorError as error:
-            raise DataError(f"{path} could not be written: {' '.join(str(error).split())}") from error
+            raise DataError(f"{path} could not be written: {in_one_line(error)}") from error
 
 
 def load_network(path: Path) -> MaskRCNN:
@@ -85,7 +85,7 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
         with torch.device("meta"):  # no memory, no random numbers for weights that are replaced at once
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
-        raise DataError(f"{where}: there is no such architecture: {' '.join(str(error).split())}") from error
+        raise DataError(f"{where}: there is no such architecture: {in_one_line(error)}") from error
     expected = _stored(network)
     given = {name: tensor for name, tensor in tensors.items() if not name.endswith(COUNTERS)}
     _check_names(expected.keys(), given.keys(), where)
@@ -133,7 +133,7 @@ def _opened(path: Path) -> Any:
     try:
         return safetensors.safe_open(path, framework="pt")
     except (safetensors.SafetensorError, OSError) as error:
-        raise DataError(f"{path} is damaged, or no safetensors file: {' '.join(str(error).split())}") from error
+        raise DataError(f"{path} is damaged, or no safetensors file: {in_one_line(error)}") from error
 
 
 def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescription:

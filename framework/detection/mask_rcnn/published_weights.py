@@ -14,7 +14,7 @@ from pathlib import Path
 import platformdirs
 from tqdm import tqdm
 
-from framework.errors import DataError
+from framework.errors import DataError, in_one_line
 from framework.files.search_paths import candidates
 from framework.files.whole_files import written_whole
 
@@ -143,4 +143,4 @@ def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
 
 def _reason(error: Exception) -> str:
     """What is wrong, in a few words."""
-    return " ".join(str(getattr(error, "reason", None) or error).split()) or type(error).__name__
+    return in_one_line(getattr(error, "reason", None) or error)

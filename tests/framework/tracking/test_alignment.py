@@ -111,7 +111,7 @@ def test_points_whose_normals_differ_do_not_match() -> None:
 
 def with_noisy_normals(model: ModelView) -> ModelView:
     """As a map of one frame has them, a few metres away."""
-    noisy = model.normals + np.random.default_rng(0).normal(0, 0.4, model.normals.shape).astype(np.float32)
+    noisy = model.normals + np.random.default_rng(0).normal(0, 0.5, model.normals.shape).astype(np.float32)
     noisy /= np.linalg.norm(noisy, axis=0)
     return model._replace(normals=np.where(model.depth > 0, noisy, 0).astype(np.float32))
 
@@ -128,7 +128,7 @@ def test_noisy_normals_do_not_resist_a_motion_along_a_wall(level: int) -> None:
         return float(xi[0] / 0.02)
 
     assert share_found(lambda model: model) == pytest.approx(1, abs=0.02)
-    assert share_found(with_noisy_normals) < 0.85, "this case does not show what it is for"
+    assert share_found(with_noisy_normals) < 0.8, "this case does not show what it is for"
     assert share_found(lambda model: smoothed(with_noisy_normals(model), level)) == pytest.approx(1, abs=0.1)
 
 
