@@ -1,6 +1,6 @@
 """`python -m framework detect detector=X dataset=D out=FILE`: writes a sequence's detections as a COCO result file.
 
-Where the frames come with their true instances, it also says how good the masks are.
+Where the frames come with their true instances, it also says how good the masks are, and what goes wrong how often.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from framework.interfaces import Detector, RGBDSequence
 if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
     from framework.data import Bool, Detections
     from framework.detection.coco_results import ResultWriter
+    from framework.evaluation.detection_faults import DetectionFaults
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
@@ -64,11 +65,13 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
     """
     from framework.detection.coco_results import results_file
     from framework.detection.domain import warn_outside_domain
+    from framework.evaluation.detection_faults import DetectionFaults
     from framework.evaluation.mask_ap import mask_ap
 
     warn_outside_domain(detector, sequence)
+    faults = DetectionFaults()
     with results_file(path, detector.classes) as results:
-        precision = mask_ap(_written(results, detector, sequence), detector.classes, SMALLEST)
+        precision = mask_ap(_written(results, detector, sequence, faults), detector.classes, SMALLEST)
     log.info("%s: %d detections in %d frames of %s", path, results.count, results.frames, sequence.name)
     if precision.objects:
         log.info(
@@ -79,13 +82,15 @@ def write_detections(path: Path, detector: Detector, sequence: RGBDSequence) -> 
             precision.objects,
             SMALLEST,
         )
+        for name, value in faults.table().items():
+            log.info("%-40s %.2f", name, value)
     return results.count
 
 
 def _written(
-    results: ResultWriter, detector: Detector, sequence: RGBDSequence
+    results: ResultWriter, detector: Detector, sequence: RGBDSequence, faults: DetectionFaults
 ) -> Iterator[tuple[Bool, list[str | None], Detections]]:
-    """Detects and writes, frame by frame; yields what `mask_ap` compares where the true instances are known."""
+    """Detects and writes, frame by frame; where there is truth, counts faults and yields what `mask_ap` compares."""
     with logging_redirect_tqdm(), tqdm(total=len(sequence), unit=" frames", disable=None, dynamic_ncols=True) as bar:
         for k in range(len(sequence)):
             bar.update()
@@ -97,6 +102,7 @@ def _written(
                 continue
             results.write(frame.index, found)
             if frame.truth is not None:
+                faults.add(frame.truth, found)
                 names = frame.truth.class_names
                 ids = np.array([i for i in np.unique(frame.truth.instance_ids).tolist() if i and i in names], np.int32)
                 yield frame.truth.instance_ids == ids[:, None, None], [names[i] for i in ids.tolist()], found

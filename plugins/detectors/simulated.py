@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from framework.data import Bool, Detections, Float32, Float64, Frame, Int32
+from framework.detection.ghost_places import ghost_places
 from framework.detection.masks import paste_masks, tight_boxes
 from framework.detection.truth import TrueInstances, true_instances
 from framework.interfaces import Detector
@@ -27,10 +28,21 @@ LOOKALIKES = (
 # fmt: on
 """COCO classes that are taken for each other, chosen from what detectors are seen to confuse indoors."""
 
+TAKEN_FOR = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
+"""What is none of COCO's classes is taken for one of these."""
+
 LOOKALIKE_SHARE = 0.8  # of the probability lost by the true class; the rest is spread over all other classes
 EVEN_SHARE = 0.01  # of each distribution that is the model's mean: like a softmax, it has no zeros
 CONTACT_DEPTH = 0.1  # m, neighbouring pixels of two instances nearer than this in depth touch
 FALSE_SIZES = (24.0, 160.0)  # px, sides of false detections, drawn evenly on a logarithmic scale
+
+LARGEST_CLUTTER = 0.25  # of the image: larger things, walls as a rule, are not taken for objects as a whole
+LARGEST_ATTACHED = 2.0  # times the object's size: larger things are not taken for a part of it
+GHOST_SIZES = (0.2, 1.2)  # m, sides of false detections at places of the room, drawn evenly on a logarithmic scale
+SHARES = (
+    *("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate", "split_rate"),
+    *("confusion_consistency", "ghost_share"),
+)
 
 
 class Draw(IntEnum):
@@ -44,39 +56,49 @@ class Draw(IntEnum):
     CLASS_OF_OBJECT = 5
     SCORE = 6
     FALSE_POSITIVES = 7
+    ATTACH = 8
+    CLUTTER = 9
+    DETECTABILITY = 10
+    GHOST = 11
 
 
 @dataclass(frozen=True)
 class Candidate:
     """An object, or a part of one, on its way to a detection."""
 
-    instance: int  # its id in the ground truth; false detections count down from -1
+    instance: int  # its id in the ground truth; what is nothing has a negative one
     part: int  # 0, or 1 for the second half of a split object
     class_id: int
     mask: Bool  # (H, W)
-    true_mask: Bool  # (H, W) of the instance, which a perfect detector would return
+    true_mask: Bool  # (H, W) of the instance, which a perfect detector would return; empty for a false detection
 
 
 @dataclass
 class SimulatedDetector(Detector):
     """The ground truth with the errors of a mid-quality detector, each one a parameter; all at 0 = the ground truth.
 
-    In this order: touching neighbours come back under one mask (`merge_rate`); objects are missed, the more so the
-    smaller (`small_side`) or when cut by the image's border; objects come back in two halves (`split_rate`); masks
+    In this order: things of unknown class are taken for objects (`clutter_rate`); an object comes back with a thing
+    that touches it, as a sink with its cupboard (`attach_rate`); touching neighbours come back under one mask
+    (`merge_rate`); objects are missed, the more so the smaller (`small_side`) or when cut by the image's border, some
+    objects nearly always and others never (`miss_spread`); objects come back in two halves (`split_rate`); masks
     are shifted, bleed over the border, wobble smoothly along it and pass through a coarse grid; the class becomes a
     distribution around a confusion kernel of lookalikes, the same one in many of an object's frames
-    (`confusion_consistency`), because real errors do not average out over a video; the score follows the
-    mask's quality and the class's certainty; false detections appear. Every number is drawn from (seed, purpose, frame,
-    instance): the order of calls does not matter, and changing one error leaves the draws of the others alone. Raises
-    DataError without ground truth.
+    (`confusion_consistency`); the score follows the mask's quality and the class's certainty; false detections appear,
+    some of them at the same places of the room again and again (`ghost_share`, where poses are known). What an object
+    or a place has of its own does not average out over a video, as the errors of real detectors do not. Every number
+    is drawn from (seed, purpose, frame, instance): the order of calls does not matter, and changing one error leaves
+    the draws of the others alone. Raises DataError without ground truth.
     """
 
     seed: int = 0  # >= 0
     min_pixels: int = 64  # px >= 1, smaller instances are never detected
+    clutter_rate: float = 0.0  # in [0, 1], share of the things of unknown class that are taken for objects
+    attach_rate: float = 0.0  # in [0, 1], share of the pairs object, thing that touches it, that come back as one
     merge_rate: float = 0.1  # in [0, 1], probability that a touching pair comes back as one
     miss_rate: float = 0.1  # in [0, 1], probability to miss a large, whole object
     small_side: float = 24.0  # px >= 0, at this side 1/e of the objects are missed; 0 = size is no matter
     truncated_miss_rate: float = 0.15  # in [0, 1], more for an object at the image's border
+    miss_spread: float = 0.0  # >= 0, standard deviation over objects of the logit of being seen
     split_rate: float = 0.05  # in [0, 1], probability that an object comes back in two halves
     shift: float = 1.5  # px >= 0, standard deviation along x and y
     bleed: float = 2.0  # px, how far masks reach over the border; negative = they fall short
@@ -86,18 +108,20 @@ class SimulatedDetector(Detector):
     confusion: float = 0.25  # in [0, 1), mean probability that goes to wrong classes
     confusion_concentration: float = 3.0  # > 0, of the Dirichlet: small = confident, often wrong
     confusion_consistency: float = 0.5  # in [0, 1], share of frames that give an object one and the same distribution
-    score_concentration: float = 20.0  # >= 0, of the Beta around quality x certainty; 0 = no noise
+    score_scale: float = 1.0  # in (0, 1], of the mean score: quality x certainty x this
+    score_concentration: float = 20.0  # >= 0, of the Beta around the mean; 0 = no noise
     score_threshold: float = 0.1  # in [0, 1), detections below are dropped
     false_positives: float = 0.5  # >= 0, mean number an image
     false_positive_score: float = 0.25  # in (0, 1), mean
+    ghost_share: float = 0.0  # in [0, 1], of the false positives: at places of the room, of one class each
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, "detector.seed", self.seed, "at least 0")
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")
-        for name in ("merge_rate", "miss_rate", "truncated_miss_rate", "split_rate", "confusion_consistency"):
+        for name in SHARES:
             value = getattr(self, name)
             require(0 <= value <= 1, f"detector.{name}", value, "in [0, 1]")
-        for name in ("small_side", "shift", "boundary_noise", "score_concentration", "false_positives"):
+        for name in ("small_side", "miss_spread", "shift", "boundary_noise", "score_concentration", "false_positives"):
             value = getattr(self, name)
             require(0 <= value < np.inf, f"detector.{name}", value, "at least 0")
         for name in ("confusion", "score_threshold"):
@@ -106,6 +130,7 @@ class SimulatedDetector(Detector):
         require(bool(np.isfinite(self.bleed)), "detector.bleed", self.bleed, "a number of px")
         require(2 <= self.boundary_scale < np.inf, "detector.boundary_scale", self.boundary_scale, "at least 2 px")
         require(self.mask_grid == 0 or self.mask_grid >= 4, "detector.mask_grid", self.mask_grid, "0 or at least 4")
+        require(0 < self.score_scale <= 1, "detector.score_scale", self.score_scale, "in (0, 1]")
         concentration = self.confusion_concentration
         require(0 < concentration < np.inf, "detector.confusion_concentration", concentration, "positive")
         mean = self.false_positive_score
@@ -115,7 +140,8 @@ class SimulatedDetector(Detector):
 
     def detect(self, frame: Frame) -> Detections:
         truth = true_instances(frame, self.classes, self.min_pixels)
-        candidates = self._merge(truth, frame)
+        pairs = touching_pairs(frame).tolist()
+        candidates = self._clutter(frame) + self._merge(self._attached(truth, pairs, frame), pairs, frame)
         candidates = [candidate for candidate in candidates if self._sees(candidate, frame)]
         candidates = [part for candidate in candidates for part in self._split(candidate, frame)]
         candidates = [self._reshape(candidate, frame) for candidate in candidates]
@@ -141,15 +167,53 @@ class SimulatedDetector(Detector):
     def _random(self, draw: Draw, *key: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
-    def _merge(self, truth: TrueInstances, frame: Frame) -> list[Candidate]:
-        """The instances, touching pairs put together under the larger one's name; each merges at most once."""
+    def _clutter(self, frame: Frame) -> list[Candidate]:
+        """The things of unknown class that are taken for objects: in all frames the same ones, of the same class."""
+        if self.clutter_rate == 0:
+            return []
+        largest = LARGEST_CLUTTER * frame.depth.size
+        candidates = []
+        for instance, mask in self._things(frame).items():
+            random = self._random(Draw.CLUTTER, instance)
+            if random.random() < self.clutter_rate and np.count_nonzero(mask) <= largest:
+                class_id = self.classes.index(TAKEN_FOR[random.integers(len(TAKEN_FOR))])
+                candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
+        return candidates
+
+    def _things(self, frame: Frame) -> dict[int, Bool]:
+        """The masks of what has no known class, by id; none smaller than `min_pixels`."""
+        assert frame.truth is not None
+        names = frame.truth.class_names
+        found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
+        chosen = [i for i in found[areas >= self.min_pixels].tolist() if i > 0 and names.get(i) is None]
+        return {i: frame.truth.instance_ids == i for i in chosen}
+
+    def _attached(self, truth: TrueInstances, pairs: list[list[int]], frame: Frame) -> list[Candidate]:
+        """The instances, largest first, some of them with things that touch them."""
         candidates = {
             i: Candidate(i, 0, c, mask, mask)
             for i, c, mask in zip(truth.ids.tolist(), truth.class_ids.tolist(), truth.masks, strict=True)
         }
+        if self.attach_rate == 0:
+            return list(candidates.values())
+        things = self._things(frame)
+        for first, second in pairs:
+            for instance, thing in ((first, second), (second, first)):
+                if instance not in candidates or thing not in things:
+                    continue
+                if self._random(Draw.ATTACH, instance, thing).random() >= self.attach_rate:
+                    continue
+                own = candidates[instance]
+                if np.count_nonzero(things[thing]) <= LARGEST_ATTACHED * np.count_nonzero(own.true_mask):
+                    candidates[instance] = replace(own, mask=own.mask | things[thing])
+        return list(candidates.values())
+
+    def _merge(self, instances: list[Candidate], pairs: list[list[int]], frame: Frame) -> list[Candidate]:
+        """The instances, touching pairs put together under the larger one's name; each merges at most once."""
+        candidates = {candidate.instance: candidate for candidate in instances}
         rank = {i: k for k, i in enumerate(candidates)}  # the largest first
         taken: set[int] = set()
-        for pair in touching_pairs(frame).tolist():
+        for pair in pairs:
             if not taken.isdisjoint(pair) or not rank.keys() >= set(pair):
                 continue
             if self._random(Draw.MERGE, frame.index, *pair).random() >= self.merge_rate:
@@ -167,6 +231,9 @@ class SimulatedDetector(Detector):
         p = 1 - self.miss_rate
         p *= 1 - np.exp(-side / self.small_side) if self.small_side > 0 else 1.0
         p *= 1 - self.truncated_miss_rate if truncated else 1.0
+        if self.miss_spread > 0 and 0 < p < 1:
+            own = self.miss_spread * self._random(Draw.DETECTABILITY, candidate.instance).standard_normal()
+            p = 1 / (1 + (1 - p) / p * np.exp(-own))
         return bool(self._random(Draw.MISS, frame.index, candidate.instance).random() < p)
 
     def _split(self, candidate: Candidate, frame: Frame) -> list[Candidate]:
@@ -222,17 +289,30 @@ class SimulatedDetector(Detector):
         return np.asarray(paste_masks(grid[None], borders, (mask.shape[0], mask.shape[1]))[0], np.bool_)
 
     def _false_positives(self, frame: Frame) -> list[Candidate]:
-        """Ellipses with a wobbling border, of random classes, anywhere in the image."""
+        """Ellipses with a wobbling border: of any class anywhere in the image, or of one class at a place of the room.
+
+        Of the places in sight the same ones come first in all frames.
+        """
         random = self._random(Draw.FALSE_POSITIVES, frame.index)
         height, width = frame.camera.shape
+        count = int(random.poisson(self.false_positives))
+        is_ghost = self._random(Draw.GHOST, frame.index).random(count) < self.ghost_share
+        places = ghost_places(frame, self.seed, int(is_ghost.sum()))
         candidates = []
-        for k in range(int(random.poisson(self.false_positives))):
+        for k in range(count):
             a, b = np.exp(random.uniform(np.log(FALSE_SIZES[0]), np.log(FALSE_SIZES[1]), 2)) / 2
             x, y = random.uniform(0, width), random.uniform(0, height)
-            wobble = smooth_field(random, (height, width), self.boundary_scale) * (self.boundary_noise / min(a, b))
-            mask = self._coarsen(ellipse(x, y, a, b, wobble))
-            nothing = np.zeros_like(mask)
-            candidates.append(Candidate(-1 - k, 0, int(random.integers(len(self.classes))), mask, nothing))
+            wobble = smooth_field(random, (height, width), self.boundary_scale)
+            instance, class_id = -1 - k, int(random.integers(len(self.classes)))
+            if is_ghost[k] and places:
+                place = places.pop(0)
+                own = self._random(Draw.GHOST, place.key)
+                scale = frame.camera.fx / place.z
+                a, b = np.exp(own.uniform(np.log(GHOST_SIZES[0]), np.log(GHOST_SIZES[1]), 2)) / 2 * scale
+                x, y, instance = place.u, place.v, -place.key
+                class_id = self.classes.index(TAKEN_FOR[own.integers(len(TAKEN_FOR))])
+            mask = self._coarsen(ellipse(x, y, a, b, wobble * (self.boundary_noise / min(a, b))))
+            candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
         return candidates
 
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
@@ -245,12 +325,12 @@ class SimulatedDetector(Detector):
         return np.asarray((1 - EVEN_SHARE) * drawn + EVEN_SHARE * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
-        """Beta around the mask's IoU with its instance times the probability of the most likely class."""
+        """Beta around the mask's IoU with its instance times the probability of the most likely class, scaled."""
         mean = self.false_positive_score
-        if candidate.instance > 0:
+        if candidate.true_mask.any():
             union = np.count_nonzero(candidate.mask | candidate.true_mask)
             iou = np.count_nonzero(candidate.mask & candidate.true_mask) / union
-            mean = iou * float(probabilities.max())
+            mean = self.score_scale * iou * float(probabilities.max())
         if self.score_concentration == 0 or not 0 < mean < 1:
             return min(mean, 1.0)
         random = self._random(Draw.SCORE, frame.index, candidate.instance, candidate.part)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +34,10 @@ def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
     assert "frame skipped: frame 1" in done.stderr
     assert "10 detections in 5 frames of corner_room" in done.stderr
     assert "mask AP50 1.00, AP 1.00: the mean of 2 classes, 10 true objects" in done.stderr
+    said = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
+    assert (said["found"], said["mask IoU"], said["class right"], said["false detections an image"]) == (
+        *("1.00", "1.00", "1.00", "0.00"),
+    )
     how = done.stderr.split("read it with: ")[1].split()
     path, labels = (argument.split("=")[1] for argument in how[1:])
     detector = Precomputed(Path(path), labels=labels)

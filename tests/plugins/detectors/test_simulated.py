@@ -238,6 +238,84 @@ def test_false_positives():
     assert np.mean(np.concatenate([d.scores for d in found])) == pytest.approx(0.25, abs=0.04)
 
 
+THING = np.zeros((120, 160), np.int32)
+THING[20:60, 20:60] = 5  # a chair
+THING[20:50, 60:90] = 31  # a thing that touches it
+THING[80:110, 20:50] = 32  # one that touches nothing
+ROOM = FrameTruth(THING, {5: "chair", **dict.fromkeys(range(31, 200))})
+
+
+def test_an_object_takes_the_same_neighbour_with_it_in_all_frames():
+    taken = []
+    for seed in range(200):
+        detector = replace(PERFECT, attach_rate=0.3, seed=seed)
+        masks = [detector.detect(replace(frame(k), truth=ROOM)).masks[0] for k in range(3)]
+        assert all(np.array_equal(mask, masks[0]) for mask in masks)
+        assert np.array_equal(masks[0], (THING == 5) | (THING == 31) & masks[0][30, 70])
+        taken.append(masks[0][30, 70])
+    assert np.mean(taken) == pytest.approx(0.3, abs=0.09)
+    large = THING.copy()
+    large[20:120, 60:160] = 31  # more than twice as large as the chair
+    alone = replace(PERFECT, attach_rate=1.0).detect(replace(frame(), truth=FrameTruth(large, ROOM.class_names)))
+    np.testing.assert_array_equal(alone.masks[0], large == 5)
+
+
+def test_things_are_taken_for_the_same_object_in_all_frames():
+    detector = replace(PERFECT, clutter_rate=0.4, score_concentration=20.0)
+    taken = 0
+    for thing in range(31, 200):
+        truth = FrameTruth(np.where(THING == 32, thing, 0).astype(np.int32), ROOM.class_names)
+        found = [detector.detect(replace(frame(k), truth=truth)) for k in range(3)]
+        assert len({len(d) for d in found}) == 1
+        assert len({row.argmax() for d in found for row in d.class_probabilities}) == len(found[0])
+        assert all(np.array_equal(d.masks[0], THING == 32) for d in found if len(d))
+        taken += len(found[0])
+    assert taken / 169 == pytest.approx(0.4, abs=0.12)
+
+
+def test_some_objects_are_missed_nearly_always_and_others_never():
+    alike = replace(PERFECT, miss_rate=0.5)
+    apart = replace(alike, miss_spread=2.0)
+
+    def seen(detector):
+        found = [sum(len(detector.detect(replace(frame(k), truth=one))) for k in range(20)) / 20 for one in objects]
+        return np.array(found)
+
+    objects = [FrameTruth(np.where(IDS == 9, i, 0).astype(np.int32), {i: "cup"}) for i in range(100, 160)]
+    assert seen(alike).mean() == pytest.approx(0.5, abs=0.05)
+    assert seen(apart).mean() == pytest.approx(0.5, abs=0.13)
+    assert ((seen(alike) > 0.1) & (seen(alike) < 0.9)).all()
+    # of a normal variable of standard deviation 2, 27 % lie outside of +-2.2: seen in less than 10, more than 90 %
+    outside = (seen(apart) < 0.1) | (seen(apart) > 0.9)
+    assert outside.mean() == pytest.approx(0.27, abs=0.15)
+
+
+def test_ghosts_stay_at_their_places_of_the_world():
+    detector = replace(PERFECT, false_positives=1.0, ghost_share=1.0)
+    wall = np.full((120, 160), 2.0, np.float32)
+    places, classes = [], []
+    for k in range(40):
+        moved = np.eye(4)
+        moved[0, 3] = 0.01 * k  # m, along the wall
+        seen = replace(frame(k), depth=wall, T_world_camera=moved, truth=FrameTruth(np.zeros_like(IDS), {}))
+        found = detector.detect(seen)
+        for mask, row in zip(found.masks, found.class_probabilities, strict=True):
+            u = np.nonzero(mask)[1].mean()
+            places.append((u - CAMERA.cx) * 2.0 / CAMERA.fx + moved[0, 3])
+            classes.append(int(row.argmax()))
+    assert 20 < len(places) < 60
+    _, counts = np.unique(classes, return_counts=True)
+    assert counts.max() > 20, "the first place is chosen whenever there is a ghost"
+    first = np.array(places)[np.array(classes) == np.bincount(classes).argmax()]
+    assert np.ptp(first) < 0.55, "a place is 0.5 m wide, and its visible part has its middle in it"
+    nowhere = detector.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))
+    assert len(nowhere) == len(detector.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {}))))
+
+
+def test_the_scale_of_scores():
+    np.testing.assert_allclose(replace(PERFECT, score_scale=0.5).detect(frame()).scores, 0.5)
+
+
 def test_touching_pairs_are_those_of_the_arithmetic_on_whole_images():
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -284,6 +362,11 @@ def test_no_truth_is_an_error_and_no_objects_are_none():
         {"confusion_concentration": 0.0},
         {"false_positives": -1.0},
         {"false_positive_score": 1.0},
+        {"clutter_rate": 1.1},
+        {"attach_rate": -0.1},
+        {"miss_spread": -1.0},
+        {"score_scale": 0.0},
+        {"ghost_share": 2.0},
     ],
 )
 def test_a_wrong_parameter_is_named(parameters):

@@ -1,0 +1,106 @@
+"""Scenes of rectangles whose counts follow by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, FrameTruth
+from framework.detection.masks import tight_boxes
+from framework.evaluation.detection_faults import DetectionFaults, overlaps
+
+CLASSES = ("chair", "bed")
+SHAPE = (60, 80)
+IDS = np.zeros(SHAPE, np.int32)
+IDS[0:20, 0:20] = 3  # a chair
+IDS[30:60, 0:40] = 4  # a bed
+IDS[0:20, 40:60] = 7  # a thing
+IDS[0:2, 70:72] = 9  # a chair that is too small to count
+TRUTH = FrameTruth(IDS, {3: "chair", 4: "bed", 7: None, 9: "chair"})
+
+
+def block(u: int, v: int, width: int, height: int) -> np.ndarray:
+    mask = np.zeros(SHAPE, np.bool_)
+    mask[v : v + height, u : u + width] = True
+    return mask
+
+
+def detections(*found: tuple[np.ndarray, int, float]) -> Detections:
+    masks = np.array([mask for mask, _, _ in found], np.bool_).reshape(-1, *SHAPE)
+    probabilities = np.full((len(found), 2), 0.1, np.float32)
+    probabilities[np.arange(len(found)), [label for _, label, _ in found]] = 0.9
+    scores = np.array([score for _, _, score in found], np.float32)
+    return Detections(masks, tight_boxes(masks), scores, probabilities, CLASSES)
+
+
+CHAIR, BED = block(0, 0, 20, 20), block(0, 30, 40, 30)
+
+
+def counted(*frames: Detections) -> dict[str, float]:
+    faults = DetectionFaults()
+    for found in frames:
+        faults.add(TRUTH, found)
+    return faults.table()
+
+
+def test_the_truth_has_no_faults() -> None:
+    table = counted(detections((CHAIR, 0, 0.8), (BED, 1, 0.6)))
+    for name in (
+        "found",
+        "found, small",
+        "found, medium",
+        "mask IoU",
+        "share of the mask on the object",
+        "class right",
+    ):
+        assert table[name] == 1, name
+    assert np.isnan(table["found, large"])
+    assert table["false detections an image"] == table["objects in several parts"] == 0
+    assert table["score"] == pytest.approx(0.7)
+    assert table["score, standard deviation"] == pytest.approx(0.1)
+
+
+def test_a_mask_that_takes_in_a_neighbour() -> None:
+    """Of the chair's 400 px 300 are covered by 500: IoU 300 / 600."""
+    table = counted(detections((block(5, 0, 25, 20), 0, 0.8), (BED, 0, 0.6)))
+    assert table["mask IoU"] == pytest.approx((300 / 600 + 1) / 2)
+    assert table["share of the mask on the object"] == pytest.approx((300 / 500 + 1) / 2)
+    assert table["share of the object in the mask"] == pytest.approx((300 / 400 + 1) / 2)
+    assert table["class right"] == 0.5
+
+
+def test_parts_of_an_object_are_no_false_detections() -> None:
+    halves = detections((CHAIR, 0, 0.8), (block(0, 30, 20, 30), 1, 0.7), (block(20, 30, 20, 30), 1, 0.6))
+    table = counted(halves)
+    assert table["objects in several parts"] == 0.5
+    assert table["false detections an image"] == 0
+    assert table["found"] == 1
+
+
+def test_false_detections_on_a_thing_and_on_nothing() -> None:
+    table = counted(detections((block(40, 0, 20, 20), 0, 0.5), (block(50, 40, 10, 10), 1, 0.2)), detections())
+    assert table["false detections an image"] == 1
+    assert table["false detections on one thing"] == 0.5
+    assert table["score of false detections"] == pytest.approx(0.35)
+    assert table["side of false detections (px)"] == pytest.approx((20 + 10) / 2)
+    assert table["found"] == 0
+
+
+def test_what_an_object_has_in_all_frames() -> None:
+    """The chair is always found and once another class; the bed once in eight frames."""
+    frames = [detections((CHAIR, int(k == 3), 0.5), *([(BED, 1, 0.5)] if k == 0 else [])) for k in range(8)]
+    table = counted(*frames)
+    assert table["found"] == pytest.approx(9 / 16)
+    assert table["objects found in < 1/4 of the frames"] == table["objects found in > 3/4 of the frames"] == 0.5
+    assert table["class as in the object's other frames"] == pytest.approx(7 / 8)
+    assert table["class right"] == pytest.approx(8 / 9)
+
+
+def test_overlaps_are_those_of_whole_images() -> None:
+    rng = np.random.default_rng(0)
+    ids = rng.integers(0, 5, SHAPE).astype(np.int32) * 7
+    masks = rng.random((4, *SHAPE)) < 0.3
+    found, shared = overlaps(FrameTruth(ids, {}), masks)
+    assert found.tolist() == [0, 7, 14, 21, 28]
+    np.testing.assert_array_equal(shared[0], [(ids == i).sum() for i in found])
+    np.testing.assert_array_equal(shared[1:], [[(mask & (ids == i)).sum() for i in found] for mask in masks])
