@@ -122,10 +122,11 @@ def test_a_row_may_be_called_by_a_number() -> None:
 def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) -> None:
     """The command's own way of composing a row; the stages that the rows change are built, too."""
     hashes: dict[str, str] = {}
-    paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if experiment.endswith("_replica") else []
+    with_parent = experiment.endswith(("_replica", "_scannet"))
+    paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if with_parent else []
     with initialize_config_dir(str(CONF), version_base="1.3"):
         rows = compose("config", overrides=[f"experiment={experiment}"]).rows
-    for row in list(rows)[:2] if experiment.endswith("_replica") else rows:  # the others are those of the parent
+    for row in list(rows)[:2] if with_parent else rows:  # the others are those of the parent
         config, choices = composed([f"experiment={experiment}", f"row={row}", "seed=1", *paths])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
@@ -180,6 +181,24 @@ def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
 def test_what_is_in_progress_depends_on_how_long_the_sequences_are(sequences: str, stop: int) -> None:
     config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
     assert config.dataset.stop == stop
+
+
+def test_variants_that_are_to_rank_alike_are_the_same_in_all_places() -> None:
+    rows = {}
+    for place in ("rooms", "replica", "scannet"):
+        config, choices = composed([f"experiment=ranks_{place}", "row=ours", "detector=none"])
+        rows[place] = OmegaConf.to_container(config.rows)
+        assert choices["tracker"] == "ground_truth"
+        assert choices["detector"] == "none"
+    assert rows["rooms"] == rows["replica"] == rows["scannet"]
+    assert len(rows["rooms"]) >= 12
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        asked = compose(
+            "config", overrides=["experiment=ranks_scannet", "detector=rf_detr_seg"], return_hydra_config=True
+        )
+        HydraConfig.instance().set_config(asked)
+        assert asked.hydra.sweep.dir.endswith("/ranks_scannet_rf_detr_seg")
+    assert (asked.dataset.share, asked.fuser.voxel_size, asked.hydra.sweeper.params.seed) == (0.85, 0.02, "0,1,2,3")
 
 
 def test_the_command_line_wins_over_the_experiment() -> None:
