@@ -41,7 +41,14 @@ def run(root: Path, row: str, seed: int, value: float | None, iou: float = 0.5, 
     config = {"row": row, "seed": seed, "dataset": {"scene": scene}, "refiner": {"kind": row}}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     metrics = {
-        **{AP50: value, IOU: iou, "pose_source": "ground_truth", "choice.dataset": "d", "choice.detector": "seen"},
+        **{
+            AP50: value,
+            "instances.ap": value,
+            IOU: iou,
+            "pose_source": "ground_truth",
+            "choice.dataset": "d",
+            "choice.detector": "seen",
+        },
         **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
     }
     (directory / "metrics.json").write_text(json.dumps(metrics))
@@ -199,8 +206,8 @@ def test_where_the_numbers_come_from(places: list[Path]) -> None:
         (["rooms", "empty"], [AP50], "there is no complete run below .*empty"),
         (
             ["rooms", "flat"],
-            ["instances.ap5"],
-            r"rooms: no run has a figure instances.ap5; did you mean instances.ap50\?",
+            ["instances.ap51"],
+            r"rooms: no run has a figure instances.ap51; did you mean instances.ap50\?",
         ),
         (["rooms", "flat"], ["zzz"], "rooms: no run has a figure zzz$"),
         (["rooms", "small"], [AP50], "3 rows or more that all folders have, found 2: a, b; c: not in small; d: not in"),
