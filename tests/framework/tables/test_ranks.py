@@ -16,7 +16,7 @@ from scipy.stats import spearmanr
 from framework.errors import DataError
 from framework.records.provenance import config_hash
 from framework.tables.comparison import Comparison
-from framework.tables.ranks import Agreement, Ranking, spearman, write_ranks
+from framework.tables.ranks import Agreement, Ranking, ranks, spearman, write_ranks
 
 AP50, IOU = "instances.ap50", "instances.mean_iou"
 Figures = Mapping[str, Sequence[float | None]]  # by row, one for each seed; None = not defined
@@ -104,6 +104,11 @@ def test_rho_is_scipys_with_ties_too() -> None:
     ]
     np.testing.assert_allclose(spearman(ours, theirs), expected, atol=1e-12)
     assert np.isnan(spearman(np.ones((1, 5)), np.arange(5.0)[None])).all()
+
+
+def test_means_that_differ_by_rounding_alone_share_a_rank() -> None:
+    assert ranks(np.array([0.1 + 0.2, 0.0, 0.3])).tolist() == [1.5, 3, 1.5]
+    assert spearman(np.array([[0.1 + 0.2, 0.0, 0.3]]), np.array([[0.3, 0.0, 0.1 + 0.2]])) == pytest.approx([1])
 
 
 def agreement(places: Sequence[Path]) -> Agreement:
