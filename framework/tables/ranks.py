@@ -276,15 +276,15 @@ def _notes(ranking: Ranking) -> Iterator[str]:
     yield "Rank 1 is the highest; equal rows share the mean of their ranks. Rows are matched by name."
     if OTHERS in ranking.columns:
         yield (
-            f"The others: all places but {ranking.places[0].name}. Each counts as one, so that those in which rows differ"
-            " more say more about the order."
+            f"The others: all places but {ranking.places[0].name}. Each counts as one, so that those in which rows"
+            " differ more say more about the order."
         )
     yield (
         f"{CONFIDENCE:.0%} intervals: percentiles of {SAMPLES} bootstrap samples, seed {SEED}. Over rows: rows are"
         " drawn with replacement, as if others had been tried. Over runs: of each place the sequences, or the seeds"
-        " where there is one sequence, are drawn, the same for all rows: what noise does to the order; of a few runs they"
-        " are too narrow. Rows that have much in common are no independent evidence, and seeds of one place say nothing"
-        " about other places."
+        " where there is one sequence, are drawn, the same for all rows: what noise does to the order; of a few runs"
+        " they are too narrow. Rows that have much in common are no independent evidence, and seeds of one place say"
+        " nothing about other places."
     )
     for place in ranking.places:
         records = place.comparison.records

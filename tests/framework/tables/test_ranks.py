@@ -140,6 +140,9 @@ def test_the_interval_over_runs_is_that_of_the_noise(tmp_path: Path) -> None:
     # a: 0.73, b: 0.6; with the second seed alone, or twice, b is first: rho of 1 2 3 and 2 1 3 is 0.5
     found = agreement([one, noisy])
     assert (found.rho, *found.over_runs) == pytest.approx((1, 0.5, 1))
+    # b is first only where all four that are drawn are the last seed: 1 sample in 256, outside of the interval
+    rare = experiment(tmp_path / "rare", {"a": (0.9, 0.9, 0.9, 0.8), "b": (0.5, 0.5, 0.5, 0.9), "c": (0.1,) * 4})
+    assert agreement([one, rare]).over_runs == (1, 1)
 
 
 def test_the_same_random_numbers_each_time(places: list[Path]) -> None:
