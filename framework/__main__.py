@@ -10,6 +10,7 @@ from pathlib import Path
 
 COMMANDS = {
     "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
+    "ranks": "whether the rows of an experiment rank alike in several places: Spearman's rho",
     "figures": "run records below a folder become the paper's figures",
     "evaluate": "evaluates stored runs anew, without running them again",
     "detect": "writes a video's detections as a COCO result file",
@@ -22,7 +23,13 @@ COMMANDS = {
 }
 """What each does. A command is the module of framework.commands with its name."""
 
-PRINTING = ("tables", "figures", "evaluate", "plugins")  # what others may be reading: `| head` ends them without a word
+PRINTING = (
+    "tables",
+    "ranks",
+    "figures",
+    "evaluate",
+    "plugins",
+)  # what others may be reading: `| head` ends them without a word
 
 HELP = """\
 {program} [COMMAND] ...    instance-oriented semantic 3D mapping from RGB-D video

@@ -19,7 +19,7 @@ UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
     *("hydra", "debug", "resume", "ahead", "detection_cache", "detection_cache_dir"),
     "threads",  # but for networks' last digits: a sweep goes on with another number of jobs at once
-    *("row", "rows", "table", "figure"),  # of an experiment: what its runs are compared for
+    *("row", "rows", "sequences", "table", "figure"),  # of an experiment: what its runs are compared for
 )
 """Keys of the config that change no result."""
 

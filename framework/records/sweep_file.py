@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
 MOST_VALUES = 1000  # of a key; a range may claim any number
@@ -33,14 +35,27 @@ def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str,
 
 def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
     """Those of the experiment's config first: the ones of the command line win."""
-    texts = [f"{key}={value}" for key, value in _below(sweep, "sweeper", "params", dict).items()]
     found = []
-    for text in [*texts, *_below(sweep, "overrides", "task", list)]:
+    for text in [*_params(sweep), *_below(sweep, "overrides", "task", list)]:
         try:
             found.append(OverridesParser.create().parse_override(str(text)))
         except HydraException:  # ${all_of:${rows}}, which is no text of the command line
             continue
     return found
+
+
+def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
+    """What the experiment's config itself asks for, as overrides: ${sequences.all} is what stands there."""
+    params = _below(sweep, "sweeper", "params", dict)
+    others = {key: value for key, value in sweep.items() if key != "hydra"}
+    config = OmegaConf.create({**others, "hydra": {"sweeper": {"params": params}}})
+    assert isinstance(config, DictConfig)
+    node = config.hydra.sweeper.params
+    for key in params:
+        try:
+            yield f"{key}={node[key]}"
+        except OmegaConfBaseException:  # ${hydra:...}, or what is not there
+            continue
 
 
 def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:

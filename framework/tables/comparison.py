@@ -14,10 +14,18 @@ from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
 from framework.parameters import checked_block, checked_rows
 from framework.records.metrics import is_evaluation
-from framework.records.rows import Row, Run, natural, rows_of
+from framework.records.rows import CHOICE, Row, Run, natural, rows_of
 from framework.records.stored_runs import Incomplete, Record, find_records, read_yaml
 from framework.records.sweep_file import SWEEP, asked_runs
-from framework.tables.published import NOTHING_PUBLISHED, Published, read_published
+from framework.tables.published import (
+    DATASET,
+    MADE_UP,
+    NOTHING_PUBLISHED,
+    Key,
+    Published,
+    PublishedRow,
+    read_published,
+)
 
 DEFAULT_CHOICE = CONF / "parts" / "experiment.yaml"
 
@@ -38,7 +46,8 @@ class TableChoice:
     base: str | None = None  # name of the row that the others are compared with; None = the first
     columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `across`, just one
     names: dict[str, str] = field(default_factory=dict)  # what rows are called in the table; others go by their name
-    published: str | None = None  # section of published.yaml, whose numbers stand below; None = none
+    # section of published.yaml, whose numbers stand below where all runs are of the real SceneNN; None = none
+    published: str | None = None
 
     def __post_init__(self) -> None:
         for name in ("over", "columns"):
@@ -150,9 +159,36 @@ class Comparison:
     def records(self) -> list[Record]:
         return [record for row in self.rows for record in row.records.values()]
 
+    @property
+    def is_of_scenenn(self) -> bool:
+        """Whether all runs are of the real SceneNN, as published numbers are, and not of rooms in its format."""
+        datasets = {record.metrics.get(f"{CHOICE}dataset") for record in self.records}
+        return datasets == {DATASET} and not any(record.annotation.startswith(MADE_UP) for record in self.records)
+
     @cached_property
     def published(self) -> Published:
-        return read_published(self.choice.published) if self.choice.published else NOTHING_PUBLISHED
+        if self.choice.published is None or not self.is_of_scenenn:
+            return NOTHING_PUBLISHED
+        return read_published(self.choice.published)
+
+    @property
+    def published_rows(self) -> list[PublishedRow]:
+        """Those of which a number that the table shows is known."""
+        return [row for row in self.published.rows if row.knows(self._keys)]
+
+    @property
+    def published_unknown(self) -> list[PublishedRow]:
+        """Those of which no number that the table shows is known, as nobody has looked them up."""
+        return [row for row in self.published.rows if not row.knows(self._keys) and row.leaves_open(self._keys)]
+
+    @property
+    def _keys(self) -> list[Key]:
+        """What the table shows, as published numbers are listed."""
+        if self.choice.across:
+            return [(sequence,) for sequence in self.sequences]
+        if self.choice.by:
+            return [(sequence, key) for sequence in self.sequences for key in self.choice.columns]
+        return [(key,) for key in self.choice.columns]
 
     @cached_property
     def sequences(self) -> list[str]:

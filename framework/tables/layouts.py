@@ -60,7 +60,7 @@ def row_grid(comparison: Comparison) -> Grid:
         ]
         for k, row in enumerate(rows)
     ]
-    for published in comparison.published.rows:
+    for published in comparison.published_rows:
         cells = [
             published_cell(published, (key,), column.decimals)
             for key, column in zip(comparison.choice.columns, columns, strict=True)
@@ -114,9 +114,7 @@ def published_name(published: PublishedRow) -> str:
 
 def published_cell(published: PublishedRow, key: Key, digits: int) -> str:
     """The number in a cell; told apart: what nobody has looked up, and what the source does not have."""
-    if published.values is None:
-        return NOT_KNOWN
-    value = published.values.get(key, math.nan)
+    value = (published.values or {}).get(key, math.nan)
     if value is None:
         return NOT_KNOWN
     return NOTHING if math.isnan(value) else figure(value, math.nan, min(digits, published.decimals))

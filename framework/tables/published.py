@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,6 +13,8 @@ import yaml
 from framework.errors import ConfigError
 
 FILE = Path(__file__).with_suffix(".yaml")
+DATASET = "scenenn"  # what the numbers were measured on
+MADE_UP = "synthetic"  # begins the release of rooms that `python -m framework synthesize` writes in its format
 NOT_KNOWN = "not known"  # what tables print for what nobody has looked up
 
 Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"): what a number stands for in its table
@@ -30,9 +32,13 @@ class PublishedRow:
     decimals: int  # of the values, in our unit
     values: Mapping[Key, float | None] | None  # in our unit; None = nobody has looked it up, or none of all
 
-    def has(self, sequence: str) -> bool:
-        """Whether the source has numbers of this sequence."""
-        return any(key[0] == sequence for key in self.values or ())
+    def knows(self, keys: Iterable[Key]) -> bool:
+        """Whether the number of one of `keys`, or more, is known."""
+        return any((self.values or {}).get(key) is not None for key in keys)
+
+    def leaves_open(self, keys: Iterable[Key]) -> bool:
+        """Whether the source may have a number of one of `keys`, and nobody has looked it up."""
+        return self.values is None or any(key in self.values and self.values[key] is None for key in keys)
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from framework.records.rows import Mean, Row
 from framework.tables.comparison import Comparison
 from framework.tables.grid import Grid, decimals, figure
 from framework.tables.layouts import NOTHING, head, published_cell, published_name
-from framework.tables.published import NOT_KNOWN, PublishedRow
+from framework.tables.published import PublishedRow
 from framework.tables.sequences import SequenceMean, mean_by_sequence, mean_difference, mean_over_sequences
 
 MISSING = "missing"  # a figure that a run would have, of which there is no complete record
@@ -55,10 +55,10 @@ def across_grid(comparison: Comparison) -> Grid:
             _published_labels(comparison, one),
             [
                 *(published_cell(one, (sequence,), digits) for sequence in sequences),
-                NOT_KNOWN if one.values is None else NOTHING,  # a mean that nobody has published
+                NOTHING,  # a mean that nobody has published
             ],
         )
-        for one in comparison.published.rows
+        for one in comparison.published_rows
     ]
     return _grid([*_label_heads(comparison, "system"), *sequences, "mean"], [*sections, published], digits)
 
@@ -84,8 +84,8 @@ def by_grid(comparison: Comparison) -> Grid:
             for row in (rows if sequence in begun else ())
         ] + [
             _Line(_published_labels(comparison, one), [published_cell(one, (sequence, key), digits) for key in keys])
-            for one in comparison.published.rows
-            if one.has(sequence)
+            for one in comparison.published_rows
+            if one.knows((sequence, key) for key in keys)
         ]
     sections["mean"] = [
         _Line(
@@ -95,10 +95,6 @@ def by_grid(comparison: Comparison) -> Grid:
             [_comparable_mean(row, rows, overall[key]) for key in keys],
         )
         for row in rows
-    ] + [
-        _Line(_published_labels(comparison, one), [NOT_KNOWN] * len(keys))
-        for one in comparison.published.rows
-        if one.values is None
     ]
     titled = [
         [replace(line, labels=[title if k == 0 else "", *line.labels]) for k, line in enumerate(section)]

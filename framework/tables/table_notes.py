@@ -94,11 +94,11 @@ def _protocol(comparison: Comparison) -> Iterator[str]:
 
 
 def _published(comparison: Comparison) -> Iterator[str]:
-    rows = comparison.published.rows
-    for row in rows:
-        if row.values is not None:
-            yield f"Published, {row.system}: {row.source}{f'; {row.remark}' if row.remark else ''}."
-    if unknown := [f"{row.system} ({row.source})" for row in rows if row.values is None]:
+    if comparison.choice.published and not comparison.is_of_scenenn:
+        yield "Published numbers are of the real SceneNN (sequences=scenenn): none stand below figures of other data."
+    for row in comparison.published_rows:
+        yield f"Published, {row.system}: {row.source}{f'; {row.remark}' if row.remark else ''}."
+    if unknown := [f"{row.system} ({row.source})" for row in comparison.published_unknown]:
         yield f"Published, but nobody has looked the numbers up: {'; '.join(unknown)}."
 
 

@@ -21,6 +21,7 @@ from framework.files.search_paths import CONF
 from framework.interfaces import ClusterRefiner, MapFuser
 from framework.records.provenance import config_hash
 from framework.registry import build
+from framework.tables.published import read_published
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 FAKES = CHECKOUT / "tests" / "fake_conf"
@@ -121,10 +122,11 @@ def test_a_row_may_be_called_by_a_number() -> None:
 def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) -> None:
     """The command's own way of composing a row; the stages that the rows change are built, too."""
     hashes: dict[str, str] = {}
-    paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if experiment.endswith("_replica") else []
+    with_parent = experiment.endswith(("_replica", "_scannet"))
+    paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if with_parent else []
     with initialize_config_dir(str(CONF), version_base="1.3"):
         rows = compose("config", overrides=[f"experiment={experiment}"]).rows
-    for row in list(rows)[:2] if experiment.endswith("_replica") else rows:  # the others are those of the parent
+    for row in list(rows)[:2] if with_parent else rows:  # the others are those of the parent
         config, choices = composed([f"experiment={experiment}", f"row={row}", "seed=1", *paths])
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
@@ -151,6 +153,54 @@ def test_the_recorded_flat_wins_over_the_rooms() -> None:
     assert config.fuser.storage == "EXACT"
 
 
+@pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
+def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
+    """A network that knows real pictures, no rendered truth, the paper's sequences, and a folder of its own."""
+    overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        asked = compose("config", overrides=overrides, return_hydra_config=True)
+        HydraConfig.instance().set_config(asked)
+        assert asked.hydra.sweep.dir.endswith(f"/{experiment}_scenenn")
+    assert asked.hydra.runtime.choices.detector == "mask_rcnn"
+    assert asked.dataset.frame_truth is False
+    sequences = asked.hydra.sweeper.params["dataset.scene"].split(",")
+    assert set(sequences) <= set(read_published("table3").sequences)
+    assert len(sequences) == (5 if experiment in ("table1_runtime", "figure3_stage_times") else 10)
+
+
+@pytest.mark.parametrize("experiment", ["table3_map", "figure4_progress", "figure5_refinement", "ablation_overlap"])
+def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
+    assert (config.hydra.runtime.choices.detector, config.dataset.frame_truth) == ("simulated", True)
+    assert not set(config.sequences.all.split(",")) & set(read_published("table3").sequences)
+    assert set(config.hydra.sweeper.params["dataset.scene"].split(",")) <= set(config.sequences.all.split(","))
+
+
+@pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 80), ("scenenn", 1000)])
+def test_what_is_in_progress_depends_on_how_long_the_sequences_are(sequences: str, stop: int) -> None:
+    config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
+    assert config.dataset.stop == stop
+
+
+def test_variants_that_are_to_rank_alike_are_the_same_in_all_places() -> None:
+    rows = {}
+    for place in ("rooms", "replica", "scannet"):
+        config, choices = composed([f"experiment=ranks_{place}", "row=ours", "detector=none"])
+        rows[place] = OmegaConf.to_container(config.rows)
+        assert choices["tracker"] == "ground_truth"
+        assert choices["detector"] == "none"
+    assert rows["rooms"] == rows["replica"] == rows["scannet"]
+    assert len(rows["rooms"]) >= 12
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        asked = compose(
+            "config", overrides=["experiment=ranks_scannet", "detector=rf_detr_seg"], return_hydra_config=True
+        )
+        HydraConfig.instance().set_config(asked)
+        assert asked.hydra.sweep.dir.endswith("/ranks_scannet_rf_detr_seg")
+    assert (asked.dataset.share, asked.fuser.voxel_size, asked.hydra.sweeper.params.seed) == (0.85, 0.02, "0,1,2,3")
+
+
 def test_the_command_line_wins_over_the_experiment() -> None:
     config, _ = composed(["experiment=ablation_fuser", "row=label_count", "fuser.voxel_size=0.04", "tracker=icp_only"])
     assert config.fuser.voxel_size == 0.04
@@ -175,5 +225,12 @@ def test_a_run_without_experiment_is_left_alone() -> None:
 
 
 def test_what_an_experiment_compares_its_runs_for_changes_no_result() -> None:
-    told = {"row": "a", "rows": {"a": []}, "resume": True, "table": {"over": ["seed"]}, "figure": {"zoom": True}}
+    told = {
+        "row": "a",
+        "rows": {"a": []},
+        "sequences": {"all": "b"},
+        "resume": True,
+        "table": {"over": ["seed"]},
+        "figure": {"zoom": True},
+    }
     assert config_hash({"seed": 1}) == config_hash({"seed": 1} | told)

@@ -19,6 +19,11 @@ def test_the_command_line_wins_over_the_experiment() -> None:
     assert asked_runs(asked, ["seed", "dataset.scene"]) == expected
 
 
+def test_the_sequences_are_those_that_the_experiment_names() -> None:
+    asked = {"sequences": {"all": "a,b"}} | sweep({"dataset.scene": "${sequences.all}", "seed": 0, "x": "${y}"}, [])
+    assert asked_runs(asked, ["seed", "dataset.scene"]) == [("0", "a"), ("0", "b")]
+
+
 @pytest.mark.parametrize(
     ("override", "values"),
     [

@@ -1,0 +1,300 @@
+"""How alike the rows of an experiment rank in several places: their means and ranks, and Spearman's rho."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from difflib import get_close_matches
+from functools import cached_property
+from itertools import combinations
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Float64
+from framework.errors import DataError
+from framework.files.whole_files import written_whole
+from framework.records.rows import CHOICE, CONFIDENCE, Row, Run
+from framework.tables.comparison import Comparison
+from framework.tables.grid import Grid, decimals, figure, markdown_grid
+from framework.tables.layouts import NOTHING, head
+from framework.tables.sequences import mean_by_sequence
+from framework.tables.table_notes import counted, digest
+
+FEWEST = 3  # rows: two are in the same order or in the other one, by chance as likely as not
+SAMPLES = 2000  # of a bootstrap
+SEED = 0  # of its random numbers, anew for each pair of places
+DIGITS = 9  # decimals in which means must agree to share a rank
+OTHERS = "mean of the others"
+
+
+@dataclass(frozen=True)
+class Place:
+    """An experiment folder, with the rows that all places have."""
+
+    name: str  # of the folder
+    comparison: Comparison
+    values: Float64  # (R, S) a figure of each row in each sequence, or with each seed; all rows have the same
+    runs: int  # of each row, of which S sequences are the means
+    left_out: int  # runs that not every row has
+
+    @property
+    def means(self) -> Float64:
+        """(R,) of each row; every sequence counts as one."""
+        return np.asarray(self.values.mean(axis=1), np.float64)
+
+    def drawn_means(self, rng: np.random.Generator) -> Float64:
+        """(SAMPLES, R) means of as many sequences, drawn with replacement, the same ones for all rows."""
+        drawn = rng.integers(self.values.shape[1], size=(SAMPLES, self.values.shape[1]))
+        return np.asarray(self.values[:, drawn].mean(axis=2).T, np.float64)
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Spearman's rank correlation of the rows in two places; NaN = not defined, as where all rows are equal."""
+
+    rho: float
+    over_rows: tuple[float, float]  # 95 % of the bootstrap over rows: were they others of this kind
+    over_runs: tuple[float, float]  # and over the runs of each place: were they others; NaN where a place has but one
+
+    @classmethod
+    def of(cls, first: Place, others: Sequence[Place]) -> Agreement:
+        """Of a place and the mean of others; of two places where there is one other."""
+        ours, theirs = first.means, _mean([place.means for place in others])
+        rng = np.random.default_rng(SEED)
+        drawn = rng.integers(len(ours), size=(SAMPLES, len(ours)))
+        over_rows = _interval(spearman(ours[drawn], theirs[drawn]))
+        over_runs = (math.nan, math.nan)
+        if all(place.values.shape[1] > 1 for place in (first, *others)):
+            over_runs = _interval(spearman(first.drawn_means(rng), _mean([place.drawn_means(rng) for place in others])))
+        return cls(float(spearman(ours[None], theirs[None])[0]), over_rows, over_runs)
+
+
+@dataclass(frozen=True)
+class Ranking:
+    """One figure of the rows that all places have."""
+
+    key: str  # of metrics.json
+    rows: list[str]  # by name, the highest in the first place first
+    places: list[Place]
+    absent: dict[str, list[str]]  # rows that are left out, by name: the places that do not have them
+
+    @classmethod
+    def of(cls, key: str, comparisons: Sequence[Comparison]) -> Ranking:
+        """Raises DataError where a folder has no such figure, or where there is too little in common."""
+        names = _names(comparisons)
+        found = [{row.name: row for row in one.rows if row.values(key)} for one in comparisons]
+        for comparison, rows in zip(comparisons, found, strict=True):
+            if not rows:
+                raise DataError(_unknown(key, comparison))
+        everywhere = dict.fromkeys(row for rows in found for row in rows)
+        absent = {
+            row: missing
+            for row in everywhere
+            if (missing := [name for name, rows in zip(names, found, strict=True) if row not in rows])
+        }
+        common = [row for row in everywhere if row not in absent]
+        if len(common) < FEWEST:
+            raise DataError(
+                f"{key}: ranks need {FEWEST} rows or more that all folders have, found {len(common)}: "
+                f"{', '.join(common) or 'none'}; {_listed(absent)}"
+            )
+        places = [
+            _place(name, comparison, [rows[row] for row in common], key)
+            for name, comparison, rows in zip(names, comparisons, found, strict=True)
+        ]
+        order = np.argsort(-places[0].means, kind="stable")
+        ordered = [replace(place, values=place.values[order]) for place in places]
+        return cls(key, [common[k] for k in order], ordered, absent)
+
+    @cached_property
+    def columns(self) -> dict[str, Float64]:
+        """The rows' means by place, and where there are several others those of all places but the first."""
+        columns = {place.name: place.means for place in self.places}
+        if len(self.places) > 2:
+            columns[OTHERS] = _mean([place.means for place in self.places[1:]])
+        return columns
+
+    def agreements(self) -> Iterator[tuple[str, Agreement]]:
+        """Of each pair of places, and of the first with the mean of the others."""
+        for one, other in combinations(self.places, 2):
+            yield f"{one.name}, {other.name}", Agreement.of(one, [other])
+        if OTHERS in self.columns:
+            yield f"{self.places[0].name}, {OTHERS}", Agreement.of(self.places[0], self.places[1:])
+
+
+def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | None) -> str:
+    """Compares the experiments in `directories` by each of the figures, and returns the Markdown.
+
+    Where `out` is a folder, ranks.md and ranks.csv are written into it. Raises DataError when there is nothing to
+    compare.
+    """
+    if len(directories) < 2:
+        raise DataError(f"ranks compares two folders or more, found {len(directories)}")
+    if len({directory.resolve() for directory in directories}) < len(directories):
+        raise DataError(f"ranks compares different folders, found one twice: {', '.join(map(str, directories))}")
+    comparisons = [Comparison.below(directory) for directory in directories]
+    rankings = [Ranking.of(key, comparisons) for key in keys]
+    text = markdown(rankings)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, content in (("ranks.md", text), ("ranks.csv", comma_separated(rankings))):
+            with written_whole(out / name) as temporary:
+                temporary.write_text(content, "utf-8")
+    return text
+
+
+def markdown(rankings: Sequence[Ranking]) -> str:
+    parts = ["# Ranks"]
+    for ranking in rankings:
+        parts += [f"## {head(ranking.key)}", markdown_grid(rank_grid(ranking)), markdown_grid(agreement_grid(ranking))]
+        parts.append("\n".join(f"- {' '.join(note.split())}" for note in _notes_of(ranking)))
+    parts.append("\n".join(f"- {' '.join(note.split())}" for note in _notes(rankings[0])))
+    return "\n\n".join(parts) + "\n"
+
+
+def rank_grid(ranking: Ranking) -> Grid:
+    """A line a row: its mean and its rank in each place."""
+    columns = [(means, ranks(means)) for means in ranking.columns.values()]
+    digits = decimals(float(value) for means, _ in columns for value in means)
+    body = [
+        [
+            row,
+            *(text for means, rank in columns for text in (figure(float(means[k]), math.nan, digits), f"{rank[k]:g}")),
+        ]
+        for k, row in enumerate(ranking.rows)
+    ]
+    return Grid(["row", *(text for name in ranking.columns for text in (name, "rank"))], body)
+
+
+def agreement_grid(ranking: Ranking) -> Grid:
+    """A line a pair of places."""
+    share = f"{CONFIDENCE:.0%}"
+    body = [
+        [pair, str(len(ranking.rows)), _signed(one.rho), _between(one.over_rows), _between(one.over_runs)]
+        for pair, one in ranking.agreements()
+    ]
+    return Grid(["Spearman's rho of", "rows", "rho", f"{share} over rows", f"{share} over runs"], body)
+
+
+def comma_separated(rankings: Sequence[Ranking]) -> str:
+    """One line a figure, row and place, all digits, for pandas."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["figure", "row", "place", "mean", "rank"])
+    for ranking in rankings:
+        for place, means in ranking.columns.items():
+            for row, mean, rank in zip(ranking.rows, means, ranks(means), strict=True):
+                writer.writerow([ranking.key, row, place, repr(float(mean)), f"{rank:g}"])
+    return text.getvalue()
+
+
+def ranks(means: Float64) -> Float64:
+    """(R,) 1 = the highest; rows that are equal share the mean of their ranks."""
+    from scipy.stats import rankdata
+
+    return np.asarray(rankdata(-means.round(DIGITS)), np.float64)
+
+
+def spearman(ours: Float64, theirs: Float64) -> Float64:
+    """(N,) Spearman's rho of each line of two (N, R) samples: Pearson's correlation of the ranks, ties sharing theirs.
+
+    NaN where all of a line are equal.
+    """
+    from scipy.stats import rankdata
+
+    x, y = (rankdata(values.round(DIGITS), axis=1) for values in (ours, theirs))
+    x, y = (rank - rank.mean(axis=1, keepdims=True) for rank in (x, y))
+    with np.errstate(invalid="ignore"):
+        return np.asarray((x * y).sum(axis=1) / np.sqrt((x**2).sum(axis=1) * (y**2).sum(axis=1)), np.float64)
+
+
+def _interval(samples: Float64) -> tuple[float, float]:
+    """The middle of what the samples are, in which CONFIDENCE of them lie; those that are not defined do not count."""
+    defined = samples[~np.isnan(samples)]
+    if not len(defined):
+        return math.nan, math.nan
+    low, high = np.quantile(defined, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    return float(low), float(high)
+
+
+def _mean(values: Sequence[Float64]) -> Float64:
+    return np.asarray(np.mean(values, axis=0), np.float64)
+
+
+def _place(name: str, comparison: Comparison, rows: Sequence[Row], key: str) -> Place:
+    """Of the runs that every row has: another seed or sequence may be harder."""
+    values = [row.values(key) for row in rows]
+    shared: set[Run] = set(values[0]).intersection(*values)
+    if not shared:
+        raise DataError(f"{comparison.root}: there is no run in which all rows have {key}; run what its table misses")
+    by_row = [mean_by_sequence({run: of_row[run] for run in sorted(shared)}) for of_row in values]
+    sequences = sorted({run[-1] for run in shared})
+    matrix = np.array([[means[sequence].value for sequence in sequences] for means in by_row], np.float64)
+    return Place(name, comparison, matrix, len(shared), len(set().union(*values)) - len(shared))
+
+
+def _names(comparisons: Sequence[Comparison]) -> list[str]:
+    """What the folders are called; by their path where two have the same name."""
+    titles = [one.title for one in comparisons]
+    return [one.title if titles.count(one.title) == 1 else str(one.root) for one in comparisons]
+
+
+def _unknown(key: str, comparison: Comparison) -> str:
+    known = sorted({name for row in comparison.rows for one in row.records.values() for name in one.metrics})
+    close = get_close_matches(key, known, n=1)
+    suggestion = f"; did you mean {close[0]}?" if close and close[0] != key else ""
+    return f"{comparison.root}: no run has a figure {key}{suggestion}"
+
+
+def _listed(absent: dict[str, list[str]]) -> str:
+    return "; ".join(f"{row}: not in {', '.join(places)}" for row, places in absent.items()) or "no folder has others"
+
+
+def _signed(value: float) -> str:
+    return NOTHING if math.isnan(value) else figure(value, math.nan, 2, signed=True)
+
+
+def _between(interval: tuple[float, float]) -> str:
+    return NOTHING if math.isnan(interval[0]) else f"{_signed(interval[0])} to {_signed(interval[1])}"
+
+
+def _notes_of(ranking: Ranking) -> Iterator[str]:
+    """What is true of one figure alone."""
+    counts = ", ".join(f"{place.name} {place.runs}" for place in ranking.places)
+    yield f"Runs of each row: {counts}."
+    if ranking.absent:
+        yield f"Left out, rows that not all have: {_listed(ranking.absent)}."
+    if dropped := [f"{place.name} {place.left_out}" for place in ranking.places if place.left_out]:
+        yield f"Left out, runs in which not every row has this figure: {', '.join(dropped)}."
+
+
+def _notes(ranking: Ranking) -> Iterator[str]:
+    yield "Rank 1 is the highest; equal rows share the mean of their ranks. Rows are matched by name."
+    if OTHERS in ranking.columns:
+        yield (
+            f"The others: all places but {ranking.places[0].name}. Each counts as one, so that those in which rows"
+            " differ more say more about the order."
+        )
+    yield (
+        f"{CONFIDENCE:.0%} intervals: percentiles of {SAMPLES} bootstrap samples, seed {SEED}. Over rows: rows are"
+        " drawn with replacement, as if others had been tried. Over runs: of each place the sequences, or the seeds"
+        " where there is one sequence, are drawn, the same for all rows: what noise does to the order; of a few runs"
+        " they are too narrow. Rows that have much in common are no independent evidence, and seeds of one place say"
+        " nothing about other places."
+    )
+    for place in ranking.places:
+        records = place.comparison.records
+        chosen = ", ".join(
+            f"{stage}={counted(str(record.metrics.get(f'{CHOICE}{stage}')) for record in records)}"
+            for stage in ("dataset", "detector")
+        )
+        annotation = counted(record.annotation or "not named" for record in records)
+        code = counted(record.code for record in records)
+        yield (
+            f"{place.name}: {chosen}, poses {counted(row.poses for row in place.comparison.rows)}; annotation: "
+            f"{annotation}; code {code}; SHA-256 of all configs: {digest(records)}."
+        )

@@ -1,0 +1,232 @@
+"""Ranks in several places, against values computed by hand and against scipy's own rank correlation."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from scipy.stats import spearmanr
+
+from framework.errors import DataError
+from framework.records.provenance import config_hash
+from framework.tables.comparison import Comparison
+from framework.tables.ranks import Agreement, Ranking, ranks, spearman, write_ranks
+
+AP50, IOU = "instances.ap50", "instances.mean_iou"
+Figures = Mapping[str, Sequence[float | None]]  # by row, one for each seed; None = not defined
+
+
+def experiment(root: Path, figures: Figures, iou: float = 0.5, scenes: Sequence[str] = ()) -> Path:
+    """The records of a folder; with `scenes`, a figure is that of a scene, and all are of seed 0."""
+    root.mkdir(parents=True)
+    rows = {row: [f"refiner={row}"] for row in figures}
+    over = ["seed", "dataset.scene"] if scenes else ["seed"]
+    table = {"over": over, "columns": [AP50]}
+    (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": rows})))
+    for row, values in figures.items():
+        for k, value in enumerate(values):
+            run(root, row, 0 if scenes else k, value, iou, scenes[k] if scenes else "")
+    return root
+
+
+def run(root: Path, row: str, seed: int, value: float | None, iou: float = 0.5, scene: str = "") -> None:
+    directory = root / f"row={row},seed={seed},{scene}"
+    directory.mkdir()
+    config = {"row": row, "seed": seed, "dataset": {"scene": scene}, "refiner": {"kind": row}}
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    metrics = {
+        **{
+            AP50: value,
+            "instances.ap": value,
+            IOU: iou,
+            "pose_source": "ground_truth",
+            "choice.dataset": "d",
+            "choice.detector": "seen",
+        },
+        **{"config_hash": config_hash(config), "git_commit": "1234567890", "git_dirty": False},
+    }
+    (directory / "metrics.json").write_text(json.dumps(metrics))
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> list[Path]:
+    """Four rows. The order is a, b, c, d in the rooms, b, a, c = d in the flat, d, c, b, a in the hall."""
+    return [
+        experiment(tmp_path / "rooms", {"a": (0.9, 0.7), "b": (0.7, 0.7), "c": (0.5, 0.3), "d": (0.1, 0.1)}),
+        experiment(tmp_path / "flat", {"d": (0.2,), "c": (0.2,), "b": (0.6,), "a": (0.5,)}),
+        experiment(tmp_path / "hall", {"a": (0.1, 0.1), "b": (0.3, 0.3), "c": (0.4, 0.4), "d": (0.9, 0.7)}),
+    ]
+
+
+def lines_of(text: str) -> list[str]:
+    return [" ".join(line.split()) for line in text.splitlines()]
+
+
+def test_means_and_ranks_by_hand(places: list[Path]) -> None:
+    lines = lines_of(write_ranks(places, [AP50], None))
+    assert "| row | rooms | rank | flat | rank | hall | rank | mean of the others | rank |" in lines
+    first = lines.index("| a | 0.800 | 1 | 0.500 | 2 | 0.100 | 4 | 0.300 | 3.5 |")
+    assert lines[first + 1 : first + 4] == [
+        "| b | 0.700 | 2 | 0.600 | 1 | 0.300 | 3 | 0.450 | 2 |",
+        "| c | 0.400 | 3 | 0.200 | 3.5 | 0.400 | 2 | 0.300 | 3.5 |",
+        "| d | 0.100 | 4 | 0.200 | 3.5 | 0.800 | 1 | 0.500 | 1 |",
+    ]
+    assert "- Runs of each row: rooms 2, flat 1, hall 2." in lines
+
+
+def test_rho_by_hand(places: list[Path]) -> None:
+    """With ranks 1 2 3 4 and 2 1 3.5 3.5, from their mean: -1.5 -0.5 0.5 1.5 and -0.5 -1.5 1 1; 3.5 / sqrt(5 * 4.5)."""
+    lines = lines_of(write_ranks(places, [AP50], None))
+    rhos = {line.split(" | ")[0]: line.split(" | ")[1:3] for line in lines if ", " in line and line.startswith("|")}
+    expected = {"rooms, flat": 3.5 / math.sqrt(22.5), "rooms, hall": -1.0, "flat, hall": -3.5 / math.sqrt(22.5)}
+    # 1 2 3 4 and 3.5 2 3.5 1: -1.5 -0.5 0.5 1.5 and 1 -0.5 1 -1.5
+    expected["rooms, mean of the others"] = -3 / math.sqrt(5 * 4.5)
+    assert rhos == {f"| {pair}": ["4", f"{rho:+.2f}"] for pair, rho in expected.items()}
+
+
+def test_two_places_have_no_mean_of_others(places: list[Path]) -> None:
+    text = write_ranks(places[:2], [AP50], None)
+    assert "the others" not in text
+    assert text.count("| rooms, flat ") == 1
+
+
+def test_rho_is_scipys_with_ties_too() -> None:
+    rng = np.random.default_rng(0)
+    ours, theirs = rng.integers(0, 4, (200, 7)).astype(float), rng.integers(0, 4, (200, 7)) / 3
+    expected = [
+        spearmanr(a, b).statistic if np.ptp(a) and np.ptp(b) else math.nan for a, b in zip(ours, theirs, strict=True)
+    ]
+    np.testing.assert_allclose(spearman(ours, theirs), expected, atol=1e-12)
+    assert np.isnan(spearman(np.ones((1, 5)), np.arange(5.0)[None])).all()
+
+
+def test_means_that_differ_by_rounding_alone_share_a_rank() -> None:
+    assert ranks(np.array([0.1 + 0.2, 0.0, 0.3])).tolist() == [1.5, 3, 1.5]
+    assert spearman(np.array([[0.1 + 0.2, 0.0, 0.3]]), np.array([[0.3, 0.0, 0.1 + 0.2]])) == pytest.approx([1])
+
+
+def agreement(places: Sequence[Path]) -> Agreement:
+    [(_, found), *_] = Ranking.of(AP50, [Comparison.below(place) for place in places]).agreements()
+    return found
+
+
+def test_the_interval_over_rows_is_that_of_rows_drawn_with_replacement(tmp_path: Path) -> None:
+    rng = np.random.default_rng(3)
+    ours = rng.random(12)
+    theirs = ours + rng.normal(0, 0.2, 12)
+    one = experiment(tmp_path / "one", {f"r{k}": (float(v),) for k, v in enumerate(ours)})
+    other = experiment(tmp_path / "other", {f"r{k}": (float(v),) for k, v in enumerate(theirs)})
+    found = agreement([one, other])
+    assert found.rho == pytest.approx(spearmanr(ours, theirs).statistic)
+    drawn = [rng.integers(12, size=12) for _ in range(4000)]
+    low, high = np.quantile([spearmanr(ours[k], theirs[k]).statistic for k in drawn], [0.025, 0.975])
+    assert found.over_rows == pytest.approx((low, high), abs=0.05)
+    assert found.over_rows[0] < found.rho < found.over_rows[1]
+    assert np.isnan(found.over_runs).all(), "one run does not say what another would be"
+
+
+def test_the_interval_over_runs_is_that_of_the_noise(tmp_path: Path) -> None:
+    """Rows that no seed exchanges keep their order; two that each seed exchanges do not."""
+    steady = {"a": (0.9, 0.8, 0.9), "b": (0.5, 0.4, 0.5), "c": (0.1, 0.2, 0.1)}
+    one, same = experiment(tmp_path / "one", steady), experiment(tmp_path / "same", steady)
+    assert agreement([one, same]).over_runs == (1, 1)
+    noisy = experiment(tmp_path / "noisy", {"a": (0.9, 0.4, 0.9), "b": (0.5, 0.8, 0.5), "c": (0.1, 0.2, 0.1)})
+    # a: 0.73, b: 0.6; with the second seed alone, or twice, b is first: rho of 1 2 3 and 2 1 3 is 0.5
+    found = agreement([one, noisy])
+    assert (found.rho, *found.over_runs) == pytest.approx((1, 0.5, 1))
+    # b is first only where all four that are drawn are the last seed: 1 sample in 256, outside of the interval
+    rare = experiment(tmp_path / "rare", {"a": (0.9, 0.9, 0.9, 0.8), "b": (0.5, 0.5, 0.5, 0.9), "c": (0.1,) * 4})
+    assert agreement([one, rare]).over_runs == (1, 1)
+
+
+def test_the_same_random_numbers_each_time(places: list[Path]) -> None:
+    alone, with_another = agreement(places[::2]), agreement([places[0], places[2], places[1]])
+    assert alone == with_another
+    assert write_ranks(places, [AP50], None) == write_ranks(places, [AP50], None)
+
+
+def test_seeds_of_a_scene_are_drawn_together(tmp_path: Path) -> None:
+    """One scene twice as often run counts as one: 0.9, 0.9 and 0.3 are 0.6 and not 0.7."""
+    figures = {"a": (0.9, 0.3), "b": (0.5, 0.5), "c": (0.1, 0.1)}
+    one = experiment(tmp_path / "one", figures, scenes=("x", "y"))
+    other = experiment(tmp_path / "other", figures, scenes=("x", "y"))
+    for row, values in figures.items():
+        run(one, row, 1, values[0], scene="x")
+    lines = lines_of(write_ranks([one, other], [AP50], None))
+    assert "| a | 0.600 | 1 | 0.600 | 1 |" in lines
+    assert "- Runs of each row: one 3, other 2." in lines
+
+
+def test_only_runs_that_all_rows_have_are_compared(tmp_path: Path) -> None:
+    """c has no figure with the hard seed, in which all others are worse: it is no better for that."""
+    one = experiment(tmp_path / "one", {"a": (0.9, 0.3), "b": (0.8, 0.2), "c": (0.7, None), "d": (0.6, 0.1)})
+    other = experiment(tmp_path / "other", {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)})
+    lines = lines_of(write_ranks([one, other], [AP50], None))
+    assert "| c | 0.700 | 3 | 0.700 | 3 |" in lines
+    assert "| a | 0.900 | 1 | 0.900 | 1 |" in lines
+    assert "- Left out, runs in which not every row has this figure: one 1." in lines
+
+
+def test_folders_of_one_name_are_told_apart(tmp_path: Path) -> None:
+    roots = [experiment(tmp_path / k / "ranks", {"a": (0.9,), "b": (0.8,), "c": (0.7,)}) for k in "xy"]
+    assert f"| row | {roots[0]} | rank | {roots[1]} | rank |" in lines_of(write_ranks(roots, [AP50], None))
+
+
+def test_rows_of_one_place_alone_are_named(places: list[Path]) -> None:
+    run(places[1], "e", 0, 0.7)
+    text = write_ranks(places, [AP50], None)
+    assert "- Left out, rows that not all have: e: not in rooms, hall." in text
+    assert "| e " not in text
+
+
+def test_several_figures_and_the_files(places: list[Path], tmp_path: Path) -> None:
+    out = tmp_path / "new" / "folder"
+    text = write_ranks(places, [AP50, IOU], out)
+    assert (out / "ranks.md").read_text() == text
+    assert text.count("\n## ") == 2
+    assert "| rooms, flat | 4 | – | – | – |" in lines_of(text), "rows that are all equal have no order"
+    with (out / "ranks.csv").open() as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 2 * 4 * 4
+    [line] = [x for x in lines if (x["figure"], x["row"], x["place"]) == (AP50, "c", "flat")]
+    assert (float(line["mean"]), line["rank"]) == (0.2, "3.5")
+    [line] = [x for x in lines if (x["figure"], x["row"], x["place"]) == (AP50, "b", "mean of the others")]
+    assert (float(line["mean"]), line["rank"]) == (pytest.approx(0.45), "2")
+
+
+def test_where_the_numbers_come_from(places: list[Path]) -> None:
+    [line] = [line for line in lines_of(write_ranks(places, [AP50], None)) if line.startswith("- flat: ")]
+    assert "dataset=d, detector=seen, poses ground truth; annotation: not named; code 1234567; SHA-256" in line
+
+
+@pytest.mark.parametrize(
+    ("asked", "keys", "said"),
+    [
+        (["rooms"], [AP50], "ranks compares two folders or more, found 1"),
+        (["rooms", "rooms/../rooms"], [AP50], "different folders, found one twice"),
+        (["rooms", "nowhere"], [AP50], "nowhere is not a folder with records of runs"),
+        (["rooms", "empty"], [AP50], "there is no complete run below .*empty"),
+        (
+            ["rooms", "flat"],
+            ["instances.ap51"],
+            r"rooms: no run has a figure instances.ap51; did you mean instances.ap50\?",
+        ),
+        (["rooms", "flat"], ["zzz"], "rooms: no run has a figure zzz$"),
+        (["rooms", "small"], [AP50], "3 rows or more that all folders have, found 2: a, b; c: not in small; d: not in"),
+        (["rooms", "apart"], [AP50], "apart: there is no run in which all rows have instances.ap50"),
+    ],
+)
+def test_what_cannot_be_compared_is_one_line(places: list[Path], asked: list[str], keys: list[str], said: str) -> None:
+    root = places[0].parent
+    (root / "empty").mkdir()
+    experiment(root / "small", {"a": (0.1,), "b": (0.2,)})
+    experiment(root / "apart", {"a": (0.1, None), "b": (None, 0.2), "c": (0.1, 0.2)})
+    with pytest.raises(DataError, match=said) as caught:
+        write_ranks([root / name for name in asked], keys, None)
+    assert "\n" not in str(caught.value)
