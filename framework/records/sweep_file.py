@@ -12,6 +12,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from framework.parameters import checked_rows
+
 SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
 MOST_VALUES = 1000  # of a key; a range may claim any number
 MOST_RUNS = 100_000  # of all keys together
@@ -33,6 +35,19 @@ def asked_runs(sweep: Mapping[str, Any], keys: Sequence[str]) -> list[tuple[str,
     return list(itertools.islice(itertools.product(*values), MOST_RUNS)) if plain else []
 
 
+def sweep_rows(sweep: Mapping[str, Any]) -> dict[str, list[str]]:
+    """The overrides of each of the experiment's rows, by name, as they were when it ran: without ${...}.
+
+    Raises ConfigError when `rows` is something else.
+    """
+    rows = checked_rows(sweep.get("rows"))
+    try:
+        resolved = OmegaConf.to_container(_without_hydra(sweep).rows, resolve=True) if rows else {}
+    except OmegaConfBaseException:  # ${hydra:...}, or what is not there
+        return rows
+    return checked_rows(resolved)
+
+
 def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
     """Those of the experiment's config first: the ones of the command line win."""
     found = []
@@ -47,15 +62,16 @@ def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
 def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
     """What the experiment's config itself asks for, as overrides: ${sequences.all} is what stands there."""
     params = _below(sweep, "sweeper", "params", dict)
-    others = {key: value for key, value in sweep.items() if key != "hydra"}
-    config = OmegaConf.create({**others, "hydra": {"sweeper": {"params": params}}})
-    assert isinstance(config, DictConfig)
-    node = config.hydra.sweeper.params
+    node = OmegaConf.merge(_without_hydra(sweep), {"params": params}).params
     for key in params:
         try:
             yield f"{key}={node[key]}"
         except OmegaConfBaseException:  # ${hydra:...}, or what is not there
             continue
+
+
+def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
+    return OmegaConf.create({key: value for key, value in sweep.items() if key != "hydra"})
 
 
 def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:

@@ -12,11 +12,11 @@ from typing import Any
 
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
-from framework.parameters import checked_block, checked_rows
+from framework.parameters import checked_block
 from framework.records.metrics import is_evaluation
 from framework.records.rows import CHOICE, Row, Run, natural, rows_of
 from framework.records.stored_runs import Incomplete, Record, find_records, read_yaml
-from framework.records.sweep_file import SWEEP, asked_runs
+from framework.records.sweep_file import SWEEP, asked_runs, sweep_rows
 from framework.tables.published import (
     DATASET,
     MADE_UP,
@@ -109,7 +109,7 @@ class Comparison:
             raise DataError(f"{directory} is not a folder with records of runs")
         sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
         choice = TableChoice.of(sweep.get("table") or read_yaml(DEFAULT_CHOICE)["table"])
-        overrides = checked_rows(sweep.get("rows"))
+        overrides = sweep_rows(sweep)
         records, incomplete = find_records(directory)
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])

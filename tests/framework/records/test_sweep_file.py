@@ -6,7 +6,8 @@ from typing import Any
 
 import pytest
 
-from framework.records.sweep_file import asked_runs
+from framework.errors import ConfigError
+from framework.records.sweep_file import asked_runs, sweep_rows
 
 
 def sweep(params: Any, task: Any) -> dict[str, Any]:
@@ -17,6 +18,15 @@ def test_the_command_line_wins_over_the_experiment() -> None:
     asked = sweep({"row": "${all_of:${rows}}", "dataset.scene": "011,016", "seed": 0}, ["seed=0,1", "launcher=joblib"])
     expected = [("0", "011"), ("0", "016"), ("1", "011"), ("1", "016")]
     assert asked_runs(asked, ["seed", "dataset.scene"]) == expected
+
+
+def test_rows_say_what_was_run() -> None:
+    config = {"rows": {"third": ["dataset.stop=${sequences.in_progress}"], "whole": []}, "hydra": {"x": "${hydra:y}"}}
+    assert sweep_rows(config | {"sequences": {"in_progress": 80}}) == {"third": ["dataset.stop=80"], "whole": []}
+    assert sweep_rows(config) == config["rows"], "as it stands there, where nobody knows"
+    assert sweep_rows({}) == {}
+    with pytest.raises(ConfigError, match="rows must have names with overrides"):
+        sweep_rows({"rows": ["a"]})
 
 
 def test_the_sequences_are_those_that_the_experiment_names() -> None:
