@@ -172,7 +172,7 @@ def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
 def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
-    assert (config.hydra.runtime.choices.detector, config.dataset.frame_truth) == ("simulated", True)
+    assert (config.hydra.runtime.choices.detector, config.dataset.frame_truth) == ("simulated_yolo11n", True)
     assert not set(config.sequences.all.split(",")) & set(read_published("table3").sequences)
     assert set(config.hydra.sweeper.params["dataset.scene"].split(",")) <= set(config.sequences.all.split(","))
 
