@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from framework.data import Float32, Float64, Int32
 from framework.synthetic.furniture.piece import Furniture
-from framework.synthetic.textures import Material, material_table
+from framework.synthetic.textures import DARK, Material, material_table
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,23 @@ class Surfaces:
     instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
     materials: Int32  # (F,) row of material_table
     parts: Int32  # (F,) part that the triangle belongs to: pictures have edges between parts
-    material_table: Float32  # (M, 13), see textures.material_table
+    material_table: Float32  # (M, 14), see textures.material_table
     class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
+
+    def readable(self) -> Surfaces:
+        """The triangles of which a depth camera has any reading: without screens and window panes."""
+        kept = self.material_table[self.materials, DARK] < 1
+        used, triangles = np.unique(self.triangles[kept], return_inverse=True)
+        return replace(
+            self,
+            vertices=self.vertices[used],
+            normals=self.normals[used],
+            texture=self.texture[used],
+            triangles=triangles.reshape(-1, 3).astype(np.int32),
+            instance_ids=self.instance_ids[kept],
+            materials=self.materials[kept],
+            parts=self.parts[kept],
+        )
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:
