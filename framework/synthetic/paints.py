@@ -29,6 +29,7 @@ WALLS: tuple[Color, ...] = (
 
 BLACKEST = 0.35  # mean of the sRGB of a surface from which it begins to swallow a projector's infrared light
 SWALLOWED = 0.8  # share of the readings that a black surface swallows
+MATTE_SCREEN = 0.75  # `dark` of a matte screen
 POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
 
 
@@ -96,9 +97,10 @@ def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Materi
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """A painting or a screen of this size (m). No depth camera reads a screen."""
-    dark = 1.0 if texture is Texture.SCREEN else 0.0
-    return Material(texture, vivid(rng), vivid(rng), 0.1, (width, height), _seed(rng), emission, dark)
+    """A painting or a screen of this size (m). No depth camera reads a glossy screen; every other screen is matte."""
+    first, second, seed = vivid(rng), vivid(rng), _seed(rng)
+    dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
+    return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)
 
 
 def _seed(rng: np.random.Generator) -> int:
