@@ -131,7 +131,7 @@ class SceneNNScene:
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
         caster = self.renderer.caster
-        mesh = visible_mesh(self.room.surfaces.readable(), caster, self.camera, views, (MIN_RANGE, MAX_RANGE))
+        mesh = visible_mesh(self.room.surfaces, caster, self.camera, views, (MIN_RANGE, MAX_RANGE))
         vertices = transform(T_YUP_ZUP, mesh.vertices)
         write_ply(self.folder / f"{name}.ply", vertices, mesh.triangles, {"label": self.labels[mesh.instance_ids]})
         write_annotation(self.folder / f"{name}.xml", self._annotated(vertices, mesh.instance_ids))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from framework.data import Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32
 from framework.synthetic.furniture.piece import Furniture
 from framework.synthetic.textures import DARK, Material, material_table
 
@@ -27,20 +27,10 @@ class Surfaces:
     material_table: Float32  # (M, 14), see textures.material_table
     class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
 
-    def readable(self) -> Surfaces:
-        """The triangles of which a depth camera has any reading: without screens and window panes."""
-        kept = self.material_table[self.materials, DARK] < 1
-        used, triangles = np.unique(self.triangles[kept], return_inverse=True)
-        return replace(
-            self,
-            vertices=self.vertices[used],
-            normals=self.normals[used],
-            texture=self.texture[used],
-            triangles=triangles.reshape(-1, 3).astype(np.int32),
-            instance_ids=self.instance_ids[kept],
-            materials=self.materials[kept],
-            parts=self.parts[kept],
-        )
+    @property
+    def unreadable(self) -> Bool:
+        """The triangles (F,) of which no depth camera has any reading: screens and window panes."""
+        return np.asarray(self.material_table[self.materials, DARK] >= 1)
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:

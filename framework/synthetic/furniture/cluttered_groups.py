@@ -37,9 +37,9 @@ def cluttered_bed_group(rng: Rng) -> Group:
     things = [
         soft_things.blanket(rng, rng.uniform(0.75, 0.95) * min(size(bed)[0], 1.2), rng.uniform(0.55, 0.7)),
         fixtures.backpack(rng).tilted(np.pi / 2),
+        soft_things.throw_cushion(rng),
         tabletops.book_pile(rng),
         soft_things.clothes(rng),
-        soft_things.throw_cushion(rng),
         tabletops.book(rng),
         soft_things.throw_cushion(rng),
     ]

@@ -186,18 +186,3 @@ def test_dark_materials_lose_their_share_and_shiny_ones_at_a_slant():
         turned = np.minimum(1, (1 - picture.incidence) / (1 - np.cos(np.deg2rad(60))))
         assert np.ptp(turned) > 0.3
         np.testing.assert_allclose(picture.unread, dark + (1 - dark) * shiny * turned, atol=1e-5)
-
-
-def test_what_no_camera_reads_is_not_readable():
-    objects = []
-    for instance, dark in enumerate((0.0, 1.0, 0.9)):
-        piece = Furniture("box", None)
-        piece.add(rounded_box(1, 1, 1).moved(x=2.0 * instance), replace(GREY, dark=dark))
-        objects.append((instance, piece))
-    surfaces = assemble(objects)
-    readable = surfaces.readable()
-    assert set(readable.instance_ids) == {0, 2}
-    assert len(readable.triangles) == len(readable.instance_ids) == len(readable.parts)
-    kept = surfaces.vertices[surfaces.triangles[surfaces.instance_ids != 1]]
-    np.testing.assert_array_equal(readable.vertices[readable.triangles], kept)
-    assert len(readable.vertices) == len(surfaces.vertices) * 2 // 3, "nothing is left of the others"
