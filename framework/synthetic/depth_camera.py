@@ -7,6 +7,7 @@
   "A Benchmark for RGB-D Visual Odometry, 3D Reconstruction and SLAM", ICRA 2014, do).
 - There is no reading where the projector, a baseline aside of the camera, cannot shine; at many pixels along depth
   edges; and on surfaces seen at a grazing angle.
+- Dark and shiny surfaces lose readings in patches: the correlation window that finds no pattern is wider than a pixel.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ LATERAL_SIGMA = 0.8  # px at 640 px width: the constant term of Nguyen et al.
 EDGE_JUMP = 0.05  # relative step of depth that the sensor's correlation window cannot follow
 EDGE_DROP = 0.5  # probability of no reading beside such a step
 GRAZING_START, GRAZING_END = np.deg2rad(80.0), np.deg2rad(88.0)  # from all readings to none
+PATCH = 14.0  # px at 640 px width, between the random numbers that patches without readings come from
 COLOR_SIGMA = 1.5  # grey levels of 255
 QUANTILE_BITS = 12  # a normal error is one of so many equally likely ones: up to 3.7 standard deviations
 SPARE_BITS = 16 - QUANTILE_BITS
@@ -50,8 +52,18 @@ class DepthSensor:
     noise: float  # 0 = exact, 1 = as measured; scales the standard deviations and the probabilities
     max_range: float  # m, nothing is read beyond
 
-    def measure(self, depth: Float32, incidence: Float32, camera: Camera, rng: np.random.Generator) -> Float32:
-        """The readings (H, W) m for exact `depth` (H, W) m seen under the cosines `incidence`, 0 = no reading."""
+    def measure(
+        self,
+        depth: Float32,
+        incidence: Float32,
+        camera: Camera,
+        rng: np.random.Generator,
+        unread: Float32 | None = None,
+    ) -> Float32:
+        """The readings (H, W) m for exact `depth` (H, W) m seen under the cosines `incidence`, 0 = no reading.
+
+        `unread` (H, W) is the share of readings that materials lose, in patches; None = no material loses any.
+        """
         if self.noise == 0:
             return np.where(depth <= self.max_range, depth, np.float32(0))
         theta = np.arccos(np.minimum(incidence, np.float32(1)))
@@ -67,6 +79,11 @@ class DepthSensor:
             np.float32(self.max_range),
             reading,
         )
+        if unread is not None:
+            cell = PATCH * camera.width / 640
+            nodes = (int(depth.shape[0] / cell) + 2, int(depth.shape[1] / cell) + 2)
+            field = normal_quantiles()[random_bits(nodes, rng) >> SPARE_BITS]
+            _lose(unread, field, np.float32(cell), normal_quantiles(), np.float32(min(self.noise, 1.0)), reading)
         return reading
 
 
@@ -146,6 +163,34 @@ def _read(
             quantised = _SCALE / max(steps, np.float32(1))
             if np.float32(MIN_RANGE) < quantised <= max_range:
                 reading[v, u] = quantised
+
+
+@njit(cache=True, nogil=True)
+def _lose(
+    unread: Float32, field: Float32, cell: np.float32, normal: Float32, most_lost: np.float32, reading: Float32
+) -> None:
+    """Takes readings (H, W) away, in patches, so that a share of `most_lost` times `unread` (H, W) is lost.
+
+    A pixel loses its reading where a smooth random field is below the quantile of that share. The field lies between
+    the normal numbers `field` (R, C), `cell` px apart; divided by the length of the weights it is normal in each pixel.
+    """
+    one, count = np.float32(1), np.float32(len(normal))
+    for v in range(reading.shape[0]):
+        y = np.float32(v) / cell
+        j = int(y)
+        b = y - np.float32(j)
+        for u in range(reading.shape[1]):
+            entry = int(most_lost * unread[v, u] * count)
+            if entry == 0 or reading[v, u] == 0:
+                continue
+            x = np.float32(u) / cell
+            i = int(x)
+            a = x - np.float32(i)
+            upper = (one - a) * field[j, i] + a * field[j, i + 1]
+            lower = (one - a) * field[j + 1, i] + a * field[j + 1, i + 1]
+            length = np.sqrt(((one - a) * (one - a) + a * a) * ((one - b) * (one - b) + b * b))
+            if entry >= len(normal) or ((one - b) * upper + b * lower) / length < normal[entry]:
+                reading[v, u] = 0
 
 
 @njit(cache=True, nogil=True)

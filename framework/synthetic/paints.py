@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+from dataclasses import replace
 
 import numpy as np
 
@@ -26,6 +27,17 @@ WALLS: tuple[Color, ...] = (
 )  # fmt: skip
 
 
+BLACKEST = 0.35  # mean of the sRGB of a surface from which it begins to swallow a projector's infrared light
+SWALLOWED = 0.8  # share of the readings that a black surface swallows
+MATTE_SCREEN = 0.75  # `dark` of a matte screen
+POLISHED, GLAZED = 0.7, 0.5  # `shiny` of metal and of ceramics
+
+
+def swallowed(color: Color) -> float:
+    """The share of a depth camera's readings that a surface of this colour loses."""
+    return SWALLOWED * max(0.0, 1 - sum(color) / 3 / BLACKEST)
+
+
 def pick(rng: np.random.Generator, choices: tuple[Color, ...]) -> Color:
     return choices[int(rng.integers(len(choices)))]
 
@@ -44,13 +56,21 @@ def vivid(rng: np.random.Generator) -> Color:
 def wood(rng: np.random.Generator) -> Material:
     first, second = WOODS[int(rng.integers(len(WOODS)))]
     tone = rng.uniform(0.9, 1.08)
-    return Material(Texture.WOOD, shade(first, tone), shade(second, tone), rng.uniform(0.03, 0.06), seed=_seed(rng))
+    light, veins = shade(first, tone), shade(second, tone)
+    return Material(Texture.WOOD, light, veins, rng.uniform(0.03, 0.06), seed=_seed(rng), dark=swallowed(light))
 
 
 def cloth(rng: np.random.Generator, color: Color | None = None) -> Material:
     """Upholstery of one colour."""
     base = pick(rng, CLOTHS) if color is None else color
-    return Material(Texture.FABRIC, base, shade(base, 0.72), rng.uniform(0.10, 0.2), seed=_seed(rng))
+    scale = rng.uniform(0.10, 0.2)
+    return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=_seed(rng), dark=swallowed(base))
+
+
+def leather(rng: np.random.Generator) -> Material:
+    """Black, and polished by use."""
+    color = shade((0.17, 0.16, 0.15), rng.uniform(0.7, 1.3))
+    return Material(Texture.PAINT, color, shade(color, 0.6), 0.03, seed=_seed(rng), dark=swallowed(color), shiny=GLAZED)
 
 
 def patterned_cloth(rng: np.random.Generator) -> Material:
@@ -63,16 +83,24 @@ def patterned_cloth(rng: np.random.Generator) -> Material:
 
 
 def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
-    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=_seed(rng))
+    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=_seed(rng), dark=swallowed(color))
+
+
+def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
+    """Paint on ceramics."""
+    return replace(paint(rng, color, contrast, scale), shiny=GLAZED)
 
 
 def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
-    return Material(Texture.METAL, color, shade(color, 0.91), seed=_seed(rng))
+    dark = swallowed(color)
+    return Material(Texture.METAL, color, shade(color, 0.91), seed=_seed(rng), dark=dark, shiny=POLISHED)
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
-    """A painting or a screen of this size (m)."""
-    return Material(texture, vivid(rng), vivid(rng), 0.1, (width, height), _seed(rng), emission)
+    """A painting or a screen of this size (m). No depth camera reads a glossy screen; every other screen is matte."""
+    first, second, seed = vivid(rng), vivid(rng), _seed(rng)
+    dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
+    return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)
 
 
 def _seed(rng: np.random.Generator) -> int:

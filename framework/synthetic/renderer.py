@@ -12,7 +12,7 @@ from framework.data import Camera, Float32, Float64, Int32, UInt8
 from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
 from framework.synthetic.lights import Lamp, bake
 from framework.synthetic.ray_caster import RayCaster, image_rays
-from framework.synthetic.shading import WHITE, lit, shade
+from framework.synthetic.shading import WHITE, lit, shade, unread
 from framework.synthetic.surfaces import Surfaces
 
 
@@ -24,6 +24,7 @@ class Rendering:
     depth: Float32  # (H, W) m along z, 0 = nothing
     instance_ids: Int32  # (H, W)
     incidence: Float32  # (H, W) cosine of the angle between ray and surface normal, in [0, 1]
+    unread: Float32  # (H, W) in [0, 1], share of a depth camera's readings lost to dark and shiny materials
 
 
 class Renderer:
@@ -40,7 +41,8 @@ class Renderer:
         surfaces = self._lit if material_table is None else self._lit._replace(table=material_table)
         buffer = self._rasterizer.draw(camera, T_world_camera)
         light, incidence = shade(surfaces, self.caster, buffer, camera, T_world_camera)
-        return Rendering(to_srgb(light), buffer.depth, self._ids(buffer), incidence)
+        lost = unread(surfaces, buffer, incidence)
+        return Rendering(to_srgb(light), buffer.depth, self._ids(buffer), incidence, lost)
 
     def depth_and_ids(self, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Int32]:
         """Exact depth and instance ids only, (H, W) each."""

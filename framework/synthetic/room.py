@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
@@ -15,6 +16,7 @@ from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import panel, rounded_box
 from framework.synthetic.layout import Layout, arrange, place_on_wall
 from framework.synthetic.lights import Lamp, globe, rectangle
+from framework.synthetic.strewing import strew
 from framework.synthetic.surfaces import Surfaces, assemble
 from framework.synthetic.textures import Material, Texture
 
@@ -56,9 +58,12 @@ def furnish(kind: RoomKind, rng: Rng) -> Room:
     return furnish_with(_groups(kind, rng), *SMALLEST[kind], rng)
 
 
-def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng) -> Room:
-    """A room of at least `width` x `depth` m with these contents, the largest first: they find a place most easily."""
-    layout = arrange(contents, width, depth, rng)
+def furnish_with(contents: list[Group], width: float, depth: float, rng: Rng, strewn: Sequence[Furniture] = ()) -> Room:
+    """A room of at least `width` x `depth` m with these contents, the largest first: they find a place most easily.
+
+    As much of what is `strewn` stands on the floor as finds a place against the furniture.
+    """
+    layout = strew(arrange(contents, width, depth, rng), strewn, rng)
     globe_lamp = clutter.ceiling_lamp(rng).placed(rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), HEIGHT)
     pieces = [*layout.pieces, globe_lamp]
     objects = ((0, _shell(layout.width, layout.depth, rng)), *enumerate(pieces, start=1))

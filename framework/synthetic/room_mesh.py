@@ -11,6 +11,7 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.surfaces import Surfaces
 
+ON_SURFACE = 1.001  # of the way to a vertex: its own surface is met within this
 LONGEST_EDGE = 0.02  # m
 
 
@@ -37,9 +38,12 @@ def visible_mesh(
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
 ) -> LabeledMesh:
-    """The surfaces, as far as they are seen from one of the poses T_world_camera at a depth within `reach` (m, m)."""
+    """The surfaces, as far as they are seen from one of the poses T_world_camera at a depth within `reach` (m, m).
+
+    `caster` has the triangles of `surfaces`. What no depth camera reads is not seen, nor what lies behind it.
+    """
     mesh = tessellate(surfaces, longest_edge)
-    return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach))
+    return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach, surfaces.unreadable))
 
 
 def tessellate(surfaces: Surfaces, longest_edge: float) -> LabeledMesh:
@@ -87,15 +91,26 @@ def _welded(mesh: LabeledMesh) -> LabeledMesh:
 
 
 def seen_from(
-    vertices: Float32, caster: RayCaster, camera: Camera, poses: Iterable[Float64], reach: tuple[float, float]
+    vertices: Float32,
+    caster: RayCaster,
+    camera: Camera,
+    poses: Iterable[Float64],
+    reach: tuple[float, float],
+    unreadable: Bool,
 ) -> Bool:
-    """(V,) Which vertices lie in the picture of one of the poses, at a depth within `reach` and with nothing before."""
+    """(V,) Which vertices lie in the picture of one of the poses, at a depth within `reach` and with nothing before.
+
+    Those that lie on one of the `unreadable` triangles (F,) of the caster, or closely behind, have something before.
+    """
     seen = np.zeros(len(vertices), np.bool_)
     for T_world_camera in poses:
         candidates = _in_view(vertices, seen, camera, T_world_camera, reach)
         ends = vertices[candidates]
         origins = np.broadcast_to(T_world_camera[:3, 3].astype(np.float32), ends.shape)
-        seen[candidates[~caster.occluded(origins, ends)]] = True
+        free = ~caster.occluded(origins, ends)
+        hits = caster.cast(np.concatenate([origins, ends - origins], axis=1)[free])
+        free[free] = ~(np.append(unreadable, False)[hits.triangle] & (hits.distance < ON_SURFACE))
+        seen[candidates[free]] = True
     return seen
 
 

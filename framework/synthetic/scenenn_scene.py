@@ -22,14 +22,17 @@ from framework.geometry import transform
 from framework.label_spaces import SCENENN_TO_COCO
 from framework.synthetic.benchmark import SceneSpec, plan_scene
 from framework.synthetic.depth_camera import MIN_RANGE, DepthSensor, noisy_color
+from framework.synthetic.motion_blur import blurred
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
 
-GENERATION = 2  # of the rooms that this code makes: raise it when they change, so that none are mixed
+GENERATION = 3  # of the rooms that this code makes: raise it when they change, so that none are mixed
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini
 NOISE, MAX_RANGE = 1.0, 6.0  # the sensor's noise, 1 = a Kinect v1; its range, m
+EXPOSURE = 1 / 60  # s, of colour, amid which the pose is true: a lamp at home leaves a camera no shorter one
 TRUTH_VIEWS = 60  # frames whose view makes up the labelled mesh; neighbours show nearly the same
+FASTEST = 5.0  # haste: 2.2 m/s, a run
 LARGEST_ID = 934338  # of SceneNN's own labels, which have no order
 PNG = (
     *(cv2.IMWRITE_PNG_COMPRESSION, 1),
@@ -70,11 +73,14 @@ class Recording:
     seed: int = 0
     frames: int = 240  # of each scene, at 30 Hz
     width: int = 640  # px, the height is 3/4 of it
+    haste: float = 2.0  # of the walk: 1 = slowly, as a person should record; objects are seen in fewer frames, and blur
 
     def __post_init__(self) -> None:
         for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
             if getattr(self, name) < lowest:
                 raise ConfigError(f"{name} must be at least {lowest}, found {getattr(self, name)}")
+        if not 0 < self.haste <= FASTEST:
+            raise ConfigError(f"haste must be above 0 and at most {FASTEST}, found {self.haste}")
         if self.width % 4:
             raise ConfigError(f"width must be a multiple of 4, so that the picture is 4:3; found {self.width}")
 
@@ -97,7 +103,7 @@ class SceneNNScene:
             (folder / kind).mkdir(parents=True, exist_ok=True)
         self.camera = recording.camera
         self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
-        scene = plan_scene(spec, self._stream, recording.frames)
+        scene = plan_scene(spec, self._stream, recording.frames, recording.haste)
         self.room, self.path = scene.room, scene.path
         self.renderer = Renderer(self.room.surfaces, list(self.room.lamps))
         self._sensor = DepthSensor(NOISE, MAX_RANGE)
@@ -111,14 +117,16 @@ class SceneNNScene:
         T_world_camera = self.path.pose(index)
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
-        depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng)
-        color = noisy_color(picture.color, NOISE, rng)
+        depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng, picture.unread)
+        ends = (self.path.pose(index + half * FRAME_RATE * EXPOSURE) for half in (-0.5, 0.5))
+        exposed = blurred(picture.color, picture.depth, self.camera, T_world_camera, *ends)
+        color = noisy_color(exposed, NOISE, rng)
         color_file, depth_file = frame_files(self.folder, index)
         _write_png(depth_file, np.rint(1000 * depth).astype(np.uint16))
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
     def write_truth(self) -> None:
-        """The labelled mesh and what its labels mean."""
+        """The labelled mesh and what its labels mean. As in SceneNN's, what is never read is not in it."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))

@@ -11,13 +11,14 @@ from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
 from framework.rendering.rasterizer import NO_TRIANGLE, VisibilityBuffer
 from framework.synthetic.ray_caster import RayCaster, pixel_rays
 from framework.synthetic.surfaces import Surfaces
-from framework.synthetic.textures import surface_color
+from framework.synthetic.textures import DARK, SHINY, surface_color
 
 EDGE_SAMPLES = ((-0.375, 0.125), (-0.125, -0.375), (0.125, 0.375), (0.375, -0.125))  # px, a rotated grid
 EDGE_STEP = 0.04  # relative step of depth that counts as an edge
 WHITE = 2.2  # linear light that becomes full white: lamps and windows may burn out
 
 
+GLANCED_OFF = np.float32(np.deg2rad(60.0))  # rad, of incidence, from which a mirror sends the projector's light away
 GRAZING = np.float32(0.05)  # the least cosine that a pixel's footprint is computed with
 
 
@@ -30,7 +31,7 @@ class LitSurfaces(NamedTuple):
     normals: Float32  # (F, 3) unit, towards no particular side
     materials: Int32  # (F,) row of the table
     parts: Int32  # (F,)
-    table: Float32  # (M, 13), see textures.material_table
+    table: Float32  # (M, 14), see textures.material_table
 
 
 class View(NamedTuple):
@@ -85,6 +86,13 @@ def shade(
     return light, incidence
 
 
+def unread(surfaces: LitSurfaces, buffer: VisibilityBuffer, incidence: Float32) -> Float32:
+    """The share (H, W) of a structured-light camera's readings that what is seen swallows or mirrors away."""
+    lost = np.empty(incidence.shape, np.float32)
+    _unread(surfaces.materials, surfaces.table, buffer.triangle, incidence, lost)
+    return lost
+
+
 def edges(buffer: VisibilityBuffer, parts: Int32) -> Bool:
     """The pixels (H, W) on either side of a border between two parts, or of a step of depth."""
     return np.asarray(_edges(buffer.triangle, parts, buffer.depth), np.bool_)
@@ -108,6 +116,22 @@ def _shade(
                 texture, irradiance, triangles, materials, table, f, uv[v, u, 0], uv[v, u, 1], depth[v, u] / fx, cosine
             )
             light[v, u, 0], light[v, u, 1], light[v, u, 2], incidence[v, u] = red, green, blue, cosine
+
+
+@njit(cache=True, nogil=True)
+def _unread(materials: Int32, table: Float32, triangle: Int32, incidence: Float32, lost: Float32) -> None:
+    """Writes the share (H, W) lost: `dark` of all, and of the rest `shiny` times how far the surface is turned away."""
+    one = np.float32(1)
+    mirrored_away = one - np.cos(GLANCED_OFF)
+    for v in range(triangle.shape[0]):
+        for u in range(triangle.shape[1]):
+            f = triangle[v, u]
+            lost[v, u] = 0
+            if f == NO_TRIANGLE:
+                continue
+            dark, shiny = table[materials[f], DARK], table[materials[f], SHINY]
+            turned = min((one - incidence[v, u]) / mirrored_away, one)
+            lost[v, u] = dark + (one - dark) * shiny * turned
 
 
 @njit(cache=True, nogil=True, inline="always")

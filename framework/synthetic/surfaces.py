@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from framework.data import Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32
 from framework.synthetic.furniture.piece import Furniture
-from framework.synthetic.textures import Material, material_table
+from framework.synthetic.textures import DARK, Material, material_table
 
 
 @dataclass(frozen=True)
@@ -24,8 +24,13 @@ class Surfaces:
     instance_ids: Int32  # (F,), 0 = floor, wall or ceiling
     materials: Int32  # (F,) row of material_table
     parts: Int32  # (F,) part that the triangle belongs to: pictures have edges between parts
-    material_table: Float32  # (M, 13), see textures.material_table
+    material_table: Float32  # (M, 14), see textures.material_table
     class_names: Mapping[int, str | None]  # instance id -> COCO class; None = clutter
+
+    @property
+    def unreadable(self) -> Bool:
+        """The triangles (F,) of which no depth camera has any reading: screens and window panes."""
+        return np.asarray(self.material_table[self.materials, DARK] >= 1)
 
 
 def assemble(objects: Iterable[tuple[int, Furniture]]) -> Surfaces:

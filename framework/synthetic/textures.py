@@ -38,6 +38,8 @@ class Texture(IntEnum):
 PAINT, WOOD, FABRIC, STRIPES, PLANKS, TILES, RUG, PAINTING = (int(texture) for texture in list(Texture)[:8])
 SCREEN, METAL, BOOK, SKY, WALLPAPER, LEAF, CHECKS, PAGES = (int(texture) for texture in list(Texture)[8:])
 
+DARK, SHINY = 12, 13  # columns of material_table
+
 # Odd 64-bit constants that scatter lattice coordinates and seeds over all bits.
 STEP_X, STEP_Y = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xC2B2AE3D27D4EB4F)
 STEP_Z, STEP_SEED = np.uint64(0x165667B19E3779F9), np.uint64(0x27D4EB2F165667C5)
@@ -54,6 +56,8 @@ class Material:
     extent: tuple[float, float] = (1.0, 1.0)  # m, of a picture
     seed: int = 0
     emission: float = 0.0  # light given off, relative to a white wall in the room's mean light
+    dark: float = 0.0  # in [0, 1], share of a structured-light camera's readings lost from wherever it looks
+    shiny: float = 0.0  # in [0, 1], share of the others lost where it looks at a slant, see shading.GLANCED_OFF
 
 
 def to_linear(srgb: Float64) -> Float64:
@@ -62,12 +66,12 @@ def to_linear(srgb: Float64) -> Float64:
 
 
 def material_table(materials: list[Material]) -> Float32:
-    """(M, 13) rows: texture, linear colour, linear second colour, scale, extent, seed, emission, 0."""
-    rows = np.zeros((len(materials), 13))
+    """(M, 14) rows: texture, linear colour, linear second colour, scale, extent, seed, emission, dark, shiny."""
+    rows = np.zeros((len(materials), 14))
     for row, m in zip(rows, materials, strict=True):
         row[0] = m.texture
         row[1:4], row[4:7] = to_linear(np.array(m.color)), to_linear(np.array(m.second))
-        row[7:12] = m.scale, *m.extent, m.seed % 4096, m.emission
+        row[7:] = m.scale, *m.extent, m.seed % 4096, m.emission, m.dark, m.shiny
     return rows.astype(np.float32)
 
 

@@ -33,8 +33,8 @@ class CameraPath:
     sway: Float64  # (4,) rad, phases of the hand's motion
     phase_speed: float = 1.0  # rad/s
 
-    def pose(self, frame: int) -> Float64:
-        """T_world_camera (4, 4) of a frame at FRAME_RATE."""
+    def pose(self, frame: float) -> Float64:
+        """T_world_camera (4, 4) of a frame at FRAME_RATE, or between frames."""
         return self.pose_at(self.start + self.turn * self.phase_speed * frame / FRAME_RATE)
 
     def pose_at(self, phase: float) -> Float64:
@@ -68,12 +68,16 @@ def plan_path(
     labels: LabelView,
     wanted: set[int],
     rng: np.random.Generator,
+    haste: float = 1.0,
 ) -> CameraPath:
-    """The walk whose `frames` frames see most of the `wanted` instances. Raises DataError without room to walk."""
+    """The walk whose `frames` frames see most of the `wanted` instances, `haste` times as fast as it should be gone.
+
+    Raises DataError without room to walk.
+    """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
     path = CameraPath(center, radii, float(rng.uniform(*EYE_HEIGHT)), 0.0, turn, rng.uniform(0, 2 * np.pi, 4))
-    speed = _allowed_phase_speed(path)
+    speed = haste * _allowed_phase_speed(path)
     start = _best_start(path, turn * speed * (frames - 1) / FRAME_RATE, labels, wanted)
     return CameraPath(center, radii, path.height, start, turn, path.sway, speed)
 

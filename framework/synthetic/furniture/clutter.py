@@ -180,7 +180,7 @@ def pouf(rng: Rng) -> Furniture:
 
 def mug(rng: Rng) -> Furniture:
     piece = Furniture("mug", None)
-    glaze = paints.paint(rng, paints.vivid(rng))
+    glaze = paints.glaze(rng, paints.vivid(rng))
     piece.add(loft([Section(0.0, 0.034, 0.034), Section(0.008, 0.04, 0.04), Section(0.095, 0.042, 0.042)], 22), glaze)
     piece.add(tube([(0.038, 0.0, 0.02), (0.066, 0.0, 0.03), (0.066, 0.0, 0.065), (0.04, 0.0, 0.078)], 0.006, 8), glaze)
     return piece
@@ -191,7 +191,7 @@ def vase(rng: Rng) -> Furniture:
     profile = ((0.0, 0.05), (0.02, 0.06), (0.12, 0.085), (0.20, 0.05), (0.26, 0.032), (0.29, 0.045))
     piece.add(
         loft([Section(z, r, r) for z, r in profile], 26, 0.03),
-        paints.paint(rng, paints.vivid(rng), 0.7, 0.03),
+        paints.glaze(rng, paints.vivid(rng), 0.7, 0.03),
     )
     for k in range(5):
         x, y = 0.06 * np.cos(1.26 * k), 0.06 * np.sin(1.26 * k)
@@ -211,7 +211,7 @@ def bowl(rng: Rng) -> Furniture:
         Section(0.05, 0.12, 0.12),
         Section(0.08, 0.14, 0.14),
     ]
-    piece.add(loft(profile, 30, 0.03), paints.paint(rng, (0.86, 0.84, 0.80)))
+    piece.add(loft(profile, 30, 0.03), paints.glaze(rng, (0.86, 0.84, 0.80)))
     fruit = ((0.80, 0.20, 0.15), (0.85, 0.60, 0.15), (0.45, 0.62, 0.20))
     for k in range(5):
         r, angle = 0.036, 1.256 * k
@@ -242,7 +242,9 @@ def window(rng: Rng) -> Furniture:
     piece = Furniture("window", None)
     width, height = rng.uniform(1.2, 1.5), rng.uniform(1.15, 1.3)
     white = paints.paint(rng, (0.92, 0.92, 0.90))
-    glass = Material(Texture.SKY, (0.6, 0.8, 1.0), (0.2, 0.4, 0.1), 0.1, (width, height), int(rng.integers(4096)), 1.5)
+    glass = Material(
+        Texture.SKY, (0.6, 0.8, 1.0), (0.2, 0.4, 0.1), 0.1, (width, height), int(rng.integers(4096)), 1.5, dark=1
+    )
     piece.add(panel(width, height).moved(y=0.012), glass)
     for x in (-width / 2, 0.0, width / 2):
         piece.add(rounded_box(0.06, 0.05, height + 0.06, 0.006).moved(x, 0.026, height / 2), white)

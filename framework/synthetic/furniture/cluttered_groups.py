@@ -1,13 +1,16 @@
-"""The paper's hard cases as groups: beds and couches with things lying on them, and rows of equal objects."""
+"""Hard cases as groups: things lying on beds, couches and tables, rows of equal objects, and neighbours that touch."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from framework.data import Float64
-from framework.synthetic.furniture import clutter, fixtures, seating, soft_things, tabletops
-from framework.synthetic.furniture.groups import Group, against_wall, bed_group, beside, put_on, size, with_low_table
+from framework.synthetic import paints
+from framework.synthetic.furniture import clutter, fixtures, seating, small_things, soft_things, tabletops
+from framework.synthetic.furniture.groups import Group, against_wall, bed_group, beside, on_top, single, size
 from framework.synthetic.furniture.piece import Furniture, Rng
+from framework.synthetic.furniture.solids import SPACING
+from framework.synthetic.textures import Texture
 
 PILLOWS = 0.68  # m, from the wall to where a bed is free to lie on
 BACKREST = 0.50  # m, from the wall to where a couch is free to sit on
@@ -15,19 +18,28 @@ BORDER = 0.06  # m, of a bed or a couch on which nothing lies
 ARM = 0.24  # m, the widest arm of a couch
 SINK = 0.012  # m, how deep things lie in what is soft
 PLACES = 60  # tried for each thing that lies about
+TOUCHING = (0.001, 0.005)  # m, between neighbours of which a sensor cannot tell that they are two
+LADEN_CHAIRS = 0.5  # share of the chairs along a wall on which something lies
+SEAT = 0.19  # m, from the front of a chair to the middle of its seat
+LEATHER_COUCHES = 0.3  # share of the couches that are of black leather
+RIM = 0.02  # m, of a table, on which nothing lies
+APRON = 0.13  # m, from a table's top down to where the knees of a chair go under it
 
 
 def cluttered_bed_group(rng: Rng) -> Group:
     """A bed that somebody lives on: a blanket, clothes, cushions, a bag, books."""
     group = bed_group(rng)
-    bed = group.pieces[0]
+    bed, stand = group.pieces[:2]
+    side = 1 if stand.bounds()[0][0] > 0 else -1
+    bag = fixtures.backpack(rng).placed(0, 0, 0, -side * np.pi / 2)
+    group.add(bag, beside(bag, bed, -side, _touch(rng)), float(bed.bounds()[1][1]) - rng.uniform(0.3, 0.9))
     low, high = bed.bounds()
     things = [
         soft_things.blanket(rng, rng.uniform(0.75, 0.95) * min(size(bed)[0], 1.2), rng.uniform(0.55, 0.7)),
         fixtures.backpack(rng).tilted(np.pi / 2),
+        soft_things.throw_cushion(rng),
         tabletops.book_pile(rng),
         soft_things.clothes(rng),
-        soft_things.throw_cushion(rng),
         tabletops.book(rng),
         soft_things.throw_cushion(rng),
     ]
@@ -36,9 +48,14 @@ def cluttered_bed_group(rng: Rng) -> Group:
 
 
 def cluttered_couch_group(rng: Rng) -> Group:
-    """A couch with its low table, on which cushions, a blanket, a bag and books lie."""
-    group = with_low_table(seating.bare_couch(rng), rng)
-    _clutter_couch(group, rng)
+    """A couch on which cushions, a blanket, a bag and books lie, and a full low table that touches it."""
+    group = cluttered_couch(rng)
+    front = float(group.pieces[0].bounds()[1][1])
+    table = tabletops.coffee_table(rng)
+    table = group.add(table, rng.uniform(-0.3, 0.3), front + _touch(rng) + size(table)[1] / 2)
+    things = [tabletops.book_pile(rng), tabletops.book(rng), *small_things.some(rng, small_things.ON_TABLES, 4)]
+    strew_on(group, table, rng, things)
+    group.add(clutter.rug(rng, size(table)[0] + 1.2, 1.5), 0.0, front + 0.60)
     return group
 
 
@@ -46,9 +63,18 @@ def cluttered_couch(rng: Rng) -> Group:
     """The same couch without a table."""
     group = Group("couch")
     couch = seating.bare_couch(rng)
+    if rng.uniform() < LEATHER_COUCHES:
+        couch = _in_leather(couch, rng)
     group.add(couch, y=against_wall(couch))
     _clutter_couch(group, rng)
     return group
+
+
+def _in_leather(couch: Furniture, rng: Rng) -> Furniture:
+    """The couch with black leather for its cloth."""
+    hide = paints.leather(rng)
+    parts = [(solid, hide if material.texture is Texture.FABRIC else material) for solid, material in couch.parts]
+    return Furniture(couch.kind, couch.class_name, parts)
 
 
 def _clutter_couch(group: Group, rng: Rng) -> None:
@@ -114,38 +140,111 @@ def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
 
 
 def chair_row(rng: Rng, count: int) -> Group:
-    """Equal chairs along the wall, nearly touching each other."""
+    """Equal chairs along the wall that touch each other; something lies on some of them."""
     group = Group("chair row")
     chair = seating.chair(rng)
-    pitch = size(chair)[0] + rng.uniform(0.015, 0.05)
+    pitch = size(chair)[0] + _touch(rng)
     for k in range(count):
         group.add(chair, (k - (count - 1) / 2) * pitch, against_wall(chair))
+    for placed in group.pieces[: count - 1]:
+        if rng.uniform() < LADEN_CHAIRS:
+            things = [soft_things.throw_cushion(rng), tabletops.book_pile(rng), soft_things.clothes(rng)]
+            _lay_on_seat(group, placed, things[int(rng.integers(len(things)))])
     return group
+
+
+def _lay_on_seat(group: Group, chair: Furniture, thing: Furniture) -> None:
+    low, high = chair.bounds()
+    x, y = float(low[0] + high[0]) / 2, float(high[1]) - SEAT
+    z = _height([chair], np.array([low[0], y - 0.05]), np.array([high[0], y + 0.05]))
+    wide = size(thing)[:2].max()
+    fit = min(1.0, 2 * SEAT / wide)
+    parts = [(solid.deformed(lambda p: p * (fit, fit, 1.0)), material) for solid, material in thing.parts]
+    group.add(Furniture(thing.kind, thing.class_name, parts), x, y, z - SINK)
 
 
 def desk_row(rng: Rng, count: int) -> Group:
-    """Equal desks side by side, each with the same office chair, and other things on each."""
+    """Equal desks that touch, each with the same office chair pushed under it, and other things on each."""
     group = Group("desk row")
     desk, chair = tabletops.desk(rng), seating.office_chair(rng)
-    pitch = size(desk)[0] + rng.uniform(0.01, 0.04)
+    pitch = size(desk)[0] + _touch(rng)
     for k in range(count):
-        x = (k - (count - 1) / 2) * pitch
-        placed = group.add(desk, x, against_wall(desk))
-        put_on(group, placed, rng, [clutter.table_lamp(rng), tabletops.book(rng), tabletops.book_pile(rng)])
-        turned = chair.placed(0, 0, 0, np.pi + rng.uniform(-0.4, 0.4))
-        y = float(placed.bounds()[1][1] - turned.bounds()[0][1]) + 0.03
-        group.add(turned, x + rng.uniform(-0.1, 0.1), y)
+        placed = group.add(desk, (k - (count - 1) / 2) * pitch, against_wall(desk))
+        push_under(group, placed, chair, rng.uniform(-0.1, 0.1))
+        things = [small_things.book_row(rng), tabletops.book_pile(rng), clutter.table_lamp(rng), tabletops.book(rng)]
+        strew_on(group, placed, rng, [*things, *small_things.some(rng, small_things.ON_TABLES, 4)])
     return group
 
 
+def laid_table_group(rng: Rng) -> Group:
+    """A long table full of things, two equal chairs side by side pushed under it, one or two more at its ends."""
+    group = Group("dining")
+    table = tabletops.long_table(rng)
+    table = group.add(table, y=against_wall(table))
+    low, high = table.bounds()
+    chair = seating.chair(rng)
+    pitch = size(chair)[0] + _touch(rng)
+    for side in (-1, 1):
+        push_under(group, table, chair, side * pitch / 2)
+    for side in (-1, 1)[: int(rng.integers(1, 3))]:
+        turned = chair.placed(0, 0, 0, side * np.pi / 2)
+        group.add(turned, beside(turned, table, side, _touch(rng)), float(low[1] + high[1]) / 2)
+    things = [fixtures.backpack(rng), tabletops.book_pile(rng), clutter.bowl(rng), tabletops.book(rng)]
+    strew_on(group, table, rng, [*things, *small_things.some(rng, small_things.ON_TABLES, 5)])
+    return group
+
+
+def push_under(group: Group, table: Furniture, chair: Furniture, x: float) -> Furniture:
+    """A chair before a table that faces +y, at `x` m from its middle, pushed until its back or its arms touch."""
+    low, high = table.bounds()
+    turned = chair.placed(0, 0, 0, np.pi)
+    stopped = _between(turned, float(high[2]) - APRON, float(high[2]))
+    y = float(high[1]) + TOUCHING[0] - float(stopped[:, 1].min())
+    return group.add(turned, float(low[0] + high[0]) / 2 + x, y)
+
+
+def _between(piece: Furniture, bottom: float, top: float) -> Float64:
+    """The points (N, 3) of a piece's parts that reach into the heights from `bottom` to `top`, m."""
+    solids = [solid.vertices for solid, _ in piece.parts]
+    reaching = [v for v in solids if v[:, 2].max() > bottom and v[:, 2].min() < top]
+    sections = [v[(v[:, 2] > bottom - SPACING) & (v[:, 2] < top + SPACING)] for v in reaching]
+    return np.concatenate(sections)
+
+
+def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
+    """Things on a flat top, wherever there is room, also touching each other. What finds no place is left out."""
+    low, high = table.bounds()
+    there: list[Furniture] = []
+    for thing in things:
+        for _ in range(PLACES):
+            place = _random_place(thing, low[:2] + RIM, high[:2] - RIM, rng)
+            box_low, box_high = place.bounds()
+            over_edge = (box_low[:2] < low[:2]).any() or (box_high[:2] > high[:2]).any()
+            if over_edge or any(_overlap(place, other) for other in there):
+                continue
+            there.append(group.add(place, z=on_top(table)))
+            break
+
+
+def _touch(rng: Rng) -> float:
+    return float(rng.uniform(*TOUCHING))
+
+
 def board_group(rng: Rng) -> Group:
-    """A low board full of books, a bag beside it."""
+    """A low board full of books in piles and rows, a bag leaning on it."""
     group = Group("board")
     board = clutter.low_board(rng)
     board = group.add(board, y=against_wall(board))
-    put_on(
-        group, board, rng, [tabletops.book_pile(rng), tabletops.book(rng), clutter.vase(rng), tabletops.book_pile(rng)]
-    )
+    things = [tabletops.book_pile(rng), small_things.book_row(rng), tabletops.book_pile(rng), clutter.vase(rng)]
+    things += [tabletops.book(rng), small_things.book_row(rng), *small_things.some(rng, small_things.ON_TABLES, 2)]
+    strew_on(group, board, rng, things)
     bag = fixtures.backpack(rng)
-    group.add(bag, beside(bag, board, 1, 0.05), against_wall(bag))
+    group.add(bag, beside(bag, board, 1, _touch(rng)), against_wall(bag))
+    return group
+
+
+def laden(name: str, support: Furniture, rng: Rng) -> Group:
+    """A cupboard or another tall thing with others on its top."""
+    group = single(name, support)
+    strew_on(group, group.pieces[0], rng, small_things.some(rng, small_things.ON_TOPS, 2))
     return group

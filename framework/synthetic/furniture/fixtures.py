@@ -60,7 +60,7 @@ def tv(rng: Rng) -> Furniture:
 
 def toilet(rng: Rng) -> Furniture:
     piece = Furniture("toilet", "toilet")
-    white = paints.paint(rng, (0.93, 0.93, 0.91), 0.95, 0.05)
+    white = paints.glaze(rng, (0.93, 0.93, 0.91), 0.95, 0.05)
     seat_color = paints.paint(rng, (0.88, 0.88, 0.86), 0.93, 0.05) if rng.uniform() < 0.6 else paints.wood(rng)
     chrome, water = paints.metal(rng, (0.78, 0.79, 0.80)), paints.paint(rng, (0.72, 0.80, 0.84))
     rim = rng.uniform(0.38, 0.41)

@@ -34,6 +34,11 @@ def dining_table(rng: Rng) -> Furniture:
     )
 
 
+def long_table(rng: Rng) -> Furniture:
+    """A rectangular dining table."""
+    return _table("table", rng.uniform(1.3, 1.7), rng.uniform(0.80, 0.92), 0.745, paints.wood(rng), 0.065)
+
+
 def desk(rng: Rng) -> Furniture:
     return _table("desk", rng.uniform(1.2, 1.45), rng.uniform(0.62, 0.72), 0.73, paints.wood(rng), 0.05)
 

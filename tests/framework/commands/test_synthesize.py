@@ -20,7 +20,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
 @pytest.mark.parametrize(
     ("arguments", "complaint"),
     [
-        (["--scenes", "011,012"], "there is no scene '012'; the scenes are: 011, 016"),
+        (["--scenes", "bedroom,011"], "there is no scene '011'; the scenes are: living_chairs, bedroom"),
         (["--scenes", ""], "there is no scene ''"),
         (["--jobs", "0"], "jobs must be at least 1"),
         (["--frames", "0"], "frames must be at least 1"),
@@ -46,8 +46,8 @@ def test_it_writes_all_scenes_unless_told_which(
     asked = []
     monkeypatch.setattr(synthesize, "write_scenes", lambda *arguments: asked.append(arguments))
     run(monkeypatch, str(tmp_path), "--jobs", "3")
-    run(monkeypatch, str(tmp_path), "--scenes", "061,016", "--seed", "2", "--frames", "30", "--width", "320")
+    run(monkeypatch, str(tmp_path), "--scenes", "couches,bedroom", "--seed", "2", "--frames", "30", "--width", "320")
     assert asked[0] == (tmp_path, SCENES, Recording(), 3)
-    assert list(asked[1][1]) == ["061", "016"]
+    assert list(asked[1][1]) == ["couches", "bedroom"]
     assert asked[1][2] == Recording(seed=2, frames=30, width=320)
-    assert f"dataset.root={tmp_path} dataset.scene=011" in capsys.readouterr().out
+    assert f"dataset.root={tmp_path} dataset.scene=living_chairs" in capsys.readouterr().out

@@ -101,8 +101,8 @@ def test_the_network_of_the_rooms_is_for_rendered_rooms_and_the_others_are_for_a
 def test_a_dataset_knows_whether_it_was_rendered(tmp_path: Path) -> None:
     """What `synthesize` writes says so; a folder of SceneNN itself does not."""
     assert Synthetic.domain == RENDERED_ROOMS
-    write_scenes(tmp_path / "rooms", {"011": SCENES["011"]}, Recording(frames=1, width=64), jobs=1)
-    assert SceneNN(tmp_path / "rooms").domain == RENDERED_ROOMS
+    write_scenes(tmp_path / "rooms", {"bedroom": SCENES["bedroom"]}, Recording(frames=1, width=64), jobs=1)
+    assert SceneNN(tmp_path / "rooms", scene="bedroom").domain == RENDERED_ROOMS
     (tmp_path / "real").mkdir()
     option_files.overrides("dataset", "scenenn", tmp_path / "real")
     assert SceneNN(tmp_path / "real").domain == ""

@@ -6,6 +6,7 @@ import pytest
 from framework.data import Camera
 from framework.sensor_noise import axial_sigma_at_angle
 from framework.synthetic.depth_camera import (
+    PATCH,
     DepthSensor,
     depth_step,
     noisy_color,
@@ -158,3 +159,52 @@ def test_the_grain_of_colour_is_rounded_and_clipped():
         expected = np.clip(np.rint(color + np.float32(noise * 1.5) * grain), 0, 255).astype(np.uint8)
         np.testing.assert_array_equal(noisy_color(color, noise, np.random.default_rng(1)), expected)
     assert noisy_color(color, 0.0, np.random.default_rng(1)) is color
+
+
+# Dark and shiny surfaces
+
+
+def measure_unread(unread, noise=1.0, seed=0):
+    wall = np.full(FRONT.shape, 2.0, np.float32)
+    unread = np.broadcast_to(np.float32(unread), FRONT.shape)
+    return DepthSensor(noise, 8.0).measure(wall, FRONT, CAMERA, np.random.default_rng([seed]), unread)
+
+
+def slow_loss(unread, noise, seed):
+    """Whether each pixel loses its reading: bilinear normal numbers, divided by their deviation, below a quantile."""
+    rng = np.random.default_rng([seed])
+    random_bits((*FRONT.shape, 4), rng)  # the sensor's own noise comes first
+    cell = PATCH * CAMERA.width / 640
+    rows, columns = (int(side / cell) + 2 for side in FRONT.shape)
+    nodes = normal_quantiles()[random_bits((rows, columns), rng) >> 4].astype(float)
+    y, x = np.arange(CAMERA.height) / cell, np.arange(CAMERA.width) / cell
+    of_rows = np.maximum(0, 1 - np.abs(y[:, None] - np.arange(rows)))
+    of_columns = np.maximum(0, 1 - np.abs(x[:, None] - np.arange(columns)))
+    deviation = np.sqrt((of_rows**2).sum(axis=1)[:, None] * (of_columns**2).sum(axis=1))
+    quantile = np.append(normal_quantiles(), np.inf)[(min(noise, 1) * unread * 4096).astype(int)]
+    return (of_rows @ nodes @ of_columns.T / deviation < quantile) & (unread >= 1 / 4096)
+
+
+@pytest.mark.parametrize("noise", [0.5, 1.0])
+def test_materials_lose_the_readings_that_a_slow_reference_loses(noise):
+    unread = np.random.default_rng(7).uniform(-0.3, 1.2, FRONT.shape).clip(0, 1).astype(np.float32)
+    for seed in range(2):
+        without = measure(np.full(FRONT.shape, 2.0), noise=noise, seed=seed)
+        found = measure_unread(unread, noise, seed)
+        expected = np.where(slow_loss(unread, noise, seed), 0, without)
+        assert 0.2 < (expected > 0).mean() < 0.9
+        assert (found != expected).mean() < 1e-4, "but for rounding at the quantile"
+
+
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
+def test_the_share_of_readings_lost_is_the_one_asked_for_and_comes_in_patches(share):
+    lost = np.array([measure_unread(share, seed=seed) == 0 for seed in range(20)])
+    assert lost.mean() == pytest.approx(share, abs=0.02)
+    beside = (lost[:, :, 1:] == lost[:, :, :-1]).mean()
+    assert beside > 1 - 0.3 * 2 * share * (1 - share), "neighbours are lost together"
+
+
+def test_a_screen_has_no_reading_and_other_surfaces_keep_all_theirs():
+    assert not measure_unread(1.0).any()
+    np.testing.assert_array_equal(measure_unread(0.0), measure(np.full(FRONT.shape, 2.0)))
+    assert measure_unread(1.0, noise=0.0).all(), "without noise readings are exact"

@@ -1,5 +1,7 @@
 """The renderer's geometry, to float precision."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from framework.data import Camera
@@ -171,3 +173,16 @@ def test_other_materials_change_the_colours_and_nothing_else():
     np.testing.assert_array_equal(other.color[..., 1:], picture.color[..., 1:])
     seen = picture.depth > 0
     assert (other.color[seen][:, 0] < picture.color[seen][:, 0]).all()
+
+
+def test_dark_materials_lose_their_share_and_shiny_ones_at_a_slant():
+    wall = panel(60.0, 60.0, 5.0).moved(z=-30).turned("x", 0.5).turned("z", 0.4)
+    T = look(np.array([0.3, 2.0, 0.2]), -1.9, -0.2, 0.1)
+    lamp = [globe(np.array([0.0, 2.0, 0.0]), 0.1, (1, 1, 1))]
+    for dark, shiny in ((0.0, 0.0), (0.3, 0.0), (0.2, 0.8)):
+        piece = Furniture("wall", None)
+        piece.add(wall, replace(GREY, dark=dark, shiny=shiny))
+        picture = Renderer(assemble([(0, piece)]), lamp).render(CAMERA, T)
+        turned = np.minimum(1, (1 - picture.incidence) / (1 - np.cos(np.deg2rad(60))))
+        assert np.ptp(turned) > 0.3
+        np.testing.assert_allclose(picture.unread, dark + (1 - dark) * shiny * turned, atol=1e-5)

@@ -100,17 +100,17 @@ def test_only_what_the_camera_sees_remains():
 def test_nothing_is_seen_beyond_the_reach_or_too_near():
     surfaces = scene(wall(4.0))
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
-    assert seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 6.0)).any()
-    assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 3.9)).any()
-    assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (4.1, 6.0)).any()
+    assert seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 6.0), surfaces.unreadable).any()
+    assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (0.4, 3.9), surfaces.unreadable).any()
+    assert not seen_from(surfaces.vertices, caster, CAMERA, [AHEAD], (4.1, 6.0), surfaces.unreadable).any()
 
 
 def test_one_view_after_the_other_adds_what_it_sees():
     surfaces = scene(wall(4.0))
     caster = RayCaster(surfaces.vertices, surfaces.triangles)
     aside = look(np.zeros(3), 0.3, 0.0, 0.0)
-    alone = [seen_from(surfaces.vertices, caster, CAMERA, [T], (0.4, 6.0)) for T in (AHEAD, aside)]
-    both = seen_from(surfaces.vertices, caster, CAMERA, [AHEAD, aside], (0.4, 6.0))
+    alone = [seen_from(surfaces.vertices, caster, CAMERA, [T], (0.4, 6.0), surfaces.unreadable) for T in (AHEAD, aside)]
+    both = seen_from(surfaces.vertices, caster, CAMERA, [AHEAD, aside], (0.4, 6.0), surfaces.unreadable)
     assert np.array_equal(both, alone[0] | alone[1])
     assert (alone[0] != alone[1]).any()
 
@@ -119,3 +119,20 @@ def test_negative_zero_is_zero():
     surfaces = scene(wall(4.0))
     signed = np.where(surfaces.vertices == 0, np.float32(-0.0), surfaces.vertices)
     assert len(tessellate(replace(surfaces, vertices=signed), 0.1).vertices) == len(tessellate(surfaces, 0.1).vertices)
+
+
+def test_a_screen_is_not_in_the_mesh_nor_what_lies_closely_behind_it():
+    objects = []
+    for instance, (side, x, dark) in enumerate(((3.0, 3.0, 0.9), (1.0, 2.998, 1.0))):
+        piece = Furniture("thing", None)
+        face = panel(side, side).moved(z=-side / 2).turned("z", np.pi / 2).moved(x=x)
+        piece.add(face, replace(GREY, dark=dark))
+        objects.append((instance, piece))
+    surfaces = assemble(objects)
+    np.testing.assert_array_equal(surfaces.unreadable, surfaces.instance_ids == 1)
+    mesh = visible_mesh(surfaces, RayCaster(surfaces.vertices, surfaces.triangles), CAMERA, [AHEAD], (0.4, 6.0), 0.05)
+    assert not mesh.instance_ids[mesh.triangles].any(), "of the screen at most points on its border are left"
+    across = np.abs(mesh.vertices[:, 1:]).max(axis=1)
+    np.testing.assert_allclose(across[mesh.instance_ids == 1], 0.5, atol=1e-6)
+    assert across.min() == pytest.approx(0.5, abs=0.05)
+    assert across.max() > 1.3

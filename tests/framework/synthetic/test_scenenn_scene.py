@@ -102,10 +102,11 @@ def test_clutter_never_has_the_name_of_a_class() -> None:
 
 @pytest.mark.parametrize("index", SHOWN)
 def test_the_mesh_shows_what_the_renderer_sees(scene: SceneNNScene, mesh: PlyMesh, index: int) -> None:
-    depth, instance_ids = scene.renderer.depth_and_ids(scene.camera, scene.path.pose(index))
+    picture = scene.renderer.render(scene.camera, scene.path.pose(index))
+    depth, instance_ids = picture.depth, picture.instance_ids
     hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
     met = hits.triangle != NO_TRIANGLE
-    assert met.mean() > 0.97, "holes only along what hides something"
+    assert met[picture.unread < 1].mean() > 0.97, "holes only along what hides something, and where nothing is read"
     same = met & (np.abs(hits.distance - depth) < 1e-3)
     assert same.sum() > 0.985 * met.sum()
     labels = mesh.properties["label"][mesh.triangles[hits.triangle, 0]]
@@ -120,7 +121,7 @@ def test_depth_is_in_millimetres_and_agrees_with_the_mesh(scene: SceneNNScene, m
     hits = RayCaster(mesh.vertices, mesh.triangles).cast(image_rays(scene.camera, poses(scene)[index]))
     read = (depth_mm > 0) & (hits.triangle != NO_TRIANGLE)
     error = np.abs(depth_mm[read] - 1000 * hits.distance[read])
-    assert read.mean() > 0.7
+    assert read.mean() > 0.6
     assert np.median(error / (hits.distance[read] ** 2)) < 3.0, "mm at 1 m: the sensor's noise grows with the square"
     color = read_color(color_file)
     assert color.shape == (*scene.camera.shape, 3)
@@ -134,7 +135,7 @@ def test_the_camera_is_scenenns() -> None:
     assert RECORDING.release == f"synthetic {GENERATION}, seed 3, 9 frames"
 
 
-@pytest.mark.parametrize("wrong", [{"seed": -1}, {"frames": 0}, {"width": 8}, {"width": 162}])
-def test_impossible_recordings_are_refused(wrong: dict[str, int]) -> None:
+@pytest.mark.parametrize("wrong", [{"seed": -1}, {"frames": 0}, {"width": 8}, {"width": 162}, {"haste": 0.0}])
+def test_impossible_recordings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
         Recording(**wrong)
