@@ -21,6 +21,7 @@ from framework.files.search_paths import CONF
 from framework.interfaces import ClusterRefiner, MapFuser
 from framework.records.provenance import config_hash
 from framework.registry import build
+from framework.synthetic.benchmark import SCENES
 from framework.tables.published import read_published
 
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -173,7 +174,8 @@ def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
     assert (config.hydra.runtime.choices.detector, config.dataset.frame_truth) == ("simulated_yolo11n", True)
-    assert not set(config.sequences.all.split(",")) & set(read_published("table3").sequences)
+    assert config.sequences.all.split(",") == list(SCENES)
+    assert not set(SCENES) & set(read_published("table3").sequences)
     assert set(config.hydra.sweeper.params["dataset.scene"].split(",")) <= set(config.sequences.all.split(","))
 
 
