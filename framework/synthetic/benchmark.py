@@ -143,10 +143,10 @@ class Scene:
     rng: Rng
 
 
-def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, haste: float) -> Scene:
+def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, stride: float) -> Scene:
     """The scene of this spec that a walk of `frames` frames shows most of, among several drawn from `stream`.
 
-    `haste` is the walk's, see walk.plan_path.
+    `stride` is the walk's, see walk.plan_path.
 
     Raises DataError when in none of them the furniture fits.
     """
@@ -155,7 +155,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, haste: float
     for attempt in range(ATTEMPTS):
         rng = np.random.default_rng([*stream, attempt])
         try:
-            scene, shown = _draw_scene(spec, frames, haste, rng)
+            scene, shown = _draw_scene(spec, frames, stride, rng)
         except DataError:
             continue
         if shown > most_shown:
@@ -167,7 +167,7 @@ def plan_scene(spec: SceneSpec, stream: Sequence[int], frames: int, haste: float
     return best
 
 
-def _draw_scene(spec: SceneSpec, frames: int, haste: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
+def _draw_scene(spec: SceneSpec, frames: int, stride: float, rng: Rng) -> tuple[Scene, tuple[float, float]]:
     """A scene, and the shares of its classes and of its objects of a class that its walk shows well."""
     room = furnish_scene(spec, rng)
     surfaces = room.surfaces
@@ -177,7 +177,7 @@ def _draw_scene(spec: SceneSpec, frames: int, haste: float, rng: Rng) -> tuple[S
     def labels(T_world_camera: Float64) -> Int32:
         return ids_met(surfaces, caster, SMALL_VIEW, T_world_camera)
 
-    path = plan_path(room.layout, frames, labels, set(wanted), rng, haste)
+    path = plan_path(room.layout, frames, labels, set(wanted), rng, stride)
     views = [labels(path.pose(k)) for k in range(0, frames, -(-frames // JUDGED_VIEWS))]
     seen = [i for i in wanted if np.mean([np.count_nonzero(view == i) >= WELL_SEEN for view in views]) >= LONG_SEEN]
     classes = len({wanted[i] for i in seen}) / len(set(wanted.values()))

@@ -71,7 +71,8 @@ class Recording:
     """What all scenes of one benchmark folder have in common."""
 
     seed: int = 0
-    frames: int = 240  # of each scene, at 30 Hz
+    frames: int = 120  # of each scene
+    rate: float = 10.0  # Hz, of the frames: few show the same thing
     width: int = 640  # px, the height is 3/4 of it
     haste: float = 2.0  # of the walk: 1 = slowly, as a person should record; objects are seen in fewer frames, and blur
 
@@ -79,6 +80,8 @@ class Recording:
         for name, lowest in (("seed", 0), ("frames", 1), ("width", 16)):
             if getattr(self, name) < lowest:
                 raise ConfigError(f"{name} must be at least {lowest}, found {getattr(self, name)}")
+        if not 0 < self.rate <= FRAME_RATE:
+            raise ConfigError(f"rate must be above 0 and at most {FRAME_RATE:.0f} Hz, found {self.rate}")
         if not 0 < self.haste <= FASTEST:
             raise ConfigError(f"haste must be above 0 and at most {FASTEST}, found {self.haste}")
         if self.width % 4:
@@ -87,6 +90,11 @@ class Recording:
     @property
     def camera(self) -> Camera:
         return ASUS.scaled(self.width / ASUS.width)
+
+    @property
+    def stride(self) -> float:
+        """How far the walk goes from frame to frame, in frames of a walk without haste at FRAME_RATE."""
+        return self.haste * FRAME_RATE / self.rate
 
     @property
     def release(self) -> str:
@@ -103,7 +111,7 @@ class SceneNNScene:
             (folder / kind).mkdir(parents=True, exist_ok=True)
         self.camera = recording.camera
         self._stream = [recording.seed, zlib.crc32(folder.name.encode())]  # a scene is a random stream of its own
-        scene = plan_scene(spec, self._stream, recording.frames, recording.haste)
+        scene = plan_scene(spec, self._stream, recording.frames, recording.stride)
         self.room, self.path = scene.room, scene.path
         self.renderer = Renderer(self.room.surfaces, list(self.room.lamps))
         self._sensor = DepthSensor(NOISE, MAX_RANGE)
@@ -118,7 +126,7 @@ class SceneNNScene:
         picture = self.renderer.render(self.camera, T_world_camera)
         rng = np.random.default_rng([*self._stream, index])
         depth = self._sensor.measure(picture.depth, picture.incidence, self.camera, rng, picture.unread)
-        ends = (self.path.pose(index + half * FRAME_RATE * EXPOSURE) for half in (-0.5, 0.5))
+        ends = (self.path.pose(index + half * self.recording.rate * EXPOSURE) for half in (-0.5, 0.5))
         exposed = blurred(picture.color, picture.depth, self.camera, T_world_camera, *ends)
         color = noisy_color(exposed, NOISE, rng)
         color_file, depth_file = frame_files(self.folder, index)
@@ -162,7 +170,7 @@ class SceneNNScene:
         """The timestamps and the trajectory, which come last: where the trajectory is, the scene is complete."""
         frames = range(self.recording.frames)
         with written_whole(self.folder / "timestamp.txt") as temporary:
-            times = [round(1e6 * index / FRAME_RATE) for index in frames]
+            times = [round(1e6 * index / self.recording.rate) for index in frames]
             temporary.write_text("".join(f"{k} {time} {time}\n" for k, time in enumerate(times, start=1)))
         poses = {index: T_YUP_ZUP @ self.path.pose(index) for index in frames}
         write_trajectory_log(trajectory_file(self.folder), poses)

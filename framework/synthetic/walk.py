@@ -68,16 +68,16 @@ def plan_path(
     labels: LabelView,
     wanted: set[int],
     rng: np.random.Generator,
-    haste: float = 1.0,
+    stride: float = 1.0,
 ) -> CameraPath:
-    """The walk whose `frames` frames see most of the `wanted` instances, `haste` times as fast as it should be gone.
+    """The walk whose `frames` frames see most of the `wanted` instances, with only every `stride`-th frame.
 
     Raises DataError without room to walk.
     """
     center, radii = _widest_ellipse(layout)
     turn = 1 if rng.uniform() < 0.5 else -1
     path = CameraPath(center, radii, float(rng.uniform(*EYE_HEIGHT)), 0.0, turn, rng.uniform(0, 2 * np.pi, 4))
-    speed = haste * _allowed_phase_speed(path)
+    speed = stride * _allowed_phase_speed(path)
     start = _best_start(path, turn * speed * (frames - 1) / FRAME_RATE, labels, wanted)
     return CameraPath(center, radii, path.height, start, turn, path.sway, speed)
 

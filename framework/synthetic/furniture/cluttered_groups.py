@@ -105,14 +105,17 @@ def _scatter(
     They lie beside the other pieces and beside each other, but on blankets. What finds no place is left out.
     """
     lying = [*lying]
+    in_the_way = [np.stack(piece.bounds()) for piece in lying[1:]]
     for thing in things:
         for _ in range(PLACES):
             place = _random_place(thing, low, high, rng)
-            box_low, box_high = place.bounds()
-            if any(_overlap(place, other) for other in lying[1:] if other.kind != "blanket"):
+            box = np.stack(place.bounds())
+            if any(_overlap(box, other) for other in in_the_way):
                 continue
-            z = _height(lying, np.maximum(box_low[:2], low), np.minimum(box_high[:2], high))
+            z = _height(lying, np.maximum(box[0, :2], low), np.minimum(box[1, :2], high))
             lying.append(group.add(place, z=z - SINK))
+            if thing.kind != "blanket":
+                in_the_way.append(box)
             break
 
 
@@ -126,10 +129,9 @@ def _random_place(thing: Furniture, low: Float64, high: Float64, rng: Rng) -> Fu
     return turned.placed(float(x), float(y))
 
 
-def _overlap(piece: Furniture, other: Furniture) -> bool:
-    """Whether two pieces' boxes share ground, seen from above."""
-    (low, high), (other_low, other_high) = piece.bounds(), other.bounds()
-    return bool((np.minimum(high, other_high)[:2] > np.maximum(low, other_low)[:2]).all())
+def _overlap(box: Float64, other: Float64) -> bool:
+    """Whether two boxes (2, 3) share ground, seen from above."""
+    return bool((np.minimum(box[1], other[1])[:2] > np.maximum(box[0], other[0])[:2]).all())
 
 
 def _height(pieces: list[Furniture], low: Float64, high: Float64) -> float:
@@ -214,15 +216,16 @@ def _between(piece: Furniture, bottom: float, top: float) -> Float64:
 def strew_on(group: Group, table: Furniture, rng: Rng, things: list[Furniture]) -> None:
     """Things on a flat top, wherever there is room, also touching each other. What finds no place is left out."""
     low, high = table.bounds()
-    there: list[Furniture] = []
+    there: list[Float64] = []
     for thing in things:
         for _ in range(PLACES):
             place = _random_place(thing, low[:2] + RIM, high[:2] - RIM, rng)
-            box_low, box_high = place.bounds()
-            over_edge = (box_low[:2] < low[:2]).any() or (box_high[:2] > high[:2]).any()
-            if over_edge or any(_overlap(place, other) for other in there):
+            box = np.stack(place.bounds())
+            over_edge = (box[0, :2] < low[:2]).any() or (box[1, :2] > high[:2]).any()
+            if over_edge or any(_overlap(box, other) for other in there):
                 continue
-            there.append(group.add(place, z=on_top(table)))
+            group.add(place, z=on_top(table))
+            there.append(box)
             break
 
 
