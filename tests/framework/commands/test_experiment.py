@@ -179,7 +179,7 @@ def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
     assert set(config.hydra.sweeper.params["dataset.scene"].split(",")) <= set(config.sequences.all.split(","))
 
 
-@pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 80), ("scenenn", 1000)])
+@pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
 def test_what_is_in_progress_depends_on_how_long_the_sequences_are(sequences: str, stop: int) -> None:
     config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
     assert config.dataset.stop == stop
