@@ -361,9 +361,10 @@ def test_two_processes_may_share_a_folder(tmp_path: Path) -> None:
         assert process.returncode == 0, said
         assert "damaged" not in said
     detector = CachedDetector(SphereDetector(), tmp_path / "cache")
-    for frame in CornerRoom():
-        assert_same(SphereDetector().detect(frame), detector.detect(frame))
-    assert detector.hits > 0
+    for _ in range(2):  # what the two left, which may be nothing, and then all
+        for frame in CornerRoom():
+            assert_same(SphereDetector().detect(frame), detector.detect(frame))
+    assert detector.hits >= len(CornerRoom())
     assert not list(tmp_path.rglob(".*"))
 
 
