@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import IntEnum
 
@@ -141,7 +142,8 @@ class SimulatedDetector(Detector):
     def detect(self, frame: Frame) -> Detections:
         truth = true_instances(frame, self.classes, self.min_pixels)
         pairs = touching_pairs(frame).tolist()
-        candidates = self._clutter(frame) + self._merge(self._attached(truth, pairs, frame), pairs, frame)
+        things = self._things(frame) if self.clutter_rate > 0 or self.attach_rate > 0 else {}
+        candidates = self._clutter(things) + self._merge(self._attached(truth, things, pairs), pairs, frame)
         candidates = [candidate for candidate in candidates if self._sees(candidate, frame)]
         candidates = [part for candidate in candidates for part in self._split(candidate, frame)]
         candidates = [self._reshape(candidate, frame) for candidate in candidates]
@@ -167,15 +169,12 @@ class SimulatedDetector(Detector):
     def _random(self, draw: Draw, *key: int) -> np.random.Generator:
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
-    def _clutter(self, frame: Frame) -> list[Candidate]:
+    def _clutter(self, things: Mapping[int, Bool]) -> list[Candidate]:
         """The things of unknown class that are taken for objects: in all frames the same ones, of the same class."""
-        if self.clutter_rate == 0:
-            return []
-        largest = LARGEST_CLUTTER * frame.depth.size
         candidates = []
-        for instance, mask in self._things(frame).items():
+        for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
-            if random.random() < self.clutter_rate and np.count_nonzero(mask) <= largest:
+            if random.random() < self.clutter_rate and np.count_nonzero(mask) <= LARGEST_CLUTTER * mask.size:
                 class_id = self.classes.index(TAKEN_FOR[random.integers(len(TAKEN_FOR))])
                 candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
         return candidates
@@ -188,15 +187,12 @@ class SimulatedDetector(Detector):
         chosen = [i for i in found[areas >= self.min_pixels].tolist() if i > 0 and names.get(i) is None]
         return {i: frame.truth.instance_ids == i for i in chosen}
 
-    def _attached(self, truth: TrueInstances, pairs: list[list[int]], frame: Frame) -> list[Candidate]:
+    def _attached(self, truth: TrueInstances, things: Mapping[int, Bool], pairs: list[list[int]]) -> list[Candidate]:
         """The instances, largest first, some of them with things that touch them."""
         candidates = {
             i: Candidate(i, 0, c, mask, mask)
             for i, c, mask in zip(truth.ids.tolist(), truth.class_ids.tolist(), truth.masks, strict=True)
         }
-        if self.attach_rate == 0:
-            return list(candidates.values())
-        things = self._things(frame)
         for first, second in pairs:
             for instance, thing in ((first, second), (second, first)):
                 if instance not in candidates or thing not in things:

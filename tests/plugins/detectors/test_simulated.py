@@ -308,8 +308,15 @@ def test_ghosts_stay_at_their_places_of_the_world():
     assert counts.max() > 20, "the first place is chosen whenever there is a ghost"
     first = np.array(places)[np.array(classes) == np.bincount(classes).argmax()]
     assert np.ptp(first) < 0.55, "a place is 0.5 m wide, and its visible part has its middle in it"
-    nowhere = detector.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {})))
-    assert len(nowhere) == len(detector.detect(replace(frame(), truth=FrameTruth(np.zeros_like(IDS), {}))))
+
+
+def test_without_poses_false_detections_are_anywhere():
+    detector = replace(PERFECT, false_positives=1.0, ghost_share=1.0)
+    empty = [replace(frame(k), truth=FrameTruth(np.zeros_like(IDS), {})) for k in range(5)]
+    found = [detector.detect(one) for one in empty]
+    assert sum(map(len, found)) > 0
+    anywhere = replace(detector, ghost_share=0.0)
+    assert all(same(a, anywhere.detect(one)) for a, one in zip(found, empty, strict=True))
 
 
 def test_the_scale_of_scores():
