@@ -130,6 +130,11 @@ class SceneMap(ABC):
         """Bytes that the map's arrays take."""
 
     @property
+    def depth_range(self) -> tuple[float, float]:
+        """m: readings that are nearer or farther leave nothing in the map."""
+        return 0.0, float("inf")
+
+    @property
     def evictions(self) -> int:
         """How often a voxel had to forget a label for want of room; a map that never forgets leaves it at 0."""
         return 0

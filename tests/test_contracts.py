@@ -289,6 +289,17 @@ def test_fuser_takes_a_frame_without_detections_or_depth(fuser: MapFuser, room: 
     assert not fuser.scene.instances()
 
 
+def test_fuser_maps_the_depths_that_it_says(fuser: MapFuser, room: CornerRoom) -> None:
+    nearest, farthest = fuser.scene.depth_range
+    frame, pose = room[0], Pose(pose_at(0))
+    nothing = lift(Detections.none(CAMERA.shape, CLASSES), frame, pose)
+    for depth in (0.99 * nearest, 1.01 * farthest):
+        fuser.fuse(replace(frame, depth=np.full(CAMERA.shape, depth, np.float32)), pose, nothing)
+    assert not len(fuser.scene.mesh().vertices)
+    fuser.fuse(replace(frame, depth=np.full(CAMERA.shape, nearest + 0.1, np.float32)), pose, nothing)
+    assert len(fuser.scene.mesh().vertices)
+
+
 def test_fusers_map_survives_saving(fuser: MapFuser, tmp_path: Path) -> None:
     scene = fused(fuser, frames=3).scene
     path = tmp_path / "map.npz"

@@ -54,6 +54,10 @@ class InstanceMap(SceneMap):
         return self.volume.voxels.byte_count + self.labels.byte_count
 
     @property
+    def depth_range(self) -> tuple[float, float]:
+        return self.volume.sensor.depth_range
+
+    @property
     def evictions(self) -> int:
         return self.labels.evicted
 

@@ -25,6 +25,11 @@ class Sensor(NamedTuple):
         """The widest truncation distance, m."""
         return float(self.truncation + self.truncation_slope * self.max_depth)
 
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """m: readings that are nearer or farther are not integrated."""
+        return float(self.min_depth), float(self.max_depth)
+
 
 class Pinhole(NamedTuple):
     """A camera and its pose as the kernels see them, float32."""

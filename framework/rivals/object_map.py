@@ -76,6 +76,10 @@ class ObjectMap(SceneMap):
         return self.background.voxels.byte_count + sum(volume.byte_count for volume in self.volumes.values())
 
     @property
+    def depth_range(self) -> tuple[float, float]:
+        return self.background.sensor.depth_range
+
+    @property
     def instance_count(self) -> int:
         """Without the condition on their area, which takes a mesh."""
         return self.confirmation.count(self.table)

@@ -43,6 +43,10 @@ class Open3DMap(SceneMap):
         return self.grid.byte_count
 
     @property
+    def depth_range(self) -> tuple[float, float]:
+        return self.grid.settings.min_depth, self.grid.settings.max_depth
+
+    @property
     def instance_count(self) -> int:
         """Without the condition on their area, which takes a mesh."""
         return self.confirmation.count(self.table)

@@ -138,7 +138,7 @@ class VoxelHashingIcp(PoseTracker):
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         seen = FrameFeatures(frame, self._keyframes.extractor)
         if self._T_world_last is None or scene.voxel_count == 0:
-            return self._first(seen)
+            return self._first(seen, scene)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
         T_world_predicted = self._T_world_last @ self._T_last_next
@@ -184,7 +184,7 @@ class VoxelHashingIcp(PoseTracker):
         again = self._align_twice(levels, scene, self._T_world_doubted)
         return alignment if again.reason else again
 
-    def _first(self, seen: FrameFeatures) -> Pose:
+    def _first(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """The pose that defines the world, of the first frame with something in it to be tracked by."""
         frame = seen.frame
         if min(frame.camera.shape) * self.finest < SMALLEST * 2 ** (LEVELS - 1):
@@ -193,10 +193,11 @@ class VoxelHashingIcp(PoseTracker):
                 f"{self.finest:g}: {LEVELS} levels from there leave less than {SMALLEST} px"
             )
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
-        readings = np.count_nonzero(frame.depth) / frame.depth.size
+        nearest, farthest = scene.depth_range
+        readings = np.mean((frame.depth > 0) & (frame.depth >= nearest) & (frame.depth <= farthest))
         if readings < max(self.min_visible, 1 / frame.depth.size):
-            reason = "the frame has no depth" if readings == 0 else f"the first frame has depth in only {readings:.1%}"
-            return Pose(T_world_camera, lost=True, reason=reason)
+            few = f"{readings:.1%} of the pixels have a depth that is mapped, {nearest:g} to {farthest:g} m"
+            return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
         return self._trusted(seen, T_world_camera)
 
     def _is_jump(self, T_last_next: Float64) -> bool:

@@ -143,8 +143,17 @@ def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str)
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
     poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    assert poses[0].lost and poses[0].reason
     assert not any(pose.lost for pose in poses[1:])
     assert drift(poses[-1], frames[-1])[0] < 0.004
+
+
+def test_poses_are_not_copied_from_the_truth_while_nothing_can_be_mapped() -> None:
+    far = [dataclasses.replace(f, depth=100 * f.depth) for f in (room().frame(T, k) for k, T in enumerate(walk(4)))]
+    poses, scene = run(VoxelHashingIcp(finest=1.0), far)
+    assert scene.voxel_count == 0
+    assert all(pose.lost for pose in poses)
+    assert poses[-1].reason == "0.0% of the pixels have a depth that is mapped, 0.2 to 4 m"
 
 
 def test_a_thing_taken_away_leaves_no_ghost_that_tracking_is_lost_by() -> None:
