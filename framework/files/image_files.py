@@ -1,7 +1,8 @@
 """Images read strictly: a damaged file is an error, never a half-grey picture.
 
-Pillow reads the headers and a PNG's checksums. It accepts a JPEG that was cut off, and a PNG without its last bytes:
-the end is looked for here.
+Pillow reads the headers and a PNG's checksums, but accepts files without their end: it is looked for here. JPEGs have no
+checksums. libjpeg fills up what it cannot decode and calls that a warning, on which OpenCV is silent; simplejpeg makes
+an error of it, and gives the same pixels.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import simplejpeg
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
@@ -33,7 +35,10 @@ def read_color(path: Path) -> UInt8:
 
 def decode_color(name: Path | str, data: bytes) -> UInt8:
     """Likewise, of what such a file holds; `name` is for messages."""
-    image = _decode(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
+    check_image(name, data)
+    if data.startswith(JPEG_START):
+        return _decode_jpeg(name, data)
+    image = _decode_png(name, data, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION | cv2.IMREAD_ANYDEPTH)
     if image.dtype != np.uint8:
         raise FrameError(f"{name}: colour must be 8 bits a channel, found {image.dtype}")
     return np.asarray(image, np.uint8)
@@ -41,7 +46,9 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 def read_uint16(path: Path) -> UInt16:
     """The (H, W) uint16 values of a PNG file. Raises FrameError when it is damaged or of another type."""
-    image = _decode(path, _read(path), cv2.IMREAD_UNCHANGED)
+    data = _read(path)
+    check_image(path, data)
+    image = _decode_png(path, data, cv2.IMREAD_UNCHANGED)
     if image.dtype != np.uint16 or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
         raise FrameError(f"{path} must be a PNG with one channel of uint16, found {channels} of {image.dtype}")
@@ -55,8 +62,14 @@ def _read(path: Path) -> bytes:
         raise FrameError(str(error)) from error
 
 
-def _decode(name: Path | str, data: bytes, flags: int) -> Array:
-    check_image(name, data)
+def _decode_jpeg(name: Path | str, data: bytes) -> UInt8:
+    try:
+        return np.asarray(simplejpeg.decode_jpeg(data, colorspace="RGB", strict=True), np.uint8)
+    except ValueError as error:
+        raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
+
+
+def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error:
@@ -69,7 +82,7 @@ def _decode(name: Path | str, data: bytes, flags: int) -> Array:
 def check_image(name: Path | str, data: bytes) -> None:
     """Raises FrameError unless `data` is a whole PNG or JPEG file with a picture of a usual size.
 
-    OpenCV decodes a JPEG that ends too early without a word (seen in 4.x) and allocates whatever a header claims.
+    Decoders allocate whatever a header claims.
     """
     if not data:
         raise FrameError(f"{name} is empty")

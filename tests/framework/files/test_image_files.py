@@ -1,0 +1,69 @@
+"""JPEG and PNG files: whole ones are read to the pixel, damaged ones are refused."""
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.errors import FrameError
+from framework.files.image_files import decode_color, read_uint16
+
+RNG = np.random.default_rng(0)
+PICTURE = cv2.GaussianBlur(RNG.integers(0, 256, (96, 128, 3), np.uint8), (0, 0), 2)
+JPEG = cv2.imencode(".jpg", PICTURE)[1].tobytes()
+START_OF_SCAN, END = b"\xff\xda", b"\xff\xd9"
+
+
+def message(data: bytes) -> str:
+    with pytest.raises(FrameError) as caught:
+        decode_color("picture.jpg", data)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "parameters",
+    [
+        (cv2.IMWRITE_JPEG_QUALITY, 30),
+        (cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
+        (cv2.IMWRITE_JPEG_RST_INTERVAL, 4),
+        (cv2.IMWRITE_JPEG_SAMPLING_FACTOR, cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444),
+    ],
+)
+def test_jpegs_have_opencvs_pixels(parameters: tuple[int, int]) -> None:
+    data = cv2.imencode(".jpg", PICTURE, parameters)[1]
+    np.testing.assert_array_equal(decode_color("x", data.tobytes()), cv2.imdecode(data, cv2.IMREAD_COLOR_RGB))
+
+
+def test_grey_jpegs_have_three_equal_channels() -> None:
+    grey = cv2.imencode(".jpg", PICTURE[..., 0])[1]
+    np.testing.assert_array_equal(decode_color("x", grey.tobytes()), cv2.imdecode(grey, cv2.IMREAD_COLOR_RGB))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
+def test_a_jpeg_that_was_cut_and_closed_is_damaged(share: float) -> None:
+    """OpenCV gives a picture that is grey from the cut on."""
+    data = JPEG[: int(share * len(JPEG))] + END
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR) is not None
+    assert message(data).startswith("picture.jpg is damaged: ")
+
+
+def test_a_jpeg_with_a_corrupt_block_is_damaged() -> None:
+    """Of its entropy-coded data: noise that is no code, ends too late, or has markers in it."""
+    first = JPEG.index(START_OF_SCAN) + 14
+    seen = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        at = int(rng.integers(first, len(JPEG) - 102))
+        data = JPEG[:at] + rng.bytes(100) + JPEG[at + 100 :]
+        try:
+            decode_color("picture.jpg", data)
+        except FrameError:
+            seen += 1
+    assert seen >= 36, "noise may be valid code by chance: a JPEG has no checksums"
+
+
+def test_a_jpeg_is_no_depth(tmp_path) -> None:
+    path = tmp_path / "depth.png"
+    path.write_bytes(JPEG)
+    with pytest.raises(FrameError, match="must be a PNG with one channel of uint16"):
+        read_uint16(path)
