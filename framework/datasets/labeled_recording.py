@@ -10,6 +10,7 @@ from pathlib import Path
 from framework.data import FrameTruth, SceneTruth
 from framework.datasets.labeled_mesh import LabeledMesh
 from framework.datasets.recording import Recording
+from framework.files.whole_files import is_there
 
 log = logging.getLogger(__name__)
 
@@ -39,7 +40,7 @@ class LabeledRecording(Recording):
 
 def mesh_of(files: Sequence[Path], read: Callable[..., LabeledMesh]) -> LabeledMesh | None:
     """What `read` makes of the files; None, with a word in the log where only some are missing, without all of them."""
-    missing = [path for path in files if not path.exists()]
+    missing = [path for path in files if not is_there(path)]
     if 0 < len(missing) < len(files):
         log.warning("no true instances: %s is missing", missing[0])
     return None if missing else read(*files)

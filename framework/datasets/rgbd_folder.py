@@ -31,6 +31,7 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.files.image_files import read_uint16
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import TumLine, read_tum_lines
+from framework.files.whole_files import is_there
 from framework.label_spaces import COCO
 
 CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
@@ -104,9 +105,9 @@ class RgbdFolder(Recording):
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
         """The class of each instance, and each frame's image of instances; nothing where nobody labelled them."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
-        if not folder.is_dir() and not names.is_file():
+        if not is_there(folder) and not is_there(names):
             return {}, []
-        if not names.is_file():
+        if not is_there(names):
             raise DataError(f"{folder} is there, but {names} is missing: it names the class of each instance")
         class_names = _read_class_names(names)
         images = numbered_images(folder, (".png",))
@@ -142,7 +143,7 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
 
 def _read_poses(path: Path, frames: int) -> list[TumLine] | None:
     """Each frame's line, which may be no pose; None without the file."""
-    if not path.is_file():
+    if not is_there(path):
         return None
     poses = read_tum_lines(path)
     if len(poses) != frames:

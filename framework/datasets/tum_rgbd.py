@@ -29,6 +29,7 @@ from framework.datasets.undistortion import Distortion
 from framework.errors import ConfigError, DataError
 from framework.files.number_lines import SHOWN, read_lines
 from framework.files.tum_trajectory import TumLine, read_tum_lines
+from framework.files.whole_files import is_there
 from framework.geometry import interpolate
 from framework.parameters import require
 
@@ -125,7 +126,7 @@ class Trajectory:
     @classmethod
     def read(cls, path: Path, max_difference: float) -> Trajectory:
         """The trajectory of a file, empty where there is none."""
-        lines = sorted(read_tum_lines(path), key=lambda line: line.timestamp) if path.exists() else []
+        lines = sorted(read_tum_lines(path), key=lambda line: line.timestamp) if is_there(path) else []
         return cls(lines, np.array([line.timestamp for line in lines]), max_difference)
 
     def at(self, timestamp: float) -> Float64 | None:

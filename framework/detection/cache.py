@@ -24,8 +24,8 @@ from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)
 
-FORMAT = 1  # of the entries: another one makes other keys, so that no entry is ever misread
-CHECKSUM_BYTES = 32  # SHA-256 before an entry's content
+FORMAT = 2  # of the entries: another one makes other keys, so that no entry is ever misread
+CHECKSUM_BYTES = 32  # SHA-256 of an entry's place and content, before the content
 SUFFIX = ".detections"
 FRAME_FIELDS = tuple(field.name for field in fields(Frame))
 KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored as they are
@@ -113,20 +113,25 @@ class CachedDetector(Detector):
         except OSError as error:
             log.warning("detection cache: %s could not be read (%s): detected again", path, error.strerror)
             return None
-        content = memoryview(data)[CHECKSUM_BYTES:]
-        if hashlib.sha256(content).digest() != data[:CHECKSUM_BYTES]:
-            log.warning("detection cache: %s is damaged: detected again", path)
+        content = data[CHECKSUM_BYTES:]
+        if _checksum(path, content) != data[:CHECKSUM_BYTES]:
+            log.warning("detection cache: %s is damaged, or another entry's: detected again", path)
             return None
-        return unpack(bytes(content), self.classes)
+        return unpack(content, self.classes)
 
     def _write(self, path: Path, detections: Detections) -> None:
         content = pack(detections)
         try:
             with written_whole(path) as temporary:
-                temporary.write_bytes(hashlib.sha256(content).digest() + content)
+                temporary.write_bytes(_checksum(path, content) + content)
         except DataError as error:
             self._writes = False
             log.warning("detection cache: %s; nothing more is stored in this run", error)
+
+
+def _checksum(path: Path, content: bytes) -> bytes:
+    """Of an entry: one that was moved to another frame's or detector's place does not hold."""
+    return hashlib.sha256(f"{path.parent.name}/{path.name}\n".encode() + content).digest()
 
 
 def identity_of(detector: Detector) -> str:

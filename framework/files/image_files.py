@@ -1,8 +1,8 @@
 """Images read strictly: a damaged file is an error, never a half-grey picture.
 
-Pillow reads the headers and a PNG's checksums, but accepts files without their end: it is looked for here. JPEGs have no
-checksums. libjpeg fills up what it cannot decode and calls that a warning, on which OpenCV is silent; simplejpeg makes
-an error of it, and gives the same pixels.
+Pillow reads the headers and a PNG's checksums, but accepts files without their end: it is looked for here. JPEGs have
+no checksums. libjpeg fills up what it cannot decode and calls that a warning, on which OpenCV is silent; simplejpeg
+makes an error of it, and gives the same pixels.
 """
 
 from __future__ import annotations

@@ -33,6 +33,13 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def is_there(path: Path) -> bool:
+    """Whether a file that may be missing was given: a link to nothing, or a folder of its name, is to be complained of
+    by who reads it.
+    """
+    return os.path.lexists(path)
+
+
 def read_bytes(path: Path, most: int) -> bytes:
     """What a file holds. Raises DataError, naming it, when it cannot be read or has more than `most` bytes."""
     try:

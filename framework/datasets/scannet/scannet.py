@@ -38,6 +38,7 @@ from framework.datasets.scannet.sens_file import SensFile, open_sens
 from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import PrintedMatrix, read_matrix
+from framework.files.whole_files import is_there
 from framework.geometry import inverse, rotation_angle
 
 MESH, SEGMENTS, OBJECTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"
@@ -62,7 +63,7 @@ class ScanNet(LabeledRecording):
     def open(self) -> Contents:
         above = self.folder.resolve().parents[:2]
         tables = [parent / name for name in (FIRST_LABEL_TABLE, LABEL_TABLE) for parent in reversed(above)]
-        self._label_tables = [table for table in tables if table.exists()]
+        self._label_tables = [table for table in tables if is_there(table)]
         files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
         self.mesh = mesh_of(files, self._read_mesh)
         if self.mesh is None and self.frame_truth:
@@ -122,7 +123,7 @@ def _exported_contents(folder: Path) -> Contents:
     depth_camera = _camera(intrinsic / "intrinsic_depth.txt", *_first_size(depths.values(), read_uint16))
     color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *_first_size(colors.values(), read_color))
     extrinsics = [intrinsic / f"extrinsic_{name}.txt" for name in ("color", "depth")]
-    if all(path.exists() for path in extrinsics):
+    if all(map(is_there, extrinsics)):
         _warn_of_parallax(intrinsic, read_matrix(extrinsics[0]), read_matrix(extrinsics[1]), depth_camera)
     registration = _registration(intrinsic, color_camera, depth_camera)
     # a frame of which one image is missing is there: reading it says which

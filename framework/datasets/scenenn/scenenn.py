@@ -33,7 +33,7 @@ from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_trajec
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError, FrameError
 from framework.files.ply import read_ply
-from framework.files.whole_files import read_text
+from framework.files.whole_files import is_there, read_text
 from framework.label_spaces import SCENENN_TO_COCO
 
 DEPTH_SCALE = 1000.0  # units a metre
@@ -116,12 +116,12 @@ def _camera(ini: Path, images: Iterable[Path]) -> Camera:
 
 
 def _optional_poses(path: Path) -> TrajectoryLog | None:
-    return read_trajectory_log(path) if path.exists() else None
+    return read_trajectory_log(path) if is_there(path) else None
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
     """The times of all of these images, or of none: two clocks do not mix."""
-    if not path.exists():
+    if not is_there(path):
         return {}
     times = read_timestamps(path)
     without = [k for k in images if k not in times]
@@ -181,5 +181,5 @@ def _is_of_another_class(label: Annotated | None) -> bool:
 
 def _named_release(root: Path) -> str:
     path = root / "release.txt"
-    text = read_text(path) if path.exists() else ""
+    text = read_text(path) if is_there(path) else ""
     return text.strip().partition("\n")[0].strip() or "not named"

@@ -253,6 +253,21 @@ def test_a_file_without_number(folder):
         RgbdFolder(folder)
 
 
+@pytest.mark.parametrize("name", ["poses.txt", "instances.json", "instance"])
+@pytest.mark.parametrize("kind", ["folder", "dangling link"])
+def test_what_is_there_and_cannot_be_read_does_not_count_as_missing(folder, name, kind):
+    path = folder / name
+    if path.is_dir():
+        shutil.rmtree(path)
+    path.unlink(missing_ok=True)
+    if kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to("nowhere")
+    with pytest.raises(DataError, match=name):
+        RgbdFolder(folder)
+
+
 def test_fewer_poses_than_frames(folder):
     lines = (folder / "poses.txt").read_text().splitlines()
     (folder / "poses.txt").write_text("\n".join(lines[:-1]))

@@ -184,6 +184,13 @@ def test_without_ground_truth_no_pose_is_known(folder: Path) -> None:
     assert TumRgbd(folder)[0].T_world_camera is None
 
 
+def test_a_ground_truth_that_cannot_be_read_does_not_count_as_missing(folder: Path) -> None:
+    (folder / "groundtruth.txt").unlink()
+    (folder / "groundtruth.txt").symlink_to("nowhere")
+    with pytest.raises(DataError, match=r"groundtruth\.txt"):
+        TumRgbd(folder)
+
+
 def test_a_pose_that_is_none_is_the_fault_of_its_frame(folder: Path) -> None:
     lines = [f"{color_time(k):.6f} 0 0 0 0 0 0 1" for k in range(FRAMES)]
     lines[1] = f"{color_time(1):.6f} 0 0 0 0 0 0 0"

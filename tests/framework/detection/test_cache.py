@@ -268,7 +268,7 @@ def test_detectors_read_no_more_than_they_say(
     assert_same(detector.detect(frame), detector.detect(unread))
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped"])
+@pytest.mark.parametrize("damage", ["truncated", "empty", "flipped", "another frame's"])
 def test_a_damaged_entry_is_a_miss_and_is_mended(
     room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, damage: str
 ) -> None:
@@ -276,7 +276,16 @@ def test_a_damaged_entry_is_a_miss_and_is_mended(
     [entry] = tmp_path.rglob("*.detections")
     data = bytearray(entry.read_bytes())
     data[len(data) // 2] ^= 1
-    entry.write_bytes({"truncated": bytes(data[:-9]), "empty": b"", "flipped": bytes(data)}[damage])
+    CachedDetector(Noise(), tmp_path / "other").detect(room[1])
+    [other] = (tmp_path / "other").rglob("*.detections")
+    entry.write_bytes(
+        {
+            "truncated": bytes(data[:-9]),
+            "empty": b"",
+            "flipped": bytes(data),
+            "another frame's": other.read_bytes(),
+        }[damage]
+    )
     detector = CachedDetector(Noise(), tmp_path)
     assert_same(expected, detector.detect(room[0]))
     assert (detector.hits, detector.misses) == (0, 1)

@@ -143,7 +143,8 @@ def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str)
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
     poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
-    assert poses[0].lost and poses[0].reason
+    assert poses[0].lost
+    assert poses[0].reason
     assert not any(pose.lost for pose in poses[1:])
     assert drift(poses[-1], frames[-1])[0] < 0.004
 
