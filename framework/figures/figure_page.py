@@ -22,6 +22,7 @@ PNG_DPI = 200
 PDF_DPI = 300  # of the rasters in it
 NOTE_LINE_MM = 2.35  # from one line of small type to the next
 MARGIN_MM = 1.0
+HINTED = 1.03  # letters in a PNG are up to so much wider than their outlines: each begins at a whole pixel
 
 logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells a hundred lines about each font in a PDF
 
@@ -30,7 +31,7 @@ class Page:
     """A white page with a note at its foot. Places are mm from the lower left corner of what is above the note."""
 
     def __init__(self, width: float, height: float, note: str) -> None:
-        lines = _wrapped(note, width - 2 * MARGIN_MM)
+        lines = _wrapped(note, (width - 2 * MARGIN_MM) / HINTED)
         self._foot = NOTE_LINE_MM * len(lines) + 2 * MARGIN_MM
         self._size = width, height + self._foot
         self.figure = Figure((self._size[0] / INCH_MM, self._size[1] / INCH_MM), facecolor="white")
