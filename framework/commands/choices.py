@@ -1,0 +1,51 @@
+"""What a command line sweeps over: looked at before the first run of it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from difflib import get_close_matches
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from hydra.core.override_parser.types import Override, ValueType
+from hydra.errors import HydraException
+
+from framework.errors import ConfigError
+
+COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)  # glob() asks the disk
+
+
+def check_sweep(overrides: Sequence[str], rows: Collection[str]) -> None:
+    """Raises ConfigError for a sweep without a single run, and for a row that is none of an experiment's `rows`."""
+    for override in OverridesParser.create().parse_overrides([*overrides]):
+        values = _values(override)
+        if not values and override.value_type in COUNTED:
+            raise ConfigError(f"{override.input_line} has no value: the sweep would be empty")
+        if override.key_or_group == "row" and rows:
+            check_row(values, rows)
+
+
+def check_row(asked: Sequence[str], rows: Collection[str]) -> None:
+    """Raises ConfigError for the first of the rows asked for that an experiment does not have."""
+    for row in asked:
+        if row not in rows:
+            close = get_close_matches(row, rows, n=1)
+            hint = f"; did you mean {close[0]}?" if close else "."
+            raise ConfigError(f"there is no row={row}{hint} The experiment has {', '.join(rows)}")
+
+
+def single_run(overrides: Sequence[str]) -> list[str]:
+    """The overrides of the first run of the sweep that they make."""
+    chosen = []
+    for override in OverridesParser.create().parse_overrides([*overrides]):
+        values = _values(override)
+        swept = override.value_type in COUNTED and values
+        chosen.append(f"{override.get_key_element()}={values[0]}" if swept else str(override.input_line))
+    return chosen
+
+
+def _values(override: Override) -> list[str]:
+    """What an override gives its key, one after the other, as far as that can be told from the command line."""
+    try:
+        return [*override.sweep_string_iterator()] if override.is_sweep_override() else [str(override.value())]
+    except HydraException:
+        return []
