@@ -30,7 +30,8 @@ def written_whole(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise DataError(f"{path} could not be written: {error.strerror or error}") from error
+        why = error.strerror or f"{error}; the disk may be full"  # NumPy only counts what it could write
+        raise DataError(f"{path} could not be written: {why}") from error
     finally:
         temporary.unlink(missing_ok=True)
 

@@ -59,6 +59,9 @@ class RunRecord:
         """Takes `directory` over: an earlier run's metrics are removed, so that they cannot pass for this one's."""
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
+        asked = {str(key): value for key, value in resolved.items()}
+        inputs = inputs_sha256(asked)
+        provenance: Metrics = {**code_version(), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS):
@@ -66,8 +69,7 @@ class RunRecord:
         with written_whole(directory / CONFIG) as temporary:
             OmegaConf.save(OmegaConf.create(resolved), temporary)
         _reset_peak_memory()
-        asked = {str(key): value for key, value in resolved.items()}
-        return cls(directory, asked, choices, inputs_sha256(asked), {**code_version(), **environment()})
+        return cls(directory, asked, choices, inputs, provenance)
 
     def write(
         self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None
