@@ -25,6 +25,10 @@ class MapFullError(InstanceMapError):
     """The map has reached its block budget; what was mapped so far is kept."""
 
 
+class PartialRunError(InstanceMapError):
+    """A run ended early, and the record of what it had mapped is written. `__cause__` is what ended it."""
+
+
 def in_one_line(said: object) -> str:
     """What a library says of a fault, for a message of ours; the kind of the fault where it says nothing."""
     return " ".join(str(said).split()) or type(said).__name__

@@ -15,7 +15,7 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import Float64, Frame, Pose
-from framework.errors import FrameError, MapFullError, NoPoseError
+from framework.errors import FrameError, NoPoseError
 from framework.interfaces import PoseTracker, SceneMap
 
 log = logging.getLogger(__name__)
@@ -54,7 +54,7 @@ class RunResult:
     tracked: tuple[TrackedFrame, ...]  # in order, lost frames included
     timings: tuple[StageTime, ...]
     seconds: float  # wall clock of the whole loop
-    stopped_by: KeyboardInterrupt | MapFullError | None = None  # None = the sequence was mapped to its end
+    stopped_by: BaseException | None = None  # what ended it early; None = the sequence was mapped to its end
     intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
     pose_source: str = PoseTracker.pose_source
 
@@ -87,7 +87,8 @@ class Journal:
     first_without_pose: str = ""  # which that was, and why
     tracked: list[TrackedFrame] = field(default_factory=list)
     timings: list[StageTime] = field(default_factory=list)
-    stopped_by: KeyboardInterrupt | MapFullError | None = None
+    frames_in_map: int = 0  # of which at least a part may be in the map
+    stopped_by: BaseException | None = None
     frames_began: list[float] = field(default_factory=list)  # s, when each frame was taken
     lost_for: int = 0  # frames up to the last one
 

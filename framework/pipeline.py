@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import signal
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from types import FrameType
 from typing import TypeVar
 
 import numba
@@ -21,6 +19,7 @@ from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.interruption import Interruption, signals_deferred
 from framework.journal import Journal, RunResult, StageTime
 from framework.refinement.refine import refine
 
@@ -53,27 +52,31 @@ class Pipeline:
 
         Raises DataError when there is no frame that can be used, and whatever else a stage raises.
         """
+        result = self.run_to_any_end(sequence)
+        if result.stopped_by is None or isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
+            return result
+        raise result.stopped_by
+
+    def run_to_any_end(self, sequence: RGBDSequence) -> RunResult:
+        """Maps `sequence` likewise; a stage's fault, too, is in `stopped_by` once a part of a frame is in the map."""
         if len(sequence) == 0:
             raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
         if self.tracker.pose_source == "ground_truth" and not sequence.has_poses():
             raise DataError(f"{sequence.name}: none of the {len(sequence)} frames has a true pose; {WITHOUT_POSES}")
         warn_outside_domain(self.detector, sequence)
         journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
-        with journal, ctrl_c_deferred() as interrupted, closing(self.detect_ahead(sequence, journal)) as detected:
+        with journal, signals_deferred(signal.SIGINT) as interruption:
             try:
-                for frame, detections in detected:
-                    try:
-                        self.map_frame(frame, detections, journal)
-                    except FrameError as error:
-                        journal.frame_skipped(error)
-                    if interrupted.is_set():
-                        raise KeyboardInterrupt
-            except (KeyboardInterrupt, MapFullError) as stop:
+                with interruption.second_ends_at_once("after this frame"):
+                    self.map_all(sequence, journal, interruption)
+            except BaseException as stop:
                 journal.stopped_by = stop
+        if journal.stopped_by is not None:
+            if journal.frames_in_map == 0:
+                raise journal.stopped_by
+            return journal.result()
         if journal.frames_skipped < journal.frames:
             return journal.result()
-        if journal.stopped_by is not None:
-            raise journal.stopped_by  # before anything was mapped
         if journal.without_pose == journal.frames:
             raise DataError(
                 f"{sequence.name}: no pose is given for any of the {journal.frames} frames; the first:"
@@ -81,7 +84,19 @@ class Pipeline:
             )
         raise DataError(f"{sequence.name}: none of the {journal.frames} frames can be used; the log says why")
 
-    def detect_ahead(self, sequence: RGBDSequence, journal: Journal) -> Generator[tuple[Frame, Detections]]:
+    def map_all(self, sequence: RGBDSequence, journal: Journal, interruption: Interruption) -> None:
+        """The loop. Raises Interrupted between two frames when a signal has asked for it."""
+        with closing(self.detect_ahead(sequence, journal, interruption)) as detected:
+            for frame, detections in detected:
+                try:
+                    self.map_frame(frame, detections, journal)
+                except FrameError as error:
+                    journal.frame_skipped(error)
+                interruption.check()
+
+    def detect_ahead(
+        self, sequence: RGBDSequence, journal: Journal, interruption: Interruption
+    ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
         Frame k + 1 is read and detected while frame k is tracked and fused; the results do not depend on it.
@@ -89,6 +104,7 @@ class Pipeline:
         read_and_detect = partial(self.read_and_detect, sequence)
         with closing(map_ahead(read_and_detect, range(len(sequence)), self.ahead)) as outcomes:
             for outcome in outcomes:
+                interruption.check()  # waiting for a frame may have taken long
                 journal.frame_begins()
                 if isinstance(outcome, FrameError):
                     journal.frame_skipped(outcome)
@@ -127,6 +143,7 @@ class Pipeline:
             clusters = lift(detections, frame, pose)
         with journal.timed(frame.index, "refine"):
             clusters = refine(self.refiner, clusters, frame)
+        journal.frames_in_map += 1
         with journal.timed(frame.index, "fuse"):
             self.fuser.fuse(frame, pose, clusters)
         return pose
@@ -152,27 +169,3 @@ def map_ahead(function: Callable[[Item], Outcome], items: Iterable[Item], ahead:
             yield pending.popleft().result()
     finally:
         worker.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def ctrl_c_deferred() -> Iterator[threading.Event]:
-    """The first Ctrl-C sets the event that this yields, in place of raising; the second one raises at once.
-
-    An exception in the middle of a frame would leave it half integrated. Outside the main thread, where Python does
-    not let signals be handled, and where the process ignores them, nothing changes.
-    """
-    interrupted = threading.Event()
-    before = signal.getsignal(signal.SIGINT)
-    if threading.current_thread() is not threading.main_thread() or not callable(before):
-        yield interrupted
-        return
-
-    def set_once(_signal: int, _frame: FrameType | None) -> None:
-        signal.signal(signal.SIGINT, before)
-        interrupted.set()
-
-    signal.signal(signal.SIGINT, set_once)
-    try:
-        yield interrupted
-    finally:
-        signal.signal(signal.SIGINT, before)

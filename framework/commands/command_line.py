@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import signal
 import sys
 import traceback
 from collections.abc import Callable, Iterator
@@ -13,19 +14,22 @@ from dataclasses import dataclass
 from functools import wraps
 from pathlib import Path
 
+from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configs import one_line
-from framework.errors import InstanceMapError
+from framework.errors import InstanceMapError, PartialRunError
+from framework.interruption import Interrupted
 
 log = logging.getLogger(__name__)
 
 KNOWN_ERRORS = (InstanceMapError, HydraException, OmegaConfBaseException, OSError)
 EXIT_FAILED = 1
-EXIT_INTERRUPTED = 130  # what shells report after Ctrl-C
+EXIT_PARTIAL = 3  # a run ended early, and what it had mapped is written
+EXIT_SIGNAL = 128  # and the signal's number, as shells report it: 130 after Ctrl-C, 143 after SIGTERM
 
 
 def directory_name(overrides: str) -> str:
@@ -47,9 +51,9 @@ def one_line_errors() -> Iterator[None]:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")  # Hydra then raises its errors in place of printing them
     try:
         yield
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        sys.exit(EXIT_INTERRUPTED)
+    except KeyboardInterrupt as error:
+        print(str(error) or "interrupted", file=sys.stderr)
+        sys.exit(EXIT_SIGNAL + (error.number if isinstance(error, Interrupted) else signal.SIGINT))
     except (*KNOWN_ERRORS, ValueError) as error:  # Hydra answers some faults on its command line with ValueError
         show_traceback(error)
         print(f"error: {one_line(error)}", file=sys.stderr)
@@ -90,9 +94,9 @@ def print_for_directories(description: str, place: str, write: Callable[[Path], 
 
 @dataclass
 class Jobs:
-    """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and counts the failed."""
+    """Reports each job's fault where it happens, so that the other jobs of a sweep still run, and keeps the status."""
 
-    failed: int = 0
+    status: int = 0
 
     def reported(self, job: Callable[[DictConfig], None]) -> Callable[[DictConfig], None]:
         """`job`, with its faults in the log: one line for a known error, the traceback for others and with `debug`."""
@@ -102,11 +106,13 @@ class Jobs:
             try:
                 job(config)
             except Exception as error:
-                known = isinstance(error, KNOWN_ERRORS)
-                _log_error(one_line(error), error if config.get("debug") or not known else None)
+                partial = isinstance(error, PartialRunError)
+                fault = error.__cause__ or error if partial else error
+                known = isinstance(fault, KNOWN_ERRORS)
+                _log_error(one_line(error), fault if config.get("debug") or not known else None)
                 if _in_worker():  # Hydra carries the error, if it can be pickled, to where the sweep was started
                     raise InstanceMapError(f"a run failed: {one_line(error)}") from None
-                self.failed += 1
+                self.status = EXIT_PARTIAL if partial and not is_of_sweep(HydraConfig.get()) else EXIT_FAILED
 
         return reported_job
 
@@ -114,15 +120,19 @@ class Jobs:
         """Runs Hydra's command for a reported job, and ends the process with a status when one has failed."""
         with one_line_errors():
             command()
-        if self.failed:
-            sys.exit(EXIT_FAILED)
+        if self.status:
+            sys.exit(self.status)
+
+
+def is_of_sweep(own: HydraConf) -> bool:
+    """Whether a job is one of a sweep's."""
+    return not OmegaConf.is_missing(own.job, "num")
 
 
 def _in_worker() -> bool:
     """Whether a job runs in another process than the sweep: in one of a launcher that is not Hydra's own."""
     own = HydraConfig.get()
-    of_sweep = not OmegaConf.is_missing(own.job, "num")
-    return of_sweep and not str(own.launcher._target_).endswith(".BasicLauncher")
+    return is_of_sweep(own) and not str(own.launcher._target_).endswith(".BasicLauncher")
 
 
 def _log_error(message: str, error: BaseException | None) -> None:

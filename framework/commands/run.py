@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from framework.commands.command_line import Jobs
+from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.experiment import with_row
 from framework.commands.sweep import ending
+from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
+from framework.interruption import ENDING, Interruption, raise_on_signals, signals_deferred
 from framework.records.stored_runs import is_recorded
-
-if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
-    from framework.journal import RunResult
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
@@ -32,22 +31,31 @@ def job(config: DictConfig) -> None:
     hydra_config = HydraConfig.get()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
-    with locked(directory, wait=config.resume):  # where the sweep was killed and not its workers, they go on
+    # where a sweep was killed and not its workers, they go on; a run by itself has its place since it was started
+    with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
         if config.resume and is_recorded(directory, config):
             return
-        run(config, directory, choices)
+        interruption = run(config, directory, choices)
+    if is_of_sweep(hydra_config):  # which has not ended with this run
+        interruption.check()
 
 
-def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> RunResult:
+def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
     """Maps the config's sequence with its stages and leaves the run's record in `directory`.
 
-    `choices` are the options that were chosen, by config group. A run that ended early (Ctrl-C, full map) leaves its
-    record too, marked as partial, and then raises what ended it.
+    `choices` are the options that were chosen, by config group. This is where it is decided how a run ends:
+
+    - completed: the record is whole. A signal that came while it was written is in the Interruption that this returns.
+    - partial: there is a map, and a signal, a stage or the disk has ended the run. What was mapped is written as far as
+      it goes, marked as partial; then Interrupted is raised, or PartialRunError from what ended it.
+    - nothing to keep: raises what ended the run before anything was mapped.
+
+    The first signal ends it after the frame, or the record, that is in work, the second one at once.
     """
     from framework.api import pipeline_of  # here: a misspelt name is answered before these load
     from framework.detection.cache import cache_metrics
     from framework.interfaces import RGBDSequence
-    from framework.records.run_record import RunRecord
+    from framework.records.run_record import RunRecord, reason
     from framework.registry import STAGES, build
     from framework.settings import Settings
 
@@ -57,14 +65,19 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)
-    result = pipeline.run(sequence)
-    record.write(sequence, result, cache_metrics(pipeline.detector))
-    if result.stopped_by is not None:
-        raise result.stopped_by
-    return result
+    with signals_deferred(*ENDING) as interruption:
+        result = pipeline.run_to_any_end(sequence)
+        with interruption.second_ends_at_once("once the record is written"):
+            fault = record.write(sequence, result, cache_metrics(pipeline.detector))
+    if fault is None:
+        return interruption
+    if isinstance(fault, Exception):
+        raise PartialRunError(reason(fault)) from fault
+    raise fault
 
 
 def main() -> None:
+    raise_on_signals()
     jobs.run(job_or_sweep)
 
 

@@ -1,26 +1,28 @@
-"""What surrounds the jobs of a sweep, whoever runs them: its place is its own while it lasts, and its table is made."""
+"""What surrounds a run or a sweep, whoever runs its jobs: its place is its own, and its table is made in the end."""
 
 from __future__ import annotations
 
 import os
-import signal
 import sys
 import textwrap
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from framework.configs import one_line
 from framework.errors import InstanceMapError
-from framework.files.directory_lock import locked
+from framework.files.directory_lock import locked, new_directory
+from framework.files.whole_files import remove_left_over
 from framework.settings import available_cores
 
 ending = ExitStack()
-"""What this process still has to do when the sweep that it began has ended, in whatever way."""
+"""What this process still has to do when the run or the sweep that it began has ended, in whatever way."""
 
 
 def cores_of(threads: int) -> int:
@@ -35,16 +37,30 @@ def jobs_at_once(threads: int) -> int:
 
 OmegaConf.register_new_resolver("cores_of", cores_of, replace=True)
 OmegaConf.register_new_resolver("jobs_at_once", jobs_at_once, replace=True)
+# once for a config: a sweep's workers, whose configs take over what this one's has resolved, get the same answer
+OmegaConf.register_new_resolver("new_directory", new_directory, use_cache=True, replace=True)
 
 
-class SweepCallback(Callback):
-    """How Hydra says that a sweep begins, and where. It calls this in the process that was started, not in workers."""
+@dataclass
+class PlaceCallback(Callback):
+    """How Hydra says that a run or a sweep begins, and where. It calls this in the process that was started, before it
+    writes anything, and not in workers.
+    """
+
+    of_run: bool = True  # whether a run has its place to itself; a command that writes one file has none
+
+    def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        if self.of_run:
+            self.take(lambda: locked(Path(config.hydra.run.dir), wait=config.resume))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         with_figure = config.get("figure") is not None
+        self.take(lambda: sweep_in(Path(config.hydra.sweep.dir), "table" in config, with_figure))
+
+    def take(self, place: Callable[[], AbstractContextManager[None]]) -> None:
         try:
-            ending.enter_context(sweep_in(Path(config.hydra.sweep.dir), "table" in config, with_figure))
-        except (InstanceMapError, OSError) as error:  # Hydra would make a warning of it, and go on
+            ending.enter_context(place())
+        except (InstanceMapError, OSError, OmegaConfBaseException) as error:  # Hydra would warn of it, and go on
             sys.exit(f"error: {one_line(error)}")
 
 
@@ -55,11 +71,10 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool) -> Iterator[N
     The picture of the runs is drawn, too, but for Ctrl-C, which shall end at once. Raises InstanceMapError, in place of
     what the launchers raise when a worker is killed.
     """
-    # `kill` ends a sweep like Ctrl-C: no worker is left behind
-    signal.signal(signal.SIGTERM, lambda *_: signal.raise_signal(signal.SIGINT))
     # joblib ends its workers without their help, and Python's own clean-up warns of that
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
     with locked(directory):
+        remove_left_over(directory)
         try:
             yield
         except BaseException as error:

@@ -1,4 +1,4 @@
-"""A directory that one process writes at a time."""
+"""A directory that one process writes at a time, and one that nobody has written yet."""
 
 from __future__ import annotations
 
@@ -16,6 +16,19 @@ from framework.errors import DataError
 LOCK, HOLDER = ".lock", ".lock_holder"  # what is locked, and who has it: on Windows a locked file cannot be read
 
 log = logging.getLogger(__name__)
+
+
+def new_directory(wanted: str) -> str:
+    """Makes a directory that was not there: `wanted`, or where others were faster `wanted`_2, _3 ..."""
+    path, number = Path(wanted), 1
+    path.parent.mkdir(parents=True, exist_ok=True)
+    while True:
+        try:
+            path.mkdir()  # of several processes that try, one succeeds
+            return str(path)
+        except FileExistsError:
+            number += 1
+            path = Path(f"{wanted}_{number}")
 
 
 @contextmanager

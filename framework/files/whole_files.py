@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,6 +12,7 @@ from pathlib import Path
 from framework.errors import DataError
 
 MOST_TEXT = 2**28  # bytes, of text and JSON; an hour of poses has 10 MB
+_TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # the names that `written_whole` makes
 
 
 @contextmanager
@@ -28,7 +30,8 @@ def written_whole(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         temporary.replace(path)
     except OSError as error:
-        raise DataError(f"{path} could not be written: {error.strerror or error}") from error
+        why = error.strerror or f"{error}; the disk may be full"  # NumPy only counts what it could write
+        raise DataError(f"{path} could not be written: {why}") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -38,6 +41,13 @@ def is_there(path: Path) -> bool:
     by who reads it.
     """
     return os.path.lexists(path)
+
+
+def remove_left_over(directory: Path) -> None:
+    """Removes what `kill -9` left behind of files that were being written; nobody else may write in `directory`."""
+    for path in directory.glob(".*.partial*"):
+        if _TEMPORARY.fullmatch(path.name):
+            path.unlink(missing_ok=True)
 
 
 def read_bytes(path: Path, most: int) -> bytes:

@@ -1,4 +1,4 @@
-"""The directory that a run leaves behind: every file whole or not at all, metrics.json last."""
+"""The directory that a run leaves behind: every file whole or not at all, the small ones first, metrics.json last."""
 
 from __future__ import annotations
 
@@ -6,19 +6,22 @@ import csv
 import logging
 import sys
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 from omegaconf import DictConfig, OmegaConf
 
+from framework.configs import one_line
+from framework.data import Instance, InstanceMesh
+from framework.errors import InstanceMapError
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
-from framework.files.whole_files import written_whole
-from framework.interfaces import RGBDSequence
+from framework.files.whole_files import remove_left_over, written_whole
+from framework.interfaces import RGBDSequence, SceneMap
 from framework.journal import RunResult
 from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.instances_file import write_instances
@@ -34,6 +37,13 @@ log = logging.getLogger(__name__)
 LIKELY = 0.3  # confidence from which on an instance is in the picture and in what a run says; files have them all
 
 
+MAPPED = ("trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz", "overview.png")
+"""What is written of a map, in this order: on a disk that is full the small ones still find a place."""
+
+Arguments = ParamSpec("Arguments")
+Made = TypeVar("Made")
+
+
 @dataclass(frozen=True)
 class RunRecord:
     """Writes one run's directory."""
@@ -42,71 +52,131 @@ class RunRecord:
     config: Mapping[str, Any]  # resolved
     choices: Mapping[str, str | None]  # the option chosen of each config group
     inputs: str  # inputs_sha256
+    provenance: Metrics  # the code and the machine, as they were when the run began
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
         """Takes `directory` over: an earlier run's metrics are removed, so that they cannot pass for this one's."""
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
+        asked = {str(key): value for key, value in resolved.items()}
+        inputs = inputs_sha256(asked)
+        provenance: Metrics = {**code_version(), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
+        remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS):
             (directory / name).unlink(missing_ok=True)
         with written_whole(directory / CONFIG) as temporary:
             OmegaConf.save(OmegaConf.create(resolved), temporary)
         _reset_peak_memory()
-        asked = {str(key): value for key, value in resolved.items()}
-        return cls(directory, asked, choices, inputs_sha256(asked))
+        return cls(directory, asked, choices, inputs, provenance)
 
-    def write(self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None) -> Metrics:
+    def write(
+        self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None
+    ) -> BaseException | None:
         """Writes everything that the run found, and says the main figures in the log.
 
-        `counts` are further figures for metrics.json, by key. What was mapped is written before it is judged: where the
-        truth turns out to be unusable, it stays.
+        Returns why the record is partial: `result.stopped_by`, or the first fault of the writing, which does not keep
+        the other files from being written; None = it is whole. `counts` are further figures for metrics.json, by key.
+
+        What was mapped is written before it is judged: where the truth turns out to be unusable, it stays. While that
+        goes on, metrics.partial.json tells what there is: who is killed in the middle of it leaves a partial record.
         """
-        scene, classes = result.scene, result.scene.classes
-        mesh, instances = scene.mesh(), scene.instances()
-        names = {key: class_name(instance, classes) for key, instance in instances.items()}
+        self.directory.mkdir(parents=True, exist_ok=True)
+        for name in MAPPED:  # of an earlier run into the same directory
+            (self.directory / name).unlink(missing_ok=True)
+        scene, attempt = result.scene, _Attempts(result.stopped_by)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
-        write_mesh(self.directory / "mesh.ply", mesh)
-        write_instances(self.directory / "instances.json", mesh, instances, classes)
-        write_tum(self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
-        write_timings(self.directory / "timings.csv", result)
-        scene.save(self.directory / "map.npz")
-        metrics: Metrics = {
+        attempt(write_tum, self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
+        attempt(write_timings, self.directory / "timings.csv", result)
+        figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
+        found = attempt(_found, scene)
+        if found is not None:
+            attempt(write_instances, self.directory / "instances.json", *found, scene.classes)
+            figures["instances.count"] = len(found[1])
+        attempt(self._write_partial, sequence, figures, attempt.fault)
+        if found is not None:
+            attempt(write_mesh, self.directory / "mesh.ply", found[0])
+        attempt(scene.save, self.directory / "map.npz")
+        if found is not None:
+            figures |= attempt(instance_metrics, sequence, *found, scene.classes) or {}
+        figures |= attempt(trajectory_metrics, result) or {}
+        title = headline({"sequence": sequence.name, **figures})
+        if found is not None:
+            labels = _labels(found[1], scene.classes)
+            attempt(write_overview, self.directory / "overview.png", found[0], labels, poses, title)
+        if attempt.fault is None:
+            attempt(write_json, self.directory / METRICS, self._metrics(sequence, figures))
+        if attempt.fault is None:
+            (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
+        else:
+            attempt(self._write_partial, sequence, figures, attempt.fault)
+        self._announce(title, labels if found is not None else {}, figures, attempt.fault)
+        return attempt.fault
+
+    def _metrics(self, sequence: RGBDSequence, figures: Metrics) -> Metrics:
+        return {
             "sequence": sequence.name,
             **{f"choice.{group}": self.choices.get(group) for group in STAGES},
-            **run_metrics(result),
-            **(counts or {}),
-            **instance_metrics(sequence, mesh, instances, classes),
-            **trajectory_metrics(result),
+            **figures,
             "peak_rss_bytes": peak_memory(),
             "seed": self.config.get("seed"),
             "config_hash": config_hash(self.config),
             INPUTS: self.inputs,
-            **code_version(),
-            **environment(),
+            **self.provenance,
         }
-        title = headline(metrics)
-        likely = {key: name or "object" for key, name in names.items() if instances[key].confidence >= LIKELY}
-        labels = {key: (name, instances[key].confidence) for key, name in likely.items()}
-        write_overview(self.directory / "overview.png", mesh, labels, poses, title)
-        if result.stopped_by is None:
-            write_json(self.directory / METRICS, metrics)
-        else:
-            write_json(self.directory / PARTIAL_METRICS, {"partial": reason(result.stopped_by), **metrics})
-        self._announce(title, Counter(likely.values()), len(names) - len(likely), result)
-        return metrics
 
-    def _announce(self, title: str, likely: Counter[str], unlikely: int, result: RunResult) -> None:
+    def _write_partial(self, sequence: RGBDSequence, figures: Metrics, fault: BaseException | None) -> None:
+        """Says what there is of a record that is not whole, and why; no fault = it is being written."""
+        why = "its record was not finished" if fault is None else reason(fault)
+        write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(sequence, figures)})
+
+    def _announce(
+        self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, fault: BaseException | None
+    ) -> None:
         log.info("%s", title)
-        found = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
+        likely = Counter(name for name, _ in labels.values())
+        counted = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
+        unlikely = int(figures.get("instances.count") or 0) - len(labels)
         rest = f"; {unlikely} of a confidence below {LIKELY} are in the files alone" if unlikely else ""
-        log.info("found: %s%s", found, rest)
+        log.info("found: %s%s", counted, rest)
         for name in ("overview.png", "mesh.ply", "instances.json"):
-            log.info("%s", self.directory / name)
-        if result.stopped_by is not None:
-            log.warning("partial run, %s: its figures are in %s", reason(result.stopped_by), PARTIAL_METRICS)
+            if (self.directory / name).exists():
+                log.info("%s", self.directory / name)
+        if fault is not None:
+            log.warning("partial run, %s: its figures are in %s", reason(fault), PARTIAL_METRICS)
+
+
+@dataclass
+class _Attempts:
+    """Calls one function after the other; one that fails says so in the log, and does not keep the others from it."""
+
+    fault: BaseException | None  # the first
+
+    def __call__(
+        self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
+    ) -> Made | None:
+        """What the function returns; None where it failed."""
+        try:
+            return function(*arguments, **named)
+        except Exception as error:
+            log.warning("%s", reason(error))
+            self.fault = self.fault or error
+            return None
+
+
+def _found(scene: SceneMap) -> tuple[InstanceMesh, Mapping[int, Instance]]:
+    return scene.mesh(), scene.instances()
+
+
+def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
+    """Class name and confidence of the instances that are likely, by id."""
+    return {
+        key: (class_name(instance, classes) or "object", instance.confidence)
+        for key, instance in instances.items()
+        if instance.confidence >= LIKELY
+    }
 
 
 _FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped"}
@@ -114,21 +184,26 @@ _QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
 
 
 def headline(metrics: Mapping[str, Any]) -> str:
-    """The main figures of a run in one line."""
-    parts = [str(metrics["sequence"]), f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
-    parts += [f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics[key]]
-    if metrics["pose_source"] == "ground_truth":
+    """The main figures of a run in one line, as far as there are any."""
+    parts = [str(metrics["sequence"])]
+    if "frames" in metrics:
+        parts += [f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
+    parts += [f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics.get(key)]
+    if metrics.get("pose_source") == "ground_truth":
         parts.append("given poses")
     elif metrics.get("trajectory.ate_rmse_m") is not None:
         parts.append(f"ATE {metrics['trajectory.ate_rmse_m']:.3f} m")
-    parts.append(f"{metrics['instances.count']} instances")
+    if "instances.count" in metrics:
+        parts.append(f"{metrics['instances.count']} instances")
     parts += [f"{word} {metrics[key]:.2f}" for key, word in _QUALITY.items() if metrics.get(key) is not None]
     return " | ".join(parts)
 
 
-def reason(stopped_by: BaseException) -> str:
+def reason(fault: BaseException) -> str:
     """Why a run is partial, in words."""
-    return str(stopped_by) or "interrupted by Ctrl-C"
+    if isinstance(fault, KeyboardInterrupt):
+        return str(fault) or "interrupted by Ctrl-C"
+    return one_line(fault) if isinstance(fault, InstanceMapError) else f"{type(fault).__name__}: {one_line(fault)}"
 
 
 def write_timings(path: Path, result: RunResult) -> None:

@@ -12,7 +12,7 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = [
     ["errors"],
-    ["data", "parameters", "settings"],
+    ["data", "interruption", "parameters", "settings"],
     ["geometry", "label_spaces", "sensor_noise"],
     ["interfaces"],
     ["files"],

@@ -164,6 +164,7 @@ class GridMap(SceneMap):
     ids: list[np.ndarray] = field(default_factory=list)
     triangles: list[np.ndarray] = field(default_factory=list)
     classes: tuple[str, ...] = CLASSES
+    slow_save_s: float = 0.0
 
     @property
     def voxel_count(self) -> int:
@@ -210,6 +211,7 @@ class GridMap(SceneMap):
                 colors=mesh.colors,
                 ids=mesh.instance_ids,
             )
+            time.sleep(self.slow_save_s)
 
     @classmethod
     def load(cls, path: Path | str) -> GridMap:
@@ -223,9 +225,11 @@ class GridFuser(MapFuser):
 
     capacity: int = 100  # frames
     slow_s: float = 0.0  # how long fusing takes
+    slow_save_s: float = 0.0  # how long saving the map takes
+    note: str = ""  # a file that is there once a frame is in the map; "" = none
 
     def __post_init__(self) -> None:
-        self.scene: GridMap = GridMap()
+        self.scene: GridMap = GridMap(slow_save_s=self.slow_save_s)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         time.sleep(self.slow_s)
@@ -246,3 +250,34 @@ class GridFuser(MapFuser):
         scene.vertices.append(np.asarray(transform(pose.T_world_camera, points), np.float32))
         scene.colors.append(frame.color.reshape(-1, 3))
         scene.ids.append(ids.ravel())
+        if self.note:
+            Path(self.note).touch()
+
+
+def fault(kind: str) -> BaseException:
+    """What a stage may raise, by name."""
+    faults: dict[str, BaseException] = {
+        "OSError": OSError(5, "Input/output error", "weights.bin"),
+        "ValueError": ValueError("operands could not be broadcast together"),
+        "MemoryError": MemoryError("Unable to allocate 40 GiB"),
+        "SystemExit": SystemExit(7),
+    }
+    return faults[kind]
+
+
+@dataclass
+class FaultyDetector(SphereDetector):
+    """Fails at one frame: in a way that `fault` knows, or with masks of a wrong size."""
+
+    at: int = 3
+    kind: str = "OSError"
+
+    def detect(self, frame: Frame) -> Detections:
+        found = super().detect(frame)
+        if frame.index != self.at:
+            return found
+        if self.kind == "masks":
+            return Detections(
+                found.masks[:, ::2], found.boxes, found.scores, found.class_probabilities, classes=found.classes
+            )
+        raise fault(self.kind)
