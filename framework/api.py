@@ -50,13 +50,10 @@ __all__ = [
 
 def pipeline_of(config: DictConfig) -> Pipeline:
     """The stages that a config names, the detector behind the cache that it asks for."""
-    return Pipeline(
-        detector=with_cache(build(Detector, config.detector), config),
-        tracker=build(PoseTracker, config.tracker),
-        refiner=build(ClusterRefiner, config.refiner),
-        fuser=build(MapFuser, config.fuser),
-        ahead=config.ahead,
-    )
+    fuser, refiner = build(MapFuser, config.fuser), build(ClusterRefiner, config.refiner)
+    tracker = build(PoseTracker, config.tracker)
+    detector = with_cache(build(Detector, config.detector), config)  # last, for loading a network takes its time
+    return Pipeline(detector, tracker, refiner, fuser, config.ahead)
 
 
 class Mapper:

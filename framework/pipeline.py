@@ -50,7 +50,7 @@ class Pipeline:
         whose pose is lost is not fused; both are counted. Ctrl-C (once the frame in work is done) and a full map end
         the loop early: the result holds what has been mapped so far, and `stopped_by` says why.
 
-        Raises DataError when there is no frame that can be used, and whatever else a stage raises.
+        Raises DataError when nothing could be mapped, and whatever else a stage raises.
         """
         result = self.run_to_any_end(sequence)
         if result.stopped_by is None or isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
@@ -75,14 +75,27 @@ class Pipeline:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
             return journal.result()
-        if journal.frames_skipped < journal.frames:
-            return journal.result()
-        if journal.without_pose == journal.frames:
-            raise DataError(
-                f"{sequence.name}: no pose is given for any of the {journal.frames} frames; the first:"
-                f" {journal.first_without_pose}; {WITHOUT_POSES}"
-            )
-        raise DataError(f"{sequence.name}: none of the {journal.frames} frames can be used; the log says why")
+        if self.fuser.scene.voxel_count == 0:
+            raise DataError(f"{sequence.name}: nothing was mapped: {self.why_nothing(journal)}")
+        return journal.result()
+
+    def why_nothing(self, journal: Journal) -> str:
+        """What became of the frames of a run whose map is empty."""
+        result = journal.result()
+        if journal.without_pose == result.frames:
+            first = journal.first_without_pose
+            return f"no pose is given for any of the {result.frames} frames; the first: {first}; {WITHOUT_POSES}"
+        if result.frames_skipped == result.frames:
+            return f"none of the {result.frames} frames can be used; the log says why"
+        lost = next((frame.pose.reason for frame in result.tracked if frame.pose.lost), "")
+        nearest, farthest = self.fuser.scene.depth_range
+        rest = result.frames - result.frames_skipped - result.frames_lost
+        parts = [
+            (result.frames_skipped, "cannot be used"),
+            (result.frames_lost, f"are lost, the first because: {lost or 'the tracker gave no reason'}"),
+            (rest, f"have no depth that is mapped, {nearest:g} to {farthest:g} m"),
+        ]
+        return f"of {result.frames} frames " + "; ".join(f"{count} {what}" for count, what in parts if count)
 
     def map_all(self, sequence: RGBDSequence, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""

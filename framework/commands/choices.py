@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
+from pathlib import Path
 
+from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
+from framework.configs import config_directory
 from framework.errors import ConfigError
 
 COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)  # glob() asks the disk
@@ -31,6 +35,26 @@ def check_row(asked: Sequence[str], rows: Collection[str]) -> None:
             close = get_close_matches(row, rows, n=1)
             hint = f"; did you mean {close[0]}?" if close else "."
             raise ConfigError(f"there is no row={row}{hint} The experiment has {', '.join(rows)}")
+
+
+def fault_of_first_run(words: Sequence[str]) -> HydraException | None:
+    """What is wrong with the first run of a sweep that an experiment makes; None = nothing.
+
+    Hydra asks a config whether it is a sweep's, and where that cannot be composed it takes it for a run's, and finds
+    fault with its choices, whatever else is wrong. `words` are those of the command line.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--config-dir", "-cd")
+    known, others = parser.parse_known_args([*words])
+    overrides = single_run([word for word in others if not word.startswith("-")])
+    if known.config_dir:
+        overrides.append(f"hydra.searchpath=[file://{Path(known.config_dir).absolute()}]")
+    try:
+        with config_directory():
+            compose("config", overrides)
+    except HydraException as error:
+        return error
+    return None
 
 
 def single_run(overrides: Sequence[str]) -> list[str]:

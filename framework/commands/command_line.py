@@ -21,7 +21,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configs import one_line
-from framework.errors import InstanceMapError, PartialRunError
+from framework.errors import ConfigError, InstanceMapError, PartialRunError
 from framework.interruption import Interrupted
 
 log = logging.getLogger(__name__)
@@ -68,6 +68,9 @@ def show_traceback(error: BaseException) -> None:
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
     """What the command line asks for; `debug=true`, which all commands understand, is not for the parser."""
+    for word in sys.argv[1:]:
+        if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
+            parser.error(f"debug must be true or false, found {word.partition('=')[2][:60]!r}")
     return parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
 
 
@@ -104,12 +107,13 @@ class Jobs:
         @wraps(job)
         def reported_job(config: DictConfig) -> None:
             try:
+                check_switches(config)
                 job(config)
             except Exception as error:
                 partial = isinstance(error, PartialRunError)
                 fault = error.__cause__ or error if partial else error
                 known = isinstance(fault, KNOWN_ERRORS)
-                _log_error(one_line(error), fault if config.get("debug") or not known else None)
+                _log_error(one_line(error), fault if config.get("debug") is True or not known else None)
                 if _in_worker():  # Hydra carries the error, if it can be pickled, to where the sweep was started
                     raise InstanceMapError(f"a run failed: {one_line(error)}") from None
                 self.status = EXIT_PARTIAL if partial and not is_of_sweep(HydraConfig.get()) else EXIT_FAILED
@@ -122,6 +126,13 @@ class Jobs:
             command()
         if self.status:
             sys.exit(self.status)
+
+
+def check_switches(config: DictConfig) -> None:
+    """Raises ConfigError for a switch that is neither on nor off: words, such as `resume=flase`, count as true."""
+    for name in ("resume", "debug"):
+        if not isinstance(config.get(name, False), bool):
+            raise ConfigError(f"{name} must be true or false, found {config[name]!r}")
 
 
 def is_of_sweep(own: HydraConf) -> bool:

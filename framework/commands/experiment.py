@@ -12,7 +12,7 @@ from hydra import compose
 from hydra.conf import HydraConf
 from omegaconf import DictConfig, OmegaConf, open_dict
 
-from framework.errors import ConfigError
+from framework.commands.choices import check_row
 from framework.figures.figure_choice import FigureChoice
 from framework.parameters import checked_rows
 from framework.tables.comparison import TableChoice
@@ -37,8 +37,7 @@ def with_row(config: DictConfig, hydra_config: HydraConf) -> tuple[DictConfig, C
     if config.get("figure") is not None:
         FigureChoice.of(config.figure)
     row = str(config.row)
-    if row not in rows:
-        raise ConfigError(f"there is no row={row}; the experiment has {', '.join(rows)}")
+    check_row([row], rows)
     overrides = [*hydra_config.overrides.task, *rows[row]]
     composed = compose(hydra_config.job.config_name, overrides, return_hydra_config=True)
     choices = dict(composed.hydra.runtime.choices)

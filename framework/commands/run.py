@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import logging
+import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
 from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
+from hydra.errors import ConfigCompositionException
 from omegaconf import DictConfig
 
+from framework.commands.choices import fault_of_first_run
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.experiment import with_row
 from framework.commands.sweep import ending
@@ -60,8 +63,8 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.settings import Settings
 
     Settings.of(config).apply()
-    sequence = build(RGBDSequence, config.dataset)
     pipeline = pipeline_of(config)
+    sequence = build(RGBDSequence, config.dataset)  # after the stages: making up a room takes longest
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)
@@ -83,4 +86,8 @@ def main() -> None:
 
 def job_or_sweep() -> None:
     with ending:
-        job()
+        try:
+            job()
+        except ConfigCompositionException as error:
+            fault = fault_of_first_run(sys.argv[1:]) or error
+            raise fault from fault.__cause__

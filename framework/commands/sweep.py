@@ -11,14 +11,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from framework.commands.choices import check_sweep
 from framework.configs import one_line
 from framework.errors import InstanceMapError
 from framework.files.directory_lock import locked, new_directory
 from framework.files.whole_files import remove_left_over
+from framework.parameters import checked_rows
 from framework.settings import available_cores
 
 ending = ExitStack()
@@ -50,18 +53,24 @@ class PlaceCallback(Callback):
     of_run: bool = True  # whether a run has its place to itself; a command that writes one file has none
 
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
+        HydraConfig.instance().set_config(config)  # as it does itself a moment later: the place names the dataset
         if self.of_run:
-            self.take(lambda: locked(Path(config.hydra.run.dir), wait=config.resume))
+            self.take(lambda: locked(Path(config.hydra.run.dir), wait=config.resume is True))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        with_figure = config.get("figure") is not None
-        self.take(lambda: sweep_in(Path(config.hydra.sweep.dir), "table" in config, with_figure))
+        self.take(lambda: sweep_of(config))
 
     def take(self, place: Callable[[], AbstractContextManager[None]]) -> None:
         try:
             ending.enter_context(place())
         except (InstanceMapError, OSError, OmegaConfBaseException) as error:  # Hydra would warn of it, and go on
             sys.exit(f"error: {one_line(error)}")
+
+
+def sweep_of(config: DictConfig) -> AbstractContextManager[None]:
+    """The place of a sweep, once it is known that it has runs. Raises InstanceMapError."""
+    check_sweep(config.hydra.overrides.task, checked_rows(config.get("rows")))
+    return sweep_in(Path(config.hydra.sweep.dir), "table" in config, config.get("figure") is not None)
 
 
 @contextmanager

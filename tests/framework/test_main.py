@@ -53,6 +53,8 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
         ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
         ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),
+        ("resume=flase", ["ERROR", "resume must be true or false, found 'flase'"]),
+        ("debug=maybe", ["ERROR", "debug must be true or false, found 'maybe'"]),
         ("tracker=null", ["group override must be a string"]),
     ],
 )
@@ -63,6 +65,12 @@ def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: l
     assert len(done.stderr.splitlines()) == 1, done.stderr
     for words in said:
         assert words in done.stderr
+
+
+def test_stages_are_looked_at_before_a_dataset_that_may_take_long(tmp_path: Path) -> None:
+    done = start(tmp_path, "fuser.capacity=abc", "dataset.frames=many")
+    assert "'abc'" in done.stderr
+    assert "'many'" not in done.stderr
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:

@@ -16,6 +16,8 @@ from framework.data import Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.journal import RunResult
 from framework.pipeline import Pipeline, map_ahead
+from framework.registry import assemble
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
 
 AHEAD = pytest.mark.parametrize("ahead", [0, 1, 3])
@@ -131,6 +133,16 @@ def test_lost_frames_are_counted_and_not_fused(room: CornerRoom, caplog: pytest.
         "frame 5: tracked again after 3 lost frames",
     ]
     assert {time.frame for time in result.timings if time.stage == "fuse"} == {0, 1, 5}
+
+
+def test_a_run_that_maps_nothing_is_an_error_that_says_what_became_of_its_frames() -> None:
+    fuser = assemble(BayesianTsdf, min_depth=50.0, max_depth=60.0)
+    with pytest.raises(DataError) as caught:
+        pipeline(tracker=GivenPose(lost_from=0, lost_to=3), fuser=fuser).run(CornerRoom(unreadable=5))
+    assert str(caught.value) == (
+        "corner_room: nothing was mapped: of 6 frames 1 cannot be used; 3 are lost, the first because: too few points "
+        "associate; 2 have no depth that is mapped, 50 to 60 m"
+    )
 
 
 @AHEAD

@@ -215,8 +215,31 @@ def test_a_picture_that_cannot_be_drawn_is_told_before_anything_runs() -> None:
 
 
 def test_a_row_that_is_not_there_is_told() -> None:
-    with pytest.raises(ConfigError, match="there is no row=chian; the experiment has chain, identity"):
+    with pytest.raises(
+        ConfigError, match=r"there is no row=chian; did you mean chain\? The experiment has chain"
+    ):
         composed(["experiment=ablation_refiner", "row=chian"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["row=half,hafl"], "error: there is no row=hafl; did you mean half? The experiment has "),
+        (
+            ["row=half,whole", "fuser.capcity=3"],
+            "error: Could not override 'fuser.capcity'. There is no fuser.cap",
+        ),
+        (["seed=range(0,0)"], "error: seed=range(0,0) has no value: the sweep would be empty"),
+    ],
+)
+def test_what_is_wrong_with_a_sweep_is_told_before_its_first_run(
+    tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    done = start(tmp_path, *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith(said)
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.rglob("config.yaml"))
 
 
 def test_a_run_without_experiment_is_left_alone() -> None:

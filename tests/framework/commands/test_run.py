@@ -213,6 +213,13 @@ def test_a_run_that_is_refused_changes_nothing(tmp_path: Path) -> None:
     assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
 
 
+def test_a_place_that_nobody_chose_is_named_after_the_dataset(tmp_path: Path) -> None:
+    assert end(begin(tmp_path))[0] == 0
+    [place] = (tmp_path / "outputs").iterdir()
+    assert place.name.endswith("_fake")
+    assert (place / "metrics.json").is_file()
+
+
 def test_runs_and_sweeps_of_the_same_moment_have_places_of_their_own(tmp_path: Path) -> None:
     runs = [begin(tmp_path, "hydra.run.dir=${new_directory:runs/now}") for _ in range(2)]
     assert [end(process)[0] for process in runs] == [0, 0]
