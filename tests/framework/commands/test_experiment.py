@@ -215,9 +215,7 @@ def test_a_picture_that_cannot_be_drawn_is_told_before_anything_runs() -> None:
 
 
 def test_a_row_that_is_not_there_is_told() -> None:
-    with pytest.raises(
-        ConfigError, match=r"there is no row=chian; did you mean chain\? The experiment has chain"
-    ):
+    with pytest.raises(ConfigError, match=r"there is no row=chian; did you mean chain\? The experiment has chain"):
         composed(["experiment=ablation_refiner", "row=chian"])
 
 
