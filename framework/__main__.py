@@ -41,6 +41,9 @@ Without a command, KEY=VALUE ... make one run; with -m, or with an experiment, a
 Commands; each explains itself with --help:
 {commands}
 
+Exit status: 0 = done; 1 = a fault; 3 = a fault ended a run early, and what it had mapped is written; 128 + N = ended by
+signal N (130 = Ctrl-C, 143 = SIGTERM), and what a run had mapped is written.
+
 debug=true, for any of them, shows where an error comes from. The keys of a run: --cfg job; Hydra's own options:
 --hydra-help.
 """

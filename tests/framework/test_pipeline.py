@@ -18,7 +18,16 @@ from framework.journal import RunResult
 from framework.pipeline import Pipeline, map_ahead
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector, pose_at
+from tests.scenes.corner_room import (
+    CornerRoom,
+    FaultyDetector,
+    GivenPose,
+    GridFuser,
+    GridMap,
+    KeepAll,
+    SphereDetector,
+    pose_at,
+)
 
 AHEAD = pytest.mark.parametrize("ahead", [0, 1, 3])
 
@@ -177,6 +186,34 @@ def test_a_full_map_ends_the_run_with_what_there_is(room: CornerRoom) -> None:
     result = pipeline(fuser=GridFuser(capacity=4)).run(room)
     assert isinstance(result.stopped_by, MapFullError)
     assert (result.frames, len(mapped(result).vertices)) == (5, 4)
+
+
+@dataclass
+class _Fails(GridFuser):
+    at: int = 3
+
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        if frame.index == self.at:
+            raise MemoryError("Unable to allocate 40 GiB")
+        super().fuse(frame, pose, clusters)
+
+
+def test_a_fault_is_raised_and_what_it_left_is_there_for_who_asks(room: CornerRoom) -> None:
+    with pytest.raises(MemoryError, match="40 GiB"):
+        pipeline(fuser=_Fails()).run(room)
+    result = pipeline(fuser=_Fails()).run_to_any_end(room)
+    assert isinstance(result.stopped_by, MemoryError)
+    assert (result.frames, len(result.tracked), len(mapped(result).vertices)) == (4, 4, 3)
+
+
+@AHEAD
+def test_a_fault_before_anything_is_in_the_map_is_raised(room: CornerRoom, ahead: int) -> None:
+    for stages in (
+        {"detector": FaultyDetector(at=0)},
+        {"tracker": GivenPose(lost_to=3), "detector": FaultyDetector(at=3)},
+    ):
+        with pytest.raises(OSError, match="Input/output error"):
+            pipeline(ahead, **stages).run_to_any_end(room)
 
 
 @dataclass

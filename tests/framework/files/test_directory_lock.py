@@ -8,12 +8,13 @@ import os
 import subprocess
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from framework.errors import DataError
-from framework.files.directory_lock import locked
+from framework.files.directory_lock import locked, new_directory
 
 
 def test_the_second_is_told_who_has_it(tmp_path: Path) -> None:
@@ -76,3 +77,11 @@ def test_a_file_system_without_locks_gives_a_warning(
     with locked(tmp_path):
         pass
     assert "cannot be locked (No locks available)" in caplog.text
+
+
+def test_who_asks_for_a_new_directory_at_the_same_moment_gets_one_of_his_own(tmp_path: Path) -> None:
+    wanted = str(tmp_path / "outputs" / "now")
+    with ThreadPoolExecutor(8) as processes:
+        made = list(processes.map(new_directory, [wanted] * 40))
+    assert set(made) == {wanted, *(f"{wanted}_{number}" for number in range(2, 41))}
+    assert len(made) == len(list((tmp_path / "outputs").iterdir())) == 40
