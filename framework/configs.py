@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from framework.errors import ConfigError
+from framework.errors import ConfigError, printable
 from framework.files.search_paths import CONF
 
 
@@ -25,13 +27,34 @@ def composed(*overrides: str, name: str = "config") -> DictConfig:
         raise ConfigError(one_line(error)) from error
 
 
+_added: list[Path] = []
+
+
+def add_config_dir(folder: Path) -> None:
+    """Takes the options of another folder for registered in this process, as a run does those of --config-dir.
+
+    Raises ConfigError when there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"--config-dir: there is no folder {folder}")
+    _added.append(folder.resolve())
+
+
 @contextmanager
 def config_directory() -> Iterator[None]:
-    """Has Hydra compose from our configs, also inside of another program that uses it for itself."""
+    """Has Hydra compose from our configs and the added ones, also inside of another program that uses it for itself."""
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
+            loader = GlobalHydra.instance().config_loader()
+            for folder in _added:
+                before = SearchPathQuery(
+                    provider="schema"
+                )  # which must stay the last, as Hydra's own --config-dir does it
+                loader.get_search_path().prepend(provider="command-line", path=f"file://{folder}", anchor=before)
+            if _added:
+                loader.repository.initialize_sources(loader.get_search_path())
             yield
     finally:
         GlobalHydra.instance().hydra = outer
@@ -39,6 +62,10 @@ def config_directory() -> Iterator[None]:
 
 def one_line(error: BaseException) -> str:
     """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    return printable(_said(error))
+
+
+def _said(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):
