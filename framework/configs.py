@@ -8,14 +8,20 @@ from difflib import get_close_matches
 from pathlib import Path
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins import file_config_source
+from hydra._internal.sources_registry import SourcesRegistry
 from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
 from framework.errors import ConfigError, printable
 from framework.files.search_paths import CONF
+from framework.files.whole_files import read_text
+from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
 
 
 def composed(*overrides: str, name: str = "config") -> DictConfig:
@@ -38,6 +44,22 @@ def add_config_dir(folder: Path) -> None:
     if not folder.is_dir():
         raise ConfigError(f"--config-dir: there is no folder {folder}")
     _added.append(folder.resolve())
+
+
+class FileConfigSource(file_config_source.FileConfigSource):
+    """Hydra's own reader of YAML in folders, but files are checked first. Hydra tells sources apart by their name."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        path = Path(self.path, self._normalize_file_name(config_path))
+        if not path.is_file():
+            return super().load_config(config_path)
+        with yaml_faults(path):
+            check_yaml(path, read_text(path, LARGEST_FILE))
+            return super().load_config(config_path)
+
+
+Plugins.instance()  # registers Hydra's own sources
+SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
 
 
 @contextmanager

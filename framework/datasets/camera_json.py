@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -13,16 +12,13 @@ from framework.data import Camera
 from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.datasets.undistortion import Distortion
 from framework.errors import DataError
-from framework.files.whole_files import MOST_TEXT, read_bytes
+from framework.files.json_file import read_json
+from framework.files.whole_files import MOST_TEXT
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
     """The JSON object that a file of at most so many bytes holds. Raises DataError, naming it, when it holds none."""
-    content = read_bytes(path, most)
-    try:
-        found = json.loads(content)  # with or without a byte order mark
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not valid JSON: {error}") from error
+    found = read_json(path, most)
     if not isinstance(found, dict):
         raise DataError(f"{path} must hold a JSON object, found {type(found).__name__}")
     return found

@@ -29,6 +29,7 @@ Element = TypeVar("Element", bound=np.generic)
 
 BLOCK_SIDE = 8  # voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
+MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # of a map: the numbers of its voxels are 32-bit
 REGION_SIDE = 8  # blocks
 REGION_BLOCKS = REGION_SIDE**3
 WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation

@@ -221,6 +221,8 @@ class ClassRows:
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
+        if len(arrays["rest"]) and not classes:
+            raise DataError("rest has rows, and the map no class")
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
 

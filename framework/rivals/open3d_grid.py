@@ -20,6 +20,10 @@ from framework.data import Array, Bool, Camera, Float32, Float64, Frame, Int32, 
 from framework.errors import MapFullError
 from framework.geometry import inverse
 from framework.mapping.map_file import check_blocks, check_like
+from framework.mapping.map_header import MapHeader
+from framework.mapping.sensor import BOUNDS
+from framework.mapping.voxel_grid import MOST_BLOCKS
+from framework.parameters import check_bounds
 
 ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three as Open3D's `integrate` wants them
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
@@ -28,7 +32,8 @@ ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three 
     "instance": (o3d.core.int32, 1),  # 0 = no instance
     "votes": (o3d.core.float32, 1),  # for that instance, less those against it
 }
-FIRST_BLOCKS = 1000  # room at the start; Open3D's memory follows what is asked for, not what is used
+FIRST_BLOCKS = 1000  # room at the start; Open3D's memory follows what is asked for, not what is used ...
+FIRST_VOXELS = 2**23  # ... and at most so many voxels, 0.2 GB
 METRES = 1.0  # Open3D's depth_scale: units of a float image for each metre
 TOUCH_STRIDE = 4  # px between the pixels that Open3D asks which blocks they touch
 NEAR = 0.05  # m, where rays start
@@ -50,6 +55,22 @@ class BlockGridSettings:
     max_blocks: int
     min_weight: float  # frames that must have seen a voxel for it to be surface
 
+    def __post_init__(self) -> None:
+        check_bounds(self, block_resolution=(2, 64), max_blocks=(1, MOST_BLOCKS), min_weight=(1.0, 1e6))
+
+    @classmethod
+    def of(cls, saved: MapHeader) -> BlockGridSettings:
+        """Those that a map's header tells. Raises DataError or ConfigError where they cannot be."""
+        return cls(
+            voxel_size=saved.number("voxel_size", BOUNDS["voxel_size"]),
+            block_resolution=saved.whole("block_resolution"),
+            truncation=saved.number("truncation", (1.0, 100.0)),
+            min_depth=saved.number("min_depth", BOUNDS["min_depth"]),
+            max_depth=saved.number("max_depth", BOUNDS["max_depth"]),
+            max_blocks=saved.whole("max_blocks"),
+            min_weight=saved.number("min_weight"),
+        )
+
 
 class BlockGrid:
     """Blocks of voxels with a signed distance, a colour and labels. A voxel's number is its place in `flat`."""
@@ -63,7 +84,7 @@ class BlockGrid:
             attr_channels=[o3d.core.SizeVector([channels]) for _, channels in ATTRIBUTES.values()],
             voxel_size=settings.voxel_size,
             block_resolution=settings.block_resolution,
-            block_count=min(FIRST_BLOCKS, settings.max_blocks),
+            block_count=min(FIRST_BLOCKS, settings.max_blocks, FIRST_VOXELS // settings.block_resolution**3),
             device=CPU,
         )
         self._make_room_for_ranges()

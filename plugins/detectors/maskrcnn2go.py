@@ -24,10 +24,12 @@ from framework.detection.masks import paste_masks, without_duplicates
 from framework.detection.nms import suppress_boxes
 from framework.errors import DataError
 from framework.files.search_paths import candidates
+from framework.files.whole_files import read_bytes
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
 from framework.parameters import require
 
+LARGEST_FILE = 2**26  # bytes; the published ones have 3 MB
 SHA256 = {
     "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
@@ -226,9 +228,9 @@ def _read_network(folder: Path) -> tuple[Graph, Tensors]:
 
 def _read_checked(path: Path, sha256: str) -> bytes:
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
+        content = read_bytes(path, LARGEST_FILE)
+    except DataError as error:
+        raise DataError(f"detector.weights: {error}") from error
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise DataError(f"detector.weights: {path} is damaged: sha256 {found[:12]}..., expected {sha256[:12]}...")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -20,6 +19,7 @@ from framework.detection.fingerprint import fingerprint
 from framework.detection.hub_model import PREPROCESSING, find_model
 from framework.detection.masks import without_duplicates
 from framework.errors import ConfigError, DataError, in_one_line
+from framework.files.json_file import read_json
 from framework.interfaces import Detector
 from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
 from framework.parameters import require
@@ -339,9 +339,9 @@ class Checkpoint:
         """How the model wants its images."""
         path = self.folder / PREPROCESSING
         try:
-            content = json.loads(path.read_text("utf-8"))
-        except (OSError, ValueError) as error:
-            raise DataError(f"detector.model: {path} could not be read: {error}") from error
+            content = read_json(path)
+        except DataError as error:
+            raise DataError(f"detector.model: {error}") from error
         return Preprocessing.parse(content, str(path))
 
     def read_network(self) -> torch.nn.Module:
