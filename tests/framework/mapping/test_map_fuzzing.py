@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import time
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +30,20 @@ NUMBERS = (0, 1, -1, 2, 255, 256, -2, 32767, 2**20, 10**8, 2**31 - 1, -(2**31), 
 ODD = (*NUMBERS, 0.5, 1e-300, 1e300, -1e-9, float("nan"), float("inf"), None, True, "", "x", "\n" * 300, [], {}, [[]])
 
 
-@pytest.fixture(scope="module", params=[*registered.names("fuser"), "exact"])
-def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """A map's file as arrays and header, each kind of map once."""
+KINDS = ("bayesian_tsdf", "exact", "last_write", "object_volumes", "open3d_vbg", "semantic_components")
+
+
+@dataclass(frozen=True)
+class Saved:
+    """A map's file."""
+
+    path: Path  # where changed ones go
+    arrays: dict[str, np.ndarray] = field(repr=False)
+
+
+@pytest.fixture(scope="module", params=KINDS)
+def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Saved:
+    """Each kind of map once."""
     name = request.param
     chosen = ["bayesian_tsdf", "fuser.storage=EXACT"] if name == "exact" else [name]
     fuser: MapFuser = registered.built("fuser", chosen[0], "fuser.voxel_size=0.08", *chosen[1:])
@@ -39,8 +52,9 @@ def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3)
     path = tmp_path_factory.mktemp(name) / "map.npz"
     fuser.scene.save(path)
+    use(load_map(path))  # compiles what it takes
     with np.load(path) as file:
-        return {"path": path.with_name("changed.npz"), **file}
+        return Saved(path.with_name("changed.npz"), dict(file))
 
 
 def use(scene: SceneMap) -> None:
@@ -131,32 +145,31 @@ def odd_number(draw: st.DrawFn, dtype: np.dtype[Any]) -> Any:
     max_examples=EXAMPLES // 3, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 @given(data=st.data())
-def test_a_changed_map_is_used_or_refused(saved: dict[str, Any], data: st.DataObject) -> None:
-    arrays = {name: array for name, array in saved.items() if name != "path"}
+def test_a_changed_map_is_used_or_refused(saved: Saved, data: st.DataObject) -> None:
+    arrays = dict(saved.arrays)
     for _ in range(data.draw(st.integers(1, 2))):
         if data.draw(st.booleans()):
-            header = data.draw(changed_header(json.loads(arrays["header"].tobytes())))
+            header = data.draw(changed_header(json.loads(saved.arrays["header"].tobytes())))
             arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
         else:
             name = data.draw(st.sampled_from(sorted(arrays)))
             arrays[name] = changed_array(data.draw, arrays[name])
-    load_and_use(saved["path"], archive(arrays))
+    load_and_use(saved.path, archive(arrays))
 
 
 @settings(
     max_examples=EXAMPLES // 3, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck), database=None
 )
 @given(data=st.data())
-def test_a_damaged_file_is_used_or_refused(saved: dict[str, Any], data: st.DataObject) -> None:
+def test_a_damaged_file_is_used_or_refused(saved: Saved, data: st.DataObject) -> None:
     """Bytes changed anywhere, headers of the archive and of its arrays among them."""
-    content = bytearray(archive({name: array for name, array in saved.items() if name != "path"}))
-    headers = [k for k in range(len(content) - 4) if content[k : k + 2] == b"PK" or content[k : k + 3] == b"\x93NU"]
+    content = bytearray(archive(saved.arrays))
+    headers = [match.start() for match in re.finditer(rb"PK|\x93NUMPY", content)]
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.sampled_from(headers)) + data.draw(st.integers(0, 130))
         content[min(at, len(content) - 1)] = data.draw(st.integers(0, 255))
-    load_and_use(saved["path"], bytes(content))
+    load_and_use(saved.path, bytes(content))
 
 
-def test_what_was_saved_is_used(saved: dict[str, Any]) -> None:
-    arrays = {name: array for name, array in saved.items() if name != "path"}
-    assert load_and_use(saved["path"], archive(arrays)) == ""
+def test_what_was_saved_is_used(saved: Saved) -> None:
+    assert load_and_use(saved.path, archive(saved.arrays)) == ""
