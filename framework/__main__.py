@@ -6,6 +6,7 @@ import signal
 import sys
 from difflib import get_close_matches
 from importlib import import_module
+from io import TextIOWrapper
 from pathlib import Path
 
 COMMANDS = {
@@ -49,8 +50,30 @@ debug=true, for any of them, shows where an error comes from. The keys of a run:
 """
 
 
+RERUN = "--experimental-rerun"  # Hydra's: it reads a pickle, which may bring code
+
+
+def leave_working_folder(arguments: list[str]) -> None:
+    """Takes the working folder from where modules are looked for, in which `python -m` puts it first.
+
+    It may be a record that somebody sent. With --config-dir, which registers modules of one's own, it comes last.
+    """
+    here = str(Path.cwd())
+    if sys.flags.safe_path or sys.path[0] not in ("", here) or Path(here) == Path(__file__).resolve().parents[1]:
+        return
+    del sys.path[0]
+    if any(word.startswith(("--config-d", "-cd")) for word in arguments):
+        sys.path.append(here)
+
+
 def main() -> None:
     """The console script `instancemap`."""
+    leave_working_folder(sys.argv[1:])
+    if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
+        sys.exit(f"error: {RERUN} reads a pickle, which may bring code that runs; give the run's overrides instead")
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, TextIOWrapper):  # names of files may be no text
+            stream.reconfigure(errors="backslashreplace")
     program = "python -m framework" if Path(sys.argv[0]).name == "__main__.py" else Path(sys.argv[0]).name
     word = sys.argv[1] if len(sys.argv) > 1 else ""
     if word in ("--help", "-h", "help"):

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import io
-import json
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
-import numpy as np
 from omegaconf import DictConfig
 
 from framework.configs import composed
@@ -96,7 +92,7 @@ def load_map(path: Path | str) -> SceneMap:
     Raises DataError when the file is none or was damaged.
     """
     from framework.mapping import instance_map
-    from framework.mapping.map_file import faults_of
+    from framework.mapping.map_file import read_format
     from framework.rivals import object_map, open3d_map, semantic_map
 
     kinds: dict[str, type[SceneMap]] = {
@@ -105,7 +101,4 @@ def load_map(path: Path | str) -> SceneMap:
         open3d_map.FORMAT: open3d_map.Open3DMap,
         semantic_map.FORMAT: semantic_map.SemanticMap,
     }
-    with faults_of(path), zipfile.ZipFile(path) as archive:
-        header = np.lib.format.read_array(io.BytesIO(archive.read("header.npy")), allow_pickle=False)
-        found = str(json.loads(header.tobytes())["format"])
-    return kinds.get(found, instance_map.InstanceMap).load(path)
+    return kinds.get(read_format(path), instance_map.InstanceMap).load(path)

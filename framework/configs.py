@@ -5,15 +5,24 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
 
 from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins import file_config_source
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.config_search_path import SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from framework.errors import ConfigError
+from framework.errors import ConfigError, printable
 from framework.files.search_paths import CONF
+from framework.files.whole_files import read_text
+from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
 
 
 def composed(*overrides: str, name: str = "config") -> DictConfig:
@@ -25,13 +34,50 @@ def composed(*overrides: str, name: str = "config") -> DictConfig:
         raise ConfigError(one_line(error)) from error
 
 
+_added: list[Path] = []
+
+
+def add_config_dir(folder: Path) -> None:
+    """Takes the options of another folder for registered in this process, as a run does those of --config-dir.
+
+    Raises ConfigError when there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"--config-dir: there is no folder {folder}")
+    _added.append(folder.resolve())
+
+
+class FileConfigSource(file_config_source.FileConfigSource):
+    """Hydra's own reader of YAML in folders, but files are checked first. Hydra tells sources apart by their name."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        path = Path(self.path, self._normalize_file_name(config_path))
+        if not path.is_file():
+            return super().load_config(config_path)
+        with yaml_faults(path):
+            check_yaml(path, read_text(path, LARGEST_FILE))
+            return super().load_config(config_path)
+
+
+Plugins.instance()  # registers Hydra's own sources
+SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
+
+
 @contextmanager
 def config_directory() -> Iterator[None]:
-    """Has Hydra compose from our configs, also inside of another program that uses it for itself."""
+    """Has Hydra compose from our configs and the added ones, also inside of another program that uses it for itself."""
     outer = GlobalHydra.instance().hydra
     GlobalHydra.instance().clear()
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
+            loader: Any = GlobalHydra.instance().config_loader()
+            for folder in _added:
+                before = SearchPathQuery(
+                    provider="schema"
+                )  # which must stay the last, as Hydra's own --config-dir does it
+                loader.get_search_path().prepend(provider="command-line", path=f"file://{folder}", anchor=before)
+            if _added:
+                loader.repository.initialize_sources(loader.get_search_path())
             yield
     finally:
         GlobalHydra.instance().hydra = outer
@@ -39,6 +85,10 @@ def config_directory() -> Iterator[None]:
 
 def one_line(error: BaseException) -> str:
     """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    return printable(_said(error))
+
+
+def _said(error: BaseException) -> str:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file:
         return _no_such_option(error)
     if isinstance(error, OverrideParseException):

@@ -37,6 +37,9 @@ UInt16 = npt.NDArray[np.uint16]
 Bool = npt.NDArray[np.bool_]
 
 ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| that still counts as rigid: published poses carry 4 digits
+MOST_PIXELS = 2**25  # of an image: 8K video
+WIDEST = 10.0  # m sideways for each m of depth, that a camera sees: 168 degrees; no lens without distortion has more
+LONGEST_FOCAL_LENGTH = 1e6  # px
 PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
 
 
@@ -54,9 +57,20 @@ class Camera:
     def __post_init__(self) -> None:
         if self.width < 1 or self.height < 1:
             raise DataError(f"Camera: the image is at least 1x1 px, not {self.width}x{self.height}")
+        if self.width * self.height > MOST_PIXELS:
+            raise DataError(f"Camera: an image has at most {MOST_PIXELS} px, not {self.width}x{self.height}")
         numbers = (self.fx, self.fy, self.cx, self.cy)
         if not np.isfinite(numbers).all() or self.fx <= 0 or self.fy <= 0:
             raise DataError(f"Camera: fx, fy must be positive and cx, cy finite; found fx, fy, cx, cy = {numbers}")
+        if max(self.fx, self.fy) > LONGEST_FOCAL_LENGTH:
+            raise DataError(f"Camera: fx, fy are at most {LONGEST_FOCAL_LENGTH:g} px; found fx, fy, cx, cy = {numbers}")
+        across = max(self.cx, self.width - 1 - self.cx, -self.cx)  # px, of the outermost pixels from the ray ahead
+        along = max(self.cy, self.height - 1 - self.cy, -self.cy)
+        if across > WIDEST * self.fx or along > WIDEST * self.fy:
+            raise DataError(
+                f"Camera: {self.width}x{self.height} px with fx, fy, cx, cy = {numbers} reach more than {WIDEST:g} m "
+                "sideways for each m of depth; are these numbers in px, and not shares of width and height?"
+            )
 
     @property
     def K(self) -> Float64:

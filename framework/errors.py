@@ -1,8 +1,23 @@
 """What can go wrong in a way that the user can mend. Each error is one line: expected, found, where, what to do."""
 
+from __future__ import annotations
+
+import re
+
+LONGEST_WORD = 200  # characters of what was given, such as a name, that a message repeats
+LONGEST_MESSAGE = 1000  # characters; a list of all options or of many labels has some 500
+
+_LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
+
 
 class InstanceMapError(Exception):
-    """Base of every known error. `python -m framework` prints it as one line; `debug=true` adds the traceback."""
+    """Base of every known error. `python -m framework` prints it as one line; `debug=true` adds the traceback.
+
+    Its message is what can be printed, and no longer than a person reads, whatever a file or a name was made of.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(printable(message))
 
 
 class ConfigError(InstanceMapError):
@@ -27,6 +42,18 @@ class MapFullError(InstanceMapError):
 
 class PartialRunError(InstanceMapError):
     """A run ended early, and the record of what it had mapped is written. `__cause__` is what ended it."""
+
+
+def printable(message: object) -> str:
+    """A message with what cannot be printed as its code, such as \\n, and with the middle left out of what is long."""
+    text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(message))
+    return _shortened(_LONG_WORD.sub(lambda match: _shortened(match[0], LONGEST_WORD), text), LONGEST_MESSAGE)
+
+
+def _shortened(text: str, most: int) -> str:
+    return (
+        text if len(text) <= most else f"{text[: most // 2]}...{text[len(text) - most // 4 :]} ({len(text)} characters)"
+    )
 
 
 def in_one_line(said: object) -> str:

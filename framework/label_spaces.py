@@ -13,8 +13,11 @@ import numpy as np
 import yaml
 
 from framework.data import Bool, Float32, Int32
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
+from framework.files.search_paths import expanded
+from framework.files.whole_files import read_text
 
+LARGEST_FILE = 2**20  # bytes of a list of labels
 _OTHER_NAMES = "other_names"  # the file's section of spellings that belong to no space
 
 
@@ -81,10 +84,10 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
     """
     if name_or_path in SPACES:
         return SPACES[name_or_path]
-    path = Path(name_or_path).expanduser()
+    path = expanded(Path(name_or_path))
     try:
-        lines = path.read_text("utf-8-sig").rstrip().splitlines()
-    except (OSError, UnicodeDecodeError) as error:
+        lines = read_text(path, LARGEST_FILE).rstrip().splitlines()
+    except DataError as error:
         raise ConfigError(
             f"labels must be one of {', '.join(SPACES)}, or a text file with one name a line, found {name_or_path}"
         ) from error

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import ast
 import dataclasses
 import importlib.util
 import inspect
 import pkgutil
 import sys
 from collections.abc import Iterator, Mapping
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from importlib.machinery import ModuleSpec
 from pathlib import Path
@@ -22,6 +21,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from framework.configs import config_directory
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF, PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
@@ -35,17 +35,19 @@ STAGES: Mapping[str, type[Any]] = {
 }
 """The config groups and the interface that their options implement."""
 
+REGISTER = "; a class of your own needs a YAML {stage}/NAME.yaml in a folder that --config-dir names"
+
 Plugin = TypeVar("Plugin")
 
 
 def build(interface: type[Plugin], node: DictConfig) -> Plugin:
     """The plugin that a config node describes: `_target_` names the class, every other key is a parameter of it.
 
-    In a run, the class must be one that an option of the stage names: those of this project, of installed packages and
-    of --config-dir. Where no Hydra with our configs runs (from Python, or when a stored run is evaluated anew), its
-    module's source must define it. Only then is it imported, and refused unless it is a concrete dataclass that
-    implements `interface`; only then is anything called, so a config cannot run arbitrary code. Interpolations in the
-    node are resolved against the config that it belongs to.
+    The class must be one that an option of the stage names: those of this project, of installed packages and, in a run,
+    of --config-dir; where no Hydra with our configs runs (from Python, or when a stored run is evaluated anew), also
+    those of `framework.configs.add_config_dir`. Only then is its module imported, and the class refused unless it is a
+    concrete dataclass that implements `interface`: a config brings no code that nobody registered. Interpolations in
+    the node are resolved against the config that it belongs to.
 
     Raises:
         ConfigError: the class or a parameter is wrong; one line that names the stage, the plugin and what is wrong.
@@ -57,10 +59,8 @@ def build(interface: type[Plugin], node: DictConfig) -> Plugin:
             f"{stage}: expected a plugin's config with a _target_, found {_shown(node)}; choose {stage}=NAME"
         )
     target = str(node["_target_"])
-    if loader := _running_loader():
+    with _options_loader() as loader:
         _refuse_unregistered(loader, stage, target)
-    else:
-        _refuse_undefined(stage, target)
     plugin_class = find_class(interface, target)
     where = f"{stage} {target}"
     arguments = parameters(where, plugin_class, node)
@@ -113,26 +113,21 @@ def stage_of(interface: type) -> str:
 
 def _refuse_unregistered(loader: Any, stage: str, target: str) -> None:
     if target not in _targets(loader, stage, target):
-        close = _did_you_mean(target, list(_targets(loader, stage, target)))
-        raise ConfigError(f"{stage} {target}: no registered option of {stage} has this _target_{close}")
+        hint = _did_you_mean(target, list(_targets(loader, stage, target))) or REGISTER.format(stage=stage)
+        raise ConfigError(f"{stage} {target}: no registered option of {stage} has this _target_{hint}")
 
 
-def _refuse_undefined(stage: str, target: str) -> None:
-    module_name, _, class_name = target.rpartition(".")
-    if module_name and module_name not in sys.modules:
-        known = _names_in(_found(f"{stage} {target}", module_name))
-        if class_name not in known and "*" not in known:
-            close = _did_you_mean(class_name, known)
-            raise ConfigError(f"{stage} {target}: module {module_name} defines no {class_name}{close}")
-
-
-def _running_loader() -> Any:
-    """The loader of the Hydra that runs, where our configs are on its search path; else None."""
-    if not GlobalHydra.instance().is_initialized():
-        return None
-    loader = GlobalHydra.instance().config_loader()
-    paths = [str(element.path).removeprefix("file://") for element in loader.get_search_path().get_path()]
-    return loader if str(CONF) in paths else None
+@contextmanager
+def _options_loader() -> Iterator[Any]:
+    """The loader of the Hydra that runs, where our configs are on its search path; else one for our configs."""
+    if GlobalHydra.instance().is_initialized():
+        loader = GlobalHydra.instance().config_loader()
+        paths = [str(element.path).removeprefix("file://") for element in loader.get_search_path().get_path()]
+        if str(CONF) in paths:
+            yield loader
+            return
+    with config_directory():
+        yield GlobalHydra.instance().config_loader()
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
@@ -307,18 +302,6 @@ def _refuse_another(plugins: ModuleSpec) -> None:
             f"the package 'plugins' at {found} stands in the way of InstanceMap's own at {PROJECT_ROOT / 'plugins'}: "
             "rename it or start elsewhere"
         )
-
-
-def _names_in(spec: ModuleSpec) -> list[str]:
-    """The classes that a module's source defines or imports from others; `*` stands for all of another's."""
-    get_source = getattr(spec.loader, "get_source", None)
-    try:
-        nodes = list(ast.walk(ast.parse((get_source(spec.name) if get_source else None) or "")))
-    except (SyntaxError, OSError):
-        return []
-    of_others = [alias for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names]
-    defined = [node.name for node in nodes if isinstance(node, ast.ClassDef)]
-    return defined + [alias.asname or alias.name for alias in of_others]
 
 
 def _implements(found: Any, interface: type) -> bool:

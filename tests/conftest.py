@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from framework import configs
 from tests.scenes.corner_room import CornerRoom
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
@@ -59,3 +60,9 @@ def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]
 def room() -> CornerRoom:
     """A video of six frames whose every pixel is known."""
     return CornerRoom()
+
+
+@pytest.fixture
+def fakes_registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The stages of tests/fake_conf may be built here, as with --config-dir tests/fake_conf."""
+    monkeypatch.setattr(configs, "_added", [CHECKOUT / "tests" / "fake_conf"])

@@ -16,6 +16,7 @@ import pytest
 from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
+from framework import configs
 from framework.api import load_map
 from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
@@ -82,8 +83,9 @@ def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_the_detector_finds_what_it_says(my_plugins: Path) -> None:
+def test_the_detector_finds_what_it_says(my_plugins: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     node = OmegaConf.load(my_plugins / "my_conf" / "detector" / "color_blobs.yaml")
+    monkeypatch.setattr(configs, "_added", [my_plugins / "my_conf"])
     detector = build(Detector, OmegaConf.create({"detector": node}).detector)
     camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
     color = np.full((48, 64, 3), 200, np.uint8)

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
-from pathlib import Path
 
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -43,15 +41,10 @@ def fault_of_first_run(words: Sequence[str]) -> HydraException | None:
     Hydra asks a config whether it is a sweep's, and where that cannot be composed it takes it for a run's, and finds
     fault with its choices, whatever else is wrong. `words` are those of the command line.
     """
-    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    parser.add_argument("--config-dir", "-cd")
-    known, others = parser.parse_known_args([*words])
-    overrides = single_run([word for word in others if not word.startswith("-")])
-    if known.config_dir:
-        overrides.append(f"hydra.searchpath=[file://{Path(known.config_dir).absolute()}]")
+    overrides = [word for word in words if word.startswith("~") or ("=" in word and not word.startswith("-"))]
     try:
         with config_directory():
-            compose("config", overrides)
+            compose("config", single_run(overrides))
     except HydraException as error:
         return error
     return None

@@ -20,7 +20,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.configs import one_line
+from framework.configs import add_config_dir, one_line
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
 from framework.interruption import Interrupted
 
@@ -67,11 +67,21 @@ def show_traceback(error: BaseException) -> None:
 
 
 def arguments(parser: argparse.ArgumentParser) -> argparse.Namespace:
-    """What the command line asks for; `debug=true`, which all commands understand, is not for the parser."""
+    """What the command line asks for; `debug=true`, which all commands understand, is not for the parser.
+
+    They all take --config-dir, too: what is registered there counts as registered, as in a run.
+    """
     for word in sys.argv[1:]:
         if word.startswith("debug=") and word not in ("debug=true", "debug=false"):
             parser.error(f"debug must be true or false, found {word.partition('=')[2][:60]!r}")
-    return parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
+    parser.add_argument("--config-dir", metavar="FOLDER", type=Path, help="of options of your own, as in a run")
+    asked = parser.parse_intermixed_args([word for word in sys.argv[1:] if not word.startswith("debug=")])
+    if asked.config_dir is not None:
+        try:
+            add_config_dir(asked.config_dir)
+        except InstanceMapError as error:
+            parser.error(str(error))
+    return asked
 
 
 def print_for_directories(description: str, place: str, write: Callable[[Path], str]) -> None:
@@ -123,6 +133,8 @@ class Jobs:
     def run(self, command: Callable[[], None]) -> None:
         """Runs Hydra's command for a reported job, and ends the process with a status when one has failed."""
         with one_line_errors():
+            for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra says where one is missing
+                add_config_dir(folder)  # for what is done when Hydra has ended, such as a sweep's figure
             command()
         if self.status:
             sys.exit(self.status)
@@ -138,6 +150,16 @@ def check_switches(config: DictConfig) -> None:
 def is_of_sweep(own: HydraConf) -> bool:
     """Whether a job is one of a sweep's."""
     return not OmegaConf.is_missing(own.job, "num")
+
+
+def _config_dirs(words: list[str]) -> list[Path]:
+    """The folders that --config-dir names on Hydra's command line."""
+    folders = []
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        option, equals, value = word.partition("=")
+        if option in ("--config-dir", "-cd"):
+            folders.append(Path(value if equals else following))
+    return folders
 
 
 def _in_worker() -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
@@ -13,16 +12,13 @@ from framework.data import Camera
 from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.datasets.undistortion import Distortion
 from framework.errors import DataError
-from framework.files.whole_files import MOST_TEXT, read_bytes
+from framework.files.json_file import read_json
+from framework.files.whole_files import MOST_TEXT
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
     """The JSON object that a file of at most so many bytes holds. Raises DataError, naming it, when it holds none."""
-    content = read_bytes(path, most)
-    try:
-        found = json.loads(content)  # with or without a byte order mark
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{path} is not valid JSON: {error}") from error
+    found = read_json(path, most)
     if not isinstance(found, dict):
         raise DataError(f"{path} must hold a JSON object, found {type(found).__name__}")
     return found
@@ -65,9 +61,6 @@ def _number(path: Path, content: Mapping[str, Any], key: str) -> float:
     if key not in content:
         raise DataError(f"{path}: the key {key!r} is missing")
     value = content[key]
-    try:
-        if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
-            return float(value)
-    except OverflowError:  # a whole number beyond the range of float
-        pass
+    if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
+        return float(value)
     raise DataError(f"{path}: {key} must be a number, found {str(value)[:40]!r}")

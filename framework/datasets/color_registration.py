@@ -8,10 +8,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from framework.data import Camera, UInt8, UInt16
+from framework.data import MOST_PIXELS, Camera, UInt8, UInt16
 from framework.datasets.recording import StoredImages
 from framework.errors import DataError, FrameError
-from framework.files.image_files import MOST_PIXELS
 
 LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp
 

@@ -15,7 +15,7 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from framework.data import Detections, Float32
+from framework.data import MOST_PIXELS, Detections, Float32
 from framework.detection.run_length import check, encode, pack
 from framework.detection.stored_detection import (
     Polygons,
@@ -27,8 +27,11 @@ from framework.detection.stored_detection import (
     read_score,
 )
 from framework.errors import ConfigError, DataError
+from framework.files.json_file import read_json
 from framework.files.whole_files import written_whole
 from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS
+
+MOST_DIGITS = 18  # of a frame's number
 
 
 class CategoryIds(Enum):
@@ -53,12 +56,7 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
     `segmentation` is run lengths (packed or a list) or polygons. `image_id` is `Frame.index`, as a number or as the
     name of the image's file ("color/000012.png"). `category_id` counts only where there is no `category_name`.
     """
-    try:
-        entries = json.loads(path.read_bytes())  # with or without a byte order mark
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise DataError(f"{path} is not JSON: {error}") from error
+    entries = read_json(path)
     if not isinstance(entries, list):
         raise DataError(f"{path} must hold a list of results, as COCO's evaluation reads them, found an object")
     index = {name: k for k, name in enumerate(labels)}
@@ -102,7 +100,7 @@ def _read_image_id(found: Any) -> int:
     if type(found) is int and found >= 0:
         return found
     stem = PurePosixPath(found).stem if isinstance(found, str) else ""
-    if not (stem.isascii() and stem.isdigit()):
+    if not (stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS):
         raise DataError(f"image_id must be the frame's number, or a file name that is one, found {found!r}")
     return int(stem)
 
@@ -124,6 +122,8 @@ def _read_segmentation(found: Any) -> Segmentation:
     if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
         raise DataError("segmentation must be run lengths with their size [height, width], or a list of polygons")
     shape = (size[0], size[1])
+    if shape[0] * shape[1] > MOST_PIXELS:
+        raise DataError(f"segmentation.size is {shape[1]}x{shape[0]} px, more than the {MOST_PIXELS} of any image")
     counts = found.get("counts")
     if isinstance(counts, list):
         return RunLengths(pack(counts, shape), shape)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import os
 from collections.abc import Collection
@@ -13,7 +12,9 @@ from framework.detection.mask_rcnn.published_weights import OFFLINE
 from framework.detection.network_outputs import one_line
 from framework.errors import DataError
 from framework.files.hashing import path_hash
+from framework.files.json_file import read_json
 from framework.files.search_paths import expanded
+from framework.files.whole_files import check_regular
 
 HUB_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 """Environment variables: set to 1, nothing is downloaded from huggingface.co."""
@@ -32,6 +33,8 @@ def find_model(model: str, revision: str) -> Path:
     """
     folder = expanded(Path(model))
     if folder.is_dir():
+        for file in filter(Path.exists, (folder / name for name in (CONFIG, PREPROCESSING, WHOLE, INDEX, PICKLED))):
+            check_regular(file)  # transformers would wait for what a pipe says
         return folder
     cached = _cached(model, revision)
     if cached is None:
@@ -64,8 +67,8 @@ def _cached(model: str, revision: str) -> Path | None:
 def _listed(index: Path) -> list[str]:
     """The files that a model's weights are divided among."""
     try:
-        return [*json.loads(index.read_text("utf-8"))["weight_map"].values()]
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        return [*read_json(index)["weight_map"].values()]
+    except (DataError, KeyError, TypeError, AttributeError) as error:
         raise DataError(f"detector.model: {index} is damaged: delete {index.parents[2]}, and run again") from error
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -20,6 +19,7 @@ from framework.detection.stored_detection import (
 )
 from framework.errors import DataError
 from framework.files.image_files import read_uint16
+from framework.files.json_file import read_json
 
 _read_ids = lru_cache(maxsize=1)(read_uint16)  # the detections of a frame share its image
 
@@ -74,12 +74,7 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
 
 
 def _read_list(path: Path) -> list[dict[str, object]]:
-    try:
-        entries = json.loads(path.read_bytes())  # with or without a byte order mark
-    except OSError as error:
-        raise DataError(f"{path} could not be read: {error.strerror or error}") from error
-    except ValueError as error:
-        raise DataError(f"{path} is not JSON: {error}") from error
+    entries = read_json(path)
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         raise DataError(f"{path} must hold a list of objects with id, class and score")
     return entries

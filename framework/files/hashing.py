@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Array
+from framework.files.whole_files import check_regular
 
 
 def add_values(digest: hashlib._Hash, array: Array) -> None:
@@ -22,12 +23,16 @@ def add_array(digest: hashlib._Hash, array: Array) -> None:
 
 
 def path_hash(path: Path) -> str:
-    """SHA-256 (hex) of a file's bytes, or of the names and the bytes of all files below a folder."""
+    """SHA-256 (hex) of a file's bytes, or of the names and the bytes of all files below a folder.
+
+    Raises DataError for what is neither.
+    """
     if path.is_dir():
         digest = hashlib.sha256()
         for below in sorted(below for below in path.rglob("*") if below.is_file()):
             name = below.relative_to(path).as_posix()
             digest.update(f"{len(name)}:{name}:{path_hash(below)}".encode())
         return digest.hexdigest()
+    check_regular(path)
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()

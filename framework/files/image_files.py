@@ -17,11 +17,10 @@ from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 
-from framework.data import Array, UInt8, UInt16
+from framework.data import MOST_PIXELS, Array, UInt8, UInt16
 from framework.errors import DataError, FrameError, in_one_line
 from framework.files.whole_files import read_bytes
 
-MOST_PIXELS = 2**25  # 8K video; decoders allocate what a header claims, and a damaged one can claim 10^10
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"
 JPEG_PADDING = b"\0\r\n"  # some cameras fill their files up with zeros, and some programs add a line end
@@ -82,7 +81,7 @@ def _decode_png(name: Path | str, data: bytes, flags: int) -> Array:
 def check_image(name: Path | str, data: bytes) -> None:
     """Raises FrameError unless `data` is a whole PNG or JPEG file with a picture of a usual size.
 
-    Decoders allocate whatever a header claims.
+    Decoders allocate whatever a header claims: a damaged one can claim 10^10 px.
     """
     if not data:
         raise FrameError(f"{name} is empty")

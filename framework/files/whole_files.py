@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,9 +20,13 @@ _TEMPORARY = re.compile(r"\..+\.\d+-[0-9a-f]{8}\.partial(\..*)?")  # the names t
 def written_whole(path: Path) -> Iterator[Path]:
     """Yields a temporary path beside `path` to write to; on success it becomes `path`, else nothing is left behind.
 
-    The temporary name keeps the suffix, because image and mesh writers choose their format by it. Raises DataError when
-    the disk does not take the file.
+    The temporary name keeps the suffix, because image and mesh writers choose their format by it. A link is followed.
+    Raises DataError when the disk does not take the file, and before anything is written where there is something else
+    than a file, such as a device.
     """
+    path = Path(os.path.realpath(path))
+    if path.exists():
+        check_regular(path)
     # a process id is not enough: containers that share a folder have the same ones
     temporary = path.with_name(f".{path.stem}.{os.getpid()}-{secrets.token_hex(4)}.partial{path.suffix}")
     try:
@@ -50,12 +55,24 @@ def remove_left_over(directory: Path) -> None:
             path.unlink(missing_ok=True)
 
 
+def check_regular(path: Path) -> os.stat_result:
+    """What the system says of a file. Raises DataError, naming it, when it is none: a pipe may never end."""
+    try:
+        found = path.stat()
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} could not be read: {getattr(error, 'strerror', None) or error}") from error
+    if not stat.S_ISREG(found.st_mode):
+        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a device, a pipe or a socket"
+        raise DataError(f"{path} is no file but {kind}")
+    return found
+
+
 def read_bytes(path: Path, most: int) -> bytes:
     """What a file holds. Raises DataError, naming it, when it cannot be read or has more than `most` bytes."""
+    size = check_regular(path).st_size
+    if size > most:
+        raise DataError(f"{path} has {size} bytes, more than the {most} that such a file can have")
     try:
-        size = path.stat().st_size
-        if size > most:
-            raise DataError(f"{path} has {size} bytes, more than the {most} that such a file can have")
         return path.read_bytes()
     except OSError as error:
         raise DataError(f"{path} could not be read: {error.strerror or error}") from error

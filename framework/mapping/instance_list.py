@@ -10,6 +10,7 @@ import open3d as o3d
 
 from framework.data import Bool, Box, Float32, Instance, InstanceMesh, Int32
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
+from framework.mapping.map_header import MapHeader
 from framework.parameters import check_bounds
 
 LEAST_VERTICES = 4  # that span a box
@@ -30,6 +31,11 @@ class Confirmation:
 
     def __post_init__(self) -> None:
         check_bounds(self, min_observations=(1, 2**31), min_confidence=(0.0, 1.0), min_area=(0.0, 1000.0))
+
+    @classmethod
+    def of(cls, saved: MapHeader) -> Confirmation:
+        """The one that a map's header tells. Raises DataError or ConfigError where it cannot be."""
+        return cls(saved.whole("min_observations"), saved.number("min_confidence"), saved.number("min_area"))
 
     def is_met(self, record: InstanceRecord) -> bool:
         """Whether an instance has been observed often enough and is trusted enough."""

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
+from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes, look_up_instances
 from framework.mapping.evidence import INSTANCE_SLOTS, NO_CLASS, Combine, Evidence, EvidenceRows, Storage
@@ -125,19 +126,23 @@ class InstanceMap(SceneMap):
     def load(cls, path: Path | str) -> InstanceMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
         with faults_of(path):
-            classes, storage = tuple(header["classes"]), Storage[header["storage"]]
-            table = table_of(header["table"], len(classes))
+            classes, storage = header.classes(), header.option("storage", Storage)
+            table = table_of(header.part("table"), len(classes))
             volume = TsdfVolume.load(header, arrays, len(arrays["instance_ids"]))
-            scene = cls(volume, Confirmation(**header["confirmation"]), table.combine, table.logarithmic, storage)
+            scene = cls(volume, Confirmation.of(header.part("confirmation")), table.combine, table.logarithmic, storage)
             scene.begin(classes)
-            slots = arrays["instance_ids"].shape[-1] if storage is Storage.EXACT else INSTANCE_SLOTS
+            slots = INSTANCE_SLOTS
+            if storage is Storage.EXACT and arrays["instance_ids"].ndim:
+                slots = max(arrays["instance_ids"].shape[-1], 1)  # as many as were needed
             free = np.empty((0, BLOCK_VOXELS, slots), np.float32)
             free_rows = scene.labels.evidence._replace(instance_ids=free.astype(np.int32), instance_value=free)
             check_like(arrays, free_rows._asdict(), len(arrays["instance_ids"]))
             check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
             check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
+            if ((arrays["instance_ids"][..., 0] > 0) & (arrays["class_ids"][..., 0] == NO_CLASS)).any():
+                raise DataError("class_ids has no class where instance_ids has an instance")
             scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
             scene.labels.row_count = len(scene.labels.evidence.instance_ids)
-            scene.labels.evicted = header["evicted"]
+            scene.labels.evicted = header.whole("evicted")
             scene.table = table
         return scene

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
+import math
+import os
 import zipfile
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -14,16 +15,21 @@ from typing import Any
 import numpy as np
 
 from framework.data import Array, check_array
-from framework.errors import DataError, InstanceMapError
-from framework.files.whole_files import written_whole
+from framework.errors import DataError, InstanceMapError, in_one_line
+from framework.files.json_file import parse_json
+from framework.files.whole_files import check_regular, written_whole
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceTable
+from framework.mapping.map_header import LARGEST_COUNT, MapHeader, whole
+from framework.mapping.voxel_grid import FARTHEST_BLOCK
 
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
 
-FAULTS_OF_FILES = (OSError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error)
-UNREADABLE = (*FAULTS_OF_FILES, LookupError, TypeError, ValueError, AttributeError)
-"""What is raised for a file that is no map, or whose header has something else where a number or a list should be."""
+HEADER = "header"
+LARGEST_HEADER = 2**28  # bytes, of an hour with thousands of instances some 10 MB
+LARGEST_ID = 2**24  # of an instance
+MOST_EVIDENCE = 1e12  # for a class
+SHARE_OF_MEMORY = 0.5  # of the machine, that a map may take when it is loaded
 
 
 def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
@@ -33,30 +39,32 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
         written_whole(Path(path)) as temporary,
         zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
     ):
-        for name, array in {"header": encoded, **arrays}.items():
+        for name, array in {HEADER: encoded, **arrays}.items():
             with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                 np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
 
 
-def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[dict[str, Any], dict[str, Any]]:
+def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
     """The header and the named arrays of a saved map.
 
-    Raises DataError for a file that is none, for another format and for a checksum that fails.
+    Raises DataError for a file that is none, for another format, for a checksum that fails, and before memory is asked
+    for where the arrays do not have the sizes that they claim or are more than this machine holds.
     """
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
+    with faults_of(path), _opened(path) as archive:
+        header = _header(archive)
+        found = header.values.get("format")
+        if found != expected_format:  # its arrays may have other names
+            raise DataError(f"it has map format {found!r:.60}, this version reads {expected_format}")
+        damaged = archive.testzip()
         if damaged is not None:
-            raise DataError(f"{path}: the checksum of {damaged} does not hold; the file is damaged, map again")
-        with np.load(path, allow_pickle=False) as file:
-            header = json.loads(file["header"].tobytes())
-            found = header.get("format")
-            if found != expected_format:  # its arrays may have other names
-                raise DataError(f"{path} has map format {found}, this version reads {expected_format}; map again")
-            arrays = {name: file[name] for name in names}
-    except UNREADABLE as error:
-        raise DataError(f"{path} is not a map that can be read: {error}") from error
-    return header, arrays
+            raise DataError(f"the checksum of {damaged} does not hold; the file is damaged")
+        return header, {name: _array(archive, name) for name in names}
+
+
+def read_format(path: Path | str) -> str:
+    """What a saved map says that it is. Raises DataError for a file that is none."""
+    with faults_of(path), _opened(path) as archive:
+        return str(_header(archive).values.get("format"))
 
 
 @contextmanager
@@ -66,8 +74,47 @@ def faults_of(path: Path | str) -> Iterator[None]:
         yield
     except InstanceMapError as error:
         raise DataError(f"{path}: {error}; map again") from error
-    except UNREADABLE as error:
-        raise DataError(f"{path} is not a map that can be read: {type(error).__name__} {error}; map again") from error
+    except Exception as error:  # of damaged archives, zipfile and numpy raise almost anything
+        raise DataError(f"{path} is not a map that can be read: {in_one_line(error)}; map again") from error
+
+
+@contextmanager
+def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
+    check_regular(Path(path))
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+        if unpacked > SHARE_OF_MEMORY * machine_memory():
+            raise DataError(f"it has {unpacked} bytes unpacked, more than half of this machine's {machine_memory()}")
+        yield archive
+
+
+def _header(archive: zipfile.ZipFile) -> MapHeader:
+    info = archive.getinfo(f"{HEADER}.npy")
+    if info.file_size > LARGEST_HEADER:
+        raise DataError(f"its header has {info.file_size} bytes, more than {LARGEST_HEADER}")
+    return MapHeader.of(parse_json("its header", _array(archive, HEADER).tobytes()))
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> Array:
+    """Reads an array whose member of the archive is as long as its shape says."""
+    info = archive.getinfo(f"{name}.npy")
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(member)
+        claimed = member.tell() + math.prod(shape) * dtype.itemsize
+    if claimed != info.file_size or min(shape, default=0) < 0:
+        raise DataError(f"{name} claims to be {shape} of {dtype}, and has {info.file_size} bytes")
+    with archive.open(info) as member:
+        return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+
+
+def machine_memory() -> int:
+    """Bytes of this machine; a usual number where the system does not tell."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return 2**34
 
 
 def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
@@ -85,10 +132,18 @@ def check_known(name: str, array: Array, known: Iterable[int]) -> None:
         raise DataError(f"{name} has {unknown[0]}, which is none of the map's")
 
 
+def check_rows(label_row: Array, rows: int) -> None:
+    """Raises DataError unless each of the label evidence's rows is that of one block; -1 = a block has none."""
+    used = label_row[label_row != -1]
+    check_known("label_row", used, range(rows))
+    if len(np.unique(used)) < max(len(used), rows):
+        raise DataError(f"label_row must name each of the {rows} rows once")
+
+
 def check_blocks(coords: Any) -> None:
-    """Raises DataError unless blocks (B, 3) lie within 2^20 blocks of the origin, and each is named once."""
-    if len(coords) and np.abs(coords, dtype=np.int64).max() >= 1 << 20:
-        raise DataError(f"block_coords must be within 2^20 of 0, found {coords.min()} to {coords.max()}")
+    """Raises DataError unless blocks (B, 3) lie where the map has any, and each is named once."""
+    if len(coords) and np.abs(coords, dtype=np.int64).max() >= FARTHEST_BLOCK:
+        raise DataError(f"block_coords must be within {FARTHEST_BLOCK} of 0, found {coords.min()} to {coords.max()}")
     if len(np.unique(coords, axis=0)) < len(coords):
         raise DataError("block_coords has a block twice")
 
@@ -111,17 +166,39 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
     }
 
 
-def table_of(plain: Mapping[str, Any], classes: int) -> InstanceTable:
-    """The table that `plain_table` wrote down, of a map with so many classes."""
-    table = InstanceTable(Combine[plain["combine"]], plain["logarithmic"])
-    table.last_id = plain["last_id"]
-    for entry in plain["instances"]:
-        record = InstanceRecord(**entry)
-        record.class_evidence = np.array(record.class_evidence, np.float64)
-        check_array(f"class_evidence of {record.id}", record.class_evidence, (classes,), np.float64)
-        record.observed_in = set(record.observed_in)
-        record.in_view = FrameSet(entry["in_view"])
+def table_of(plain: MapHeader, classes: int) -> InstanceTable:
+    """The table that `plain_table` wrote down, of a map with so many classes. Raises DataError where it cannot be."""
+    table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
+    table.last_id = plain.whole("last_id", 0, LARGEST_ID)
+    for entry in plain.parts("instances"):
+        record = _record(entry, table.last_id, classes)
+        if record.id in table.records:
+            raise DataError(f"{entry.name}.id is {record.id}, as that of another instance")
         table.records[record.id] = record
-        if not 0 < record.id <= table.last_id:
-            raise DataError(f"the table's ids must be in [1, {table.last_id}], found {record.id}")
     return table
+
+
+def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
+    evidence = entry.items("class_evidence")
+    if len(evidence) != classes or not classes or not all(type(value) in (int, float) for value in evidence):
+        raise DataError(f"{entry.name}.class_evidence must be {classes} numbers, one a class, found {evidence!r:.60}")
+    record = InstanceRecord(
+        id=entry.whole("id", 1, last_id),
+        class_evidence=np.array(evidence, np.float64),
+        first_frame=entry.whole("first_frame", -LARGEST_COUNT),
+        last_frame=entry.whole("last_frame", -LARGEST_COUNT),
+        observed_in={whole(f"{entry.name}.observed_in", k, -LARGEST_COUNT) for k in entry.items("observed_in")},
+        in_view=FrameSet(_span(f"{entry.name}.in_view", found) for found in entry.items("in_view")),
+        score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
+        detections=entry.whole("detections"),
+    )
+    if not np.abs(record.class_evidence).max() <= MOST_EVIDENCE:
+        raise DataError(f"{entry.name}.class_evidence must be within {MOST_EVIDENCE:g} of 0, found {evidence!r:.60}")
+    return record
+
+
+def _span(name: str, found: object) -> list[int]:
+    if not isinstance(found, list) or len(found) != 2:
+        raise DataError(f"{name} must have the first and the last frame of each span, found {found!r:.60}")
+    first = whole(name, found[0], -LARGEST_COUNT)
+    return [first, whole(name, found[1], first)]

@@ -9,6 +9,16 @@ import numpy as np
 from framework.data import Camera, Float32, Float64
 from framework.mapping.voxel_grid import device
 
+BOUNDS = {  # of what measures, and of the voxels that it fills; see Tsdf and VoxelHashing
+    "voxel_size": (1e-4, 1.0),
+    "truncation": (1e-4, 100.0),
+    "truncation_slope": (0.0, 1.0),
+    "min_depth": (1e-3, 100.0),
+    "max_depth": (1e-3, 1000.0),
+    "max_weight": (1.0, 255.0),
+    "full_weight_depth": (1e-3, 1000.0),
+}
+
 
 class Sensor(NamedTuple):
     """How depth readings become distances: the parameters of integration."""

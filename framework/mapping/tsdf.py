@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from framework.mapping.sensor import Sensor
+from framework.mapping.sensor import BOUNDS, Sensor
 from framework.mapping.tsdf_volume import TsdfVolume
+from framework.mapping.voxel_grid import MOST_BLOCKS
 from framework.parameters import check_bounds
 
 
@@ -24,10 +25,10 @@ class Tsdf:
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            voxel_size=(1e-4, 1.0),
+            voxel_size=BOUNDS["voxel_size"],
             truncation=(1.0, 100.0),
-            min_depth=(1e-3, 100.0),
-            max_depth=(self.min_depth, 1000.0),
+            min_depth=BOUNDS["min_depth"],
+            max_depth=(self.min_depth, BOUNDS["max_depth"][1]),
             label_band=(1.0, self.truncation),
         )
 
@@ -45,10 +46,10 @@ class VoxelHashing:
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            truncation_slope=(0.0, 1.0),
-            max_weight=(1.0, 255.0),
-            full_weight_depth=(1e-3, 1000.0),
-            max_blocks=(1, 2**31 // 512),
+            truncation_slope=BOUNDS["truncation_slope"],
+            max_weight=BOUNDS["max_weight"],
+            full_weight_depth=BOUNDS["full_weight_depth"],
+            max_blocks=(1, MOST_BLOCKS),
         )
 
     def new_volume(self) -> TsdfVolume:

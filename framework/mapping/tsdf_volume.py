@@ -9,12 +9,12 @@ import numpy as np
 
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
 from framework.mapping.integration import Integrator, SeenBlocks
-from framework.mapping.map_file import check_blocks, check_known, check_like
+from framework.mapping.map_file import check_blocks, check_like, check_rows
+from framework.mapping.map_header import MapHeader
 from framework.mapping.meshing import Surface, SurfaceNets
 from framework.mapping.raycasting import render_near, render_surface
-from framework.mapping.sensor import Sensor
-from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, find_solid_blocks
-from framework.parameters import require
+from framework.mapping.sensor import BOUNDS, Sensor
+from framework.mapping.voxel_grid import BLOCK_VOXELS, MOST_BLOCKS, VoxelGrid, find_solid_blocks
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)
@@ -87,13 +87,15 @@ class TsdfVolume:
         return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
 
     @classmethod
-    def load(cls, header: dict[str, Any], arrays: dict[str, Any], rows: int) -> TsdfVolume:
+    def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
         """The one that `saved` gave, of a map whose labels have so many rows. Raises DataError where it cannot be."""
-        sensor = Sensor(**{name: np.float32(value) for name, value in header["sensor"].items()})
-        require(0 < header["voxel_size"] <= 1, "voxel_size", header["voxel_size"], "in (0, 1] m")
-        volume = cls(header["voxel_size"], sensor, header["max_blocks"])
+        saved = header.part("sensor")
+        sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
+        volume = cls(
+            header.number("voxel_size", BOUNDS["voxel_size"]), sensor, header.whole("max_blocks", 1, MOST_BLOCKS)
+        )
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
-        check_known("label_row", arrays["label_row"], range(-1, rows))
+        check_rows(arrays["label_row"], rows)
         volume.fill(arrays)
         return volume
 

@@ -29,6 +29,7 @@ Element = TypeVar("Element", bound=np.generic)
 
 BLOCK_SIDE = 8  # voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
+MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # of a map: the numbers of its voxels are 32-bit
 REGION_SIDE = 8  # blocks
 REGION_BLOCKS = REGION_SIDE**3
 WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
@@ -48,7 +49,8 @@ def one_more(count, condition):
 
 
 _KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
-_KEY_OFFSET = 1 << (_KEY_BITS - 1)
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin, along any axis, where the map ends
+_KEY_OFFSET = FARTHEST_BLOCK
 _KEY_MASK = (1 << _KEY_BITS) - 1
 
 

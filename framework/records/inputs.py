@@ -11,7 +11,7 @@ from typing import Any
 
 from framework.datasets.scannet.scannet_annotation import FIRST_LABEL_TABLE, LABEL_TABLE
 from framework.detection.fingerprint import content_hash
-from framework.errors import ConfigError
+from framework.errors import ConfigError, DataError
 from framework.files.search_paths import folder_of
 from framework.records.provenance import leaves, relevant
 
@@ -41,7 +41,7 @@ def _content(value: str) -> str:
     """Of a file or folder; "" for a word that names none."""
     try:
         return content_hash(Path(value))
-    except (ConfigError, OSError, ValueError):
+    except (ConfigError, DataError, OSError, ValueError):
         return ""
 
 

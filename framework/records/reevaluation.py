@@ -19,7 +19,7 @@ from framework.interfaces import RGBDSequence
 from framework.records.instances_file import read_instances
 from framework.records.mesh_file import read_mesh
 from framework.records.metrics import TRUTH, evaluation_metrics, is_evaluation
-from framework.records.provenance import code_version
+from framework.records.provenance import code_version, leaves
 from framework.records.stored_runs import EVALUATION, METRICS, Record
 from framework.registry import build
 
@@ -33,8 +33,14 @@ class Truth:
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Truth:
-        """From a run's config. Raises InstanceMapError when the dataset cannot be built or read."""
+        """From a run's config, in which nothing is left to be resolved: a record does not ask for the environment.
+
+        Raises InstanceMapError when the dataset cannot be built or read.
+        """
         node = OmegaConf.create(dict(config)).get("dataset")
+        for key, value in leaves({"dataset": config.get("dataset")}):
+            if "${" in str(value):
+                raise DataError(f"a run's config is stored resolved, and this one is not: {key}={value}")
         sequence = build(RGBDSequence, node)  # type: ignore[type-abstract]
         return cls(sequence.scene_truth(), sequence.annotation)
 

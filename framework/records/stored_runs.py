@@ -12,10 +12,11 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-from yaml import YAMLError
 
 from framework.errors import DataError
 from framework.files.json_file import read_json
+from framework.files.whole_files import MOST_TEXT, read_bytes
+from framework.files.yaml_file import load_yaml
 from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.provenance import code_version, config_hash, environment, shows_speed, speed_settings
 
@@ -143,11 +144,11 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
 
 def read_yaml(path: Path) -> dict[str, Any]:
     """A YAML file with keys and values, interpolations unresolved. Raises DataError, naming the file."""
+    if not path.exists():
+        raise DataError(f"{path} is missing")
     try:
-        content = OmegaConf.to_container(OmegaConf.load(path), resolve=False)
-    except FileNotFoundError as error:
-        raise DataError(f"{path} is missing") from error
-    except (OSError, ValueError, YAMLError, OmegaConfBaseException, RecursionError) as error:
+        content = OmegaConf.to_container(load_yaml(path), resolve=False)
+    except OmegaConfBaseException as error:
         raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold keys and values, found a list")
@@ -185,8 +186,8 @@ def _why_incomplete(directory: Path) -> str:
         except DataError as error:
             return str(error)
     try:
-        lines = (directory / LOG).read_text(errors="replace").splitlines()
-    except OSError:
+        lines = read_bytes(directory / LOG, MOST_TEXT).decode(errors="replace").splitlines()
+    except DataError:
         lines = []
     matches = [match for match in map(_LOG_LINE.match, lines) if match]
     if matches and matches[-1]["level"] in ("ERROR", "CRITICAL"):

@@ -11,6 +11,7 @@ import numpy as np
 
 from framework.data import Float64, Int64
 from framework.errors import DataError
+from framework.files.whole_files import read_text
 
 HEADER = ["frame", "stage", "milliseconds"]
 LARGEST = 2**53  # numbers of frames are smaller: every program has these exactly
@@ -27,9 +28,8 @@ class StageTimes:
 def read_timings(path: Path) -> StageTimes:
     """The times that a run wrote. Raises DataError, naming file and line, for anything else."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            lines = list(csv.reader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
+    except csv.Error as error:
         raise DataError(f"{path} cannot be read: {error}") from error
     if lines[:1] != [HEADER]:
         raise DataError(f"{path}, line 1: expected {','.join(HEADER)}, found {','.join(next(iter(lines), []))!r:.60}")

@@ -29,14 +29,14 @@ from framework.data import (
     UInt8,
     View,
 )
-from framework.errors import MapFullError
+from framework.errors import DataError, MapFullError
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes
 from framework.mapping.evidence import Combine
 from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import check_known, check_like, faults_of, plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import check_like, faults_of, plain_table, read_map, table_of, write_map
 from framework.mapping.meshing import Surface
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
@@ -227,12 +227,16 @@ class ObjectMap(SceneMap):
     def load(cls, path: Path | str) -> ObjectMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *(OBJECT + name for name in VOLUME_ARRAYS)))
         with faults_of(path):
-            scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation(**header["confirmation"]))
-            scene.classes = tuple(header["classes"])
-            scene.table = table_of(header["table"], len(scene.classes))
-            counts = {int(key): blocks for key, blocks in header["objects"].items()}
+            scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation.of(header.part("confirmation")))
+            scene.classes = header.classes()
+            scene.table = table_of(header.part("table"), len(scene.classes))
+            objects = header.part("objects")
+            if objects.values.keys() != {str(key) for key in scene.table.records}:
+                raise DataError("header.objects must be the instances of its table")
+            counts = {int(key): objects.whole(key) for key in objects.values}
             check_like(arrays, scene._empty_volume().arrays(), sum(counts.values()), OBJECT)
-            check_known("objects", np.array([*counts]), scene.table.records)
+            if (arrays[OBJECT + "foreground"] > arrays[OBJECT + "observed"]).any():
+                raise DataError(f"{OBJECT}foreground must not be above {OBJECT}observed, of which it is a part")
             first = 0
             for key, blocks in counts.items():
                 volume = scene.volumes[key] = scene._empty_volume()

@@ -20,6 +20,10 @@ from framework.data import Array, Bool, Camera, Float32, Float64, Frame, Int32, 
 from framework.errors import MapFullError
 from framework.geometry import inverse
 from framework.mapping.map_file import check_blocks, check_like
+from framework.mapping.map_header import MapHeader
+from framework.mapping.sensor import BOUNDS
+from framework.mapping.voxel_grid import MOST_BLOCKS
+from framework.parameters import check_bounds
 
 ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three as Open3D's `integrate` wants them
     "tsdf": (o3d.core.float32, 1),  # in truncation distances
@@ -28,13 +32,15 @@ ATTRIBUTES = {  # name: (type, channels) of what a voxel holds; the first three 
     "instance": (o3d.core.int32, 1),  # 0 = no instance
     "votes": (o3d.core.float32, 1),  # for that instance, less those against it
 }
-FIRST_BLOCKS = 1000  # room at the start; Open3D's memory follows what is asked for, not what is used
+FIRST_BLOCKS = 1000  # room at the start; Open3D's memory follows what is asked for, not what is used ...
+FIRST_VOXELS = 2**23  # ... and at most so many voxels, 0.2 GB
 METRES = 1.0  # Open3D's depth_scale: units of a float image for each metre
 TOUCH_STRIDE = 4  # px between the pixels that Open3D asks which blocks they touch
 NEAR = 0.05  # m, where rays start
 RANGE_TILE = 8  # px of the image for one of the map of ranges that rays search, Open3D's default
 FRAGMENTS = 2**18  # pieces of blocks in view that the map of ranges has room for; a view of 10,000 blocks takes 20,000
 FRAGMENT = 16 * 16  # pixels of the map of ranges in a piece
+MOST_RANGE_PIXELS = 2**24  # of that first image: coarse voxels need fewer fragments
 CPU = o3d.core.Device("CPU:0")
 
 
@@ -50,6 +56,22 @@ class BlockGridSettings:
     max_blocks: int
     min_weight: float  # frames that must have seen a voxel for it to be surface
 
+    def __post_init__(self) -> None:
+        check_bounds(self, block_resolution=(2, 64), max_blocks=(1, MOST_BLOCKS), min_weight=(1.0, 1e6))
+
+    @classmethod
+    def of(cls, saved: MapHeader) -> BlockGridSettings:
+        """Those that a map's header tells. Raises DataError or ConfigError where they cannot be."""
+        return cls(
+            voxel_size=saved.number("voxel_size", BOUNDS["voxel_size"]),
+            block_resolution=saved.whole("block_resolution"),
+            truncation=saved.number("truncation", (1.0, 100.0)),
+            min_depth=saved.number("min_depth", BOUNDS["min_depth"]),
+            max_depth=saved.number("max_depth", BOUNDS["max_depth"]),
+            max_blocks=saved.whole("max_blocks"),
+            min_weight=saved.number("min_weight"),
+        )
+
 
 class BlockGrid:
     """Blocks of voxels with a signed distance, a colour and labels. A voxel's number is its place in `flat`."""
@@ -63,7 +85,7 @@ class BlockGrid:
             attr_channels=[o3d.core.SizeVector([channels]) for _, channels in ATTRIBUTES.values()],
             voxel_size=settings.voxel_size,
             block_resolution=settings.block_resolution,
-            block_count=min(FIRST_BLOCKS, settings.max_blocks),
+            block_count=min(FIRST_BLOCKS, settings.max_blocks, FIRST_VOXELS // settings.block_resolution**3),
             device=CPU,
         )
         self._make_room_for_ranges()
@@ -73,7 +95,7 @@ class BlockGrid:
 
         Open3D sizes that buffer by the first image. Where it is too small, a view has holes, and stdout a warning.
         """
-        side = int(np.ceil(np.sqrt(FRAGMENTS * FRAGMENT * self.settings.voxel_size)))
+        side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MOST_RANGE_PIXELS))))
         nowhere = Tensor(np.zeros((1, 3), np.int32))
         self.blocks.ray_cast(
             nowhere, Tensor(np.eye(3)), Tensor(np.eye(4)), side, side, ["depth"], METRES, range_map_down_factor=1

@@ -141,10 +141,11 @@ class Open3DMap(SceneMap):
     def load(cls, path: Path | str) -> Open3DMap:
         header, arrays = read_map(path, FORMAT, ("block_coords", *ATTRIBUTES))
         with faults_of(path):
-            scene = cls(BlockGridSettings(**header["settings"]), Confirmation(**header["confirmation"]))
-            scene.classes = tuple(header["classes"])
-            scene.table = table_of(header["table"], len(scene.classes))
-            scene.grid.frames = header["frames"]
+            settings = BlockGridSettings.of(header.part("settings"))
+            scene = cls(settings, Confirmation.of(header.part("confirmation")))
+            scene.classes = header.classes()
+            scene.table = table_of(header.part("table"), len(scene.classes))
+            scene.grid.frames = header.whole("frames")
             scene.grid.fill(arrays)
             check_known("instance", arrays["instance"], [0, *scene.table.records])
         return scene

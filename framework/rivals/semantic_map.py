@@ -20,6 +20,7 @@ from framework.mapping.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.rivals.class_evidence import ClassEvidence, ClassRows, best_class
 from framework.rivals.connected_components import component_statistics, connected_components, vertex_classes
 
+MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of what a map is made with; m^2
 FORMAT = "semantic 1"  # of the saved file; a change of meaning counts it up
 
 
@@ -152,9 +153,9 @@ class SemanticMap(SceneMap):
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *ClassEvidence._fields))
         with faults_of(path):
             volume = TsdfVolume.load(header, arrays, len(arrays["rest"]))
-            scene = cls(volume, header["missed"], header["min_area"])
-            classes = tuple(header["classes"])
+            scene = cls(volume, header.number("missed", MISSED), header.number("min_area", AREA))
+            classes = header.classes()
             scene.begin(classes)
             scene.labels.fill(arrays, len(classes))
-            scene.labels.evicted = header["evicted"]
+            scene.labels.evicted = header.whole("evicted")
         return scene

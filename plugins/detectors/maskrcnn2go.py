@@ -24,10 +24,12 @@ from framework.detection.masks import paste_masks, without_duplicates
 from framework.detection.nms import suppress_boxes
 from framework.errors import DataError
 from framework.files.search_paths import candidates
+from framework.files.whole_files import read_bytes
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
-from framework.parameters import require
+from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 
+LARGEST_FILE = 2**26  # bytes; the published ones have 3 MB
 SHA256 = {
     "graph.json": "e2b06acc9c26fdd62292100ea2a5495f9fd1bd3607276916bdb8440562f401ef",
     "maskrcnn2go_coco_int8.npz": "a79197eba054bdf4e4b1136a3dffbfea951f442682464357d91b2a1abd0d21c9",
@@ -70,11 +72,14 @@ class MaskRCNN2Go(Detector):
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        require(self.proposals >= 1, "detector.proposals", self.proposals, "at least 1")
-        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        check_count("detector.proposals", self.proposals, MOST_PROPOSALS)
+        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(self.short_side >= 32, "detector.short_side", self.short_side, "at least 32 px")
         require(
-            self.long_side >= self.short_side, "detector.long_side", self.long_side, f"at least {self.short_side} px"
+            self.short_side <= self.long_side <= LONGEST_SIDE,
+            "detector.long_side",
+            self.long_side,
+            f"at least {self.short_side} px and at most {LONGEST_SIDE}",
         )
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         self._device = torch_device(self.device)
@@ -226,9 +231,9 @@ def _read_network(folder: Path) -> tuple[Graph, Tensors]:
 
 def _read_checked(path: Path, sha256: str) -> bytes:
     try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
+        content = read_bytes(path, LARGEST_FILE)
+    except DataError as error:
+        raise DataError(f"detector.weights: {error}") from error
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
         raise DataError(f"detector.weights: {path} is damaged: sha256 {found[:12]}..., expected {sha256[:12]}...")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from collections.abc import Mapping, Sequence
@@ -20,9 +19,10 @@ from framework.detection.fingerprint import fingerprint
 from framework.detection.hub_model import PREPROCESSING, find_model
 from framework.detection.masks import without_duplicates
 from framework.errors import ConfigError, DataError, in_one_line
+from framework.files.json_file import read_json
 from framework.interfaces import Detector
 from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
-from framework.parameters import require
+from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, check_count, require
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what the files leave out by default
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers, as the files have them
@@ -96,7 +96,7 @@ class TransformersSegmentation(Detector):
     def __post_init__(self) -> None:
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         require(
             self.short_side == 0 or self.short_side >= 32,
@@ -105,10 +105,12 @@ class TransformersSegmentation(Detector):
             "0 (as published) or at least 32 px",
         )
         require(
-            self.long_side >= self.short_side if self.short_side else self.long_side == 0,
+            self.short_side <= self.long_side <= LONGEST_SIDE if self.short_side else self.long_side == 0,
             "detector.long_side",
             self.long_side,
-            f"at least {self.short_side} px" if self.short_side else "0 where short_side is 0",
+            f"at least {self.short_side} px and at most {LONGEST_SIDE}"
+            if self.short_side
+            else "0 where short_side is 0",
         )
         self._device = torch_device(self.device)
         checkpoint = Checkpoint(self.model, self.revision)
@@ -339,9 +341,9 @@ class Checkpoint:
         """How the model wants its images."""
         path = self.folder / PREPROCESSING
         try:
-            content = json.loads(path.read_text("utf-8"))
-        except (OSError, ValueError) as error:
-            raise DataError(f"detector.model: {path} could not be read: {error}") from error
+            content = read_json(path)
+        except DataError as error:
+            raise DataError(f"detector.model: {error}") from error
         return Preprocessing.parse(content, str(path))
 
     def read_network(self) -> torch.nn.Module:

@@ -31,13 +31,7 @@ class Open3DVoxelBlockGrid(MapFuser):
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self,
-            block_resolution=(2, 64),
-            max_blocks=(1, 2**31 // 512),
-            min_weight=(1.0, 1e6),
-            class_floor=(1e-6, 0.999),
-        )
+        check_bounds(self, class_floor=(1e-6, 0.999))
         settings = BlockGridSettings(
             voxel_size=self.tsdf.voxel_size,
             block_resolution=self.block_resolution,

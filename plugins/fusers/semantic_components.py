@@ -12,7 +12,7 @@ from framework.mapping.pixel_lists import list_points_by_pixel
 from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
 from framework.rivals.class_evidence import mask_classes
-from framework.rivals.semantic_map import SemanticMap
+from framework.rivals.semantic_map import AREA, MISSED, SemanticMap
 
 
 @dataclass
@@ -35,7 +35,7 @@ class SemanticComponents(MapFuser):
     missed: float = 0.7  # in (0, 1]: P(no mask | surface of any class) over that of the background; 1 = says nothing
 
     def __post_init__(self) -> None:
-        check_bounds(self, class_floor=(1e-6, 0.999), missed=(1e-6, 1.0), min_area=(0.0, 1000.0))
+        check_bounds(self, class_floor=(1e-6, 0.999), missed=MISSED, min_area=AREA)
         self.scene: SemanticMap = SemanticMap(self.hashing.new_volume(), self.missed, self.min_area)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:

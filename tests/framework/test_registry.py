@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
+from contextlib import nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -15,7 +15,8 @@ import pytest
 from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
-from framework.configs import config_directory
+from framework import configs
+from framework.configs import add_config_dir, config_directory
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker
@@ -93,10 +94,24 @@ def some_function() -> None:
     raise AssertionError("a config must not be able to call this")
 
 
+REGISTERED = ("Probe", "Undecorated", "Abstract", "Assembled", "Ambiguous", "OddField", "some_function", "Path", "Prob")
+
+
+def register(monkeypatch: pytest.MonkeyPatch, folder: Path, stage: str, *targets: str) -> None:
+    """As --config-dir does."""
+    (folder / stage).mkdir(exist_ok=True)
+    for target in targets:
+        (folder / stage / f"{target.replace('.', '_').lower()}.yaml").write_text(f"_target_: {target}\n")
+    monkeypatch.setattr(configs, "_added", [])
+    add_config_dir(folder)
+
+
 @pytest.fixture(autouse=True)
-def importable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """This module under a fixed name, whatever pytest calls it."""
+def importable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This module under a fixed name, whatever pytest calls it, and its classes registered, whatever they are."""
     monkeypatch.setitem(sys.modules, HERE, sys.modules[__name__])
+    others = ("framework.interfaces.Detector", "framework.interface.Detector", "os.system", "nowhere.at.All", "Probe")
+    register(monkeypatch, tmp_path, "detector", *(f"{HERE}.{name}" for name in REGISTERED), *others)
 
 
 def detector(**parameters: object) -> Detector:
@@ -206,23 +221,7 @@ def talkative(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "talkative" / "one.py").write_text("print('imported')\nclass Named: pass\n")
 
 
-def test_a_class_of_a_module_that_takes_all_of_another_is_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
-    (tmp_path / "takes_all.py").write_text("from plugins.trackers.ground_truth import *\n")
-    tracker = build(PoseTracker, OmegaConf.create({"_target_": "takes_all.GroundTruth"}))
-    assert type(tracker).__name__ == "GroundTruth"
-
-
-@pytest.mark.parametrize("target", ["this.X", "this.s.X", "antigravity.X", "talkative.one.Name", "talkative.two.Named"])
-@pytest.mark.usefixtures("talkative")
-def test_what_does_not_define_the_class_is_not_imported(target: str, capfd: pytest.CaptureFixture[str]) -> None:
-    assert re.search("defines no X|defines no Name; did you mean 'Named'|there is no module", fault(_target_=target))
-    assert not {"this", "antigravity", "talkative", "talkative.one"} & set(sys.modules)
-    assert capfd.readouterr() == ("", "")
-
-
+@pytest.mark.parametrize("hydra_runs", [True, False])
 @pytest.mark.parametrize(
     ("target", "said"),
     [
@@ -234,12 +233,15 @@ def test_what_does_not_define_the_class_is_not_imported(target: str, capfd: pyte
     ],
 )
 @pytest.mark.usefixtures("talkative")
-def test_a_run_takes_what_its_options_register(target: str, said: str, capfd: pytest.CaptureFixture[str]) -> None:
-    """The options are those of Hydra's search path. Nothing else is imported."""
-    with config_directory():
+def test_what_no_option_registers_is_not_imported(
+    target: str, said: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The options are those of Hydra's search path, also where a stored config is read and no Hydra runs."""
+    monkeypatch.setattr(configs, "_added", [])
+    with config_directory() if hydra_runs else nullcontext():
         assert said in fault(_target_=target)
         assert build(Detector, OmegaConf.create({"_target_": "plugins.detectors.none.NoDetections"})).classes
-    assert not {"this", "talkative"} & set(sys.modules)
+    assert not {"this", "talkative", "talkative.one"} & set(sys.modules)
     assert capfd.readouterr() == ("", "")
 
 
@@ -248,15 +250,11 @@ def test_inside_of_another_program_that_uses_hydra_its_options_do_not_matter(tmp
         assert detector() == Probe(Path("w.bin"))
 
 
-IN_THE_WAY = "import sys, framework; sys.path.insert(0, ''); from framework.__main__ import main; main()"
-
-
 def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
-    """Python finds what lies in the working folder first, under `python -m`."""
     (tmp_path / "plugins").mkdir()
     (tmp_path / "plugins" / "__init__.py").write_text("print('imported')\n")
-    line = [sys.executable, "-c", IN_THE_WAY, "plugins"]
-    environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
+    line = [sys.executable, "-m", "framework", "plugins"]
+    environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{CHECKOUT}"}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
     said = f"the package 'plugins' at {tmp_path}/plugins stands in the way of InstanceMap's own at {CHECKOUT}/plugins: "

@@ -25,11 +25,12 @@ from typing import BinaryIO
 
 import numpy as np
 
-from framework.data import Camera, Float64, UInt8, UInt16
+from framework.data import MOST_PIXELS, Camera, Float64, UInt8, UInt16
 from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, FrameError
-from framework.files.image_files import MOST_PIXELS, decode_color
+from framework.files.image_files import decode_color
 from framework.files.matrix_file import PrintedMatrix
+from framework.files.whole_files import check_regular
 
 VERSION = 4
 LONGEST_NAME = 1024  # bytes, of the sensor: "StructureSensor" has 15
@@ -130,6 +131,7 @@ class SensFile:
 
 def open_sens(path: Path) -> SensFile:
     """The header and where the frames are. Raises DataError, naming the byte, when the header cannot be."""
+    check_regular(path)
     try:
         with path.open("rb", buffering=0) as file:
             length = file.seek(0, 2)

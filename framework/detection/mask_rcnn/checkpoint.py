@@ -14,6 +14,7 @@ from framework.detection.mask_rcnn.network import MaskRCNN
 from framework.detection.mask_rcnn.network_file import describe_network, load_network
 from framework.detection.mask_rcnn.torchvision_checkpoint import from_torchvision, is_torchvision
 from framework.errors import DataError
+from framework.files.whole_files import check_regular
 
 
 class CheckpointKind(Enum):
@@ -49,6 +50,7 @@ def domain_of_network(path: Path) -> str:
 
 def _read_torch(path: Path) -> dict[str, Tensor]:
     """The state_dict in a file of torch.save."""
+    check_regular(path)
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged file can raise almost anything

@@ -21,6 +21,7 @@ from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import filled
 from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
 from framework.errors import DataError, in_one_line
+from framework.files.whole_files import check_regular
 from framework.label_spaces import COCO
 
 PIXEL_MEAN = (123.675, 116.28, 103.53)  # RGB
@@ -91,6 +92,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
 
     Raises DataError when it is damaged, or holds more than arrays.
     """
+    check_regular(path)
     try:
         with path.open("rb") as file:
             content = ArraysOnly(file, encoding="latin1").load()

@@ -23,6 +23,7 @@ from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.errors import DataError, in_one_line
+from framework.files.json_file import parse_json
 from framework.files.whole_files import written_whole
 
 Fact = str | int | float | bool | None
@@ -140,9 +141,10 @@ def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescr
     if not metadata or "architecture" not in metadata:
         raise DataError(f"{path} does not say what network it is: its metadata have no architecture")
     try:
-        card = json.loads(metadata.get("card", "{}"))
-        return NetworkDescription(_parsed(Architecture, json.loads(metadata["architecture"]), "architecture"), card)
-    except ValueError as error:  # what json raises is one, too
+        card = parse_json(path, metadata.get("card", "{}"))
+        architecture = parse_json(path, metadata["architecture"])
+        return NetworkDescription(_parsed(Architecture, architecture, "architecture"), card)
+    except ValueError as error:
         raise DataError(f"{path}: {error}") from error
 
 

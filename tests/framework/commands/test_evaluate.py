@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
+from framework import configs
 from framework.commands import evaluate
 from framework.commands.run import run
 from framework.files.directory_lock import locked
@@ -21,7 +22,9 @@ from framework.records import reevaluation, run_record
 from framework.records.provenance import config_hash
 from tests.scenes.corner_room import CornerRoom
 
+pytestmark = pytest.mark.usefixtures("fakes_registered")
 CHECKOUT = Path(__file__).resolve().parents[3]
+FAKES = CHECKOUT / "tests" / "fake_conf"
 CONFIG = {
     "seed": 0,
     "device": "cpu",
@@ -43,6 +46,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(run_record, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
+        patched.setattr(configs, "_added", [FAKES])
         run(OmegaConf.create(CONFIG), directory, {})
     return directory
 
@@ -263,7 +267,7 @@ def test_a_run_without_truth_stays_as_it_is(stored: Path, command) -> None:
 def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
     shutil.copytree(mapped, tmp_path / "run")
     done = subprocess.run(
-        [sys.executable, "-m", "framework", "evaluate", "run", "absent"],
+        [sys.executable, "-m", "framework", "evaluate", "--config-dir", str(FAKES), "run", "absent"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
         capture_output=True,
@@ -285,3 +289,35 @@ def test_a_run_that_is_at_work_in_the_directory_is_left_alone(stored: Path, comm
     assert f"refused: {stored} is in use by process {os.getpid()}" in err
     assert (stored / "metrics.json").read_bytes() == before
     assert command(stored)[0] == 0
+
+
+@pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
+def test_a_record_brings_no_code(started: list[str], stored: Path) -> None:
+    """Somebody sends a folder, and one looks at it in place: modules in it are neither imported nor found."""
+    (stored / "brought.py").write_text("print('runs')\nfrom tests.scenes.corner_room import CornerRoom as Brought\n")
+    for name in ("numpy", "yaml", "matplotlib", "evo"):  # what the command itself imports
+        (stored / f"{name}.py").write_text("print('runs')\n")
+    _with_dataset(stored, _target_="brought.Brought")
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run(
+        [sys.executable, *started, "evaluate", "."],
+        cwd=stored,
+        env=environment | {"PYTHONPATH": str(CHECKOUT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "dataset brought.Brought: no registered option of dataset has this _target_" in done.stderr
+
+
+def test_a_stored_config_asks_for_nothing_of_this_machine(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    _with_dataset(stored, scene="${oc.env:SECRET}")
+    status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert "stored resolved, and this one is not: dataset.scene=${oc.env:SECRET}" in err
+    assert "hunter2" not in err

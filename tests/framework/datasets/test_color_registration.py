@@ -51,7 +51,7 @@ def test_where_no_colour_was_seen_the_nearest_is_repeated() -> None:
     assert (found[:, 24:] == 200).all()
 
 
-@pytest.mark.parametrize("color", [Camera(32, 24, 1e12, 1e12, 16, 12), Camera(40000, 24, 30, 30, 16, 12)])
+@pytest.mark.parametrize("color", [Camera(32, 24, 9e5, 9e5, 16, 12), Camera(40000, 24, 5000, 30, 16, 12)])
 def test_cameras_that_do_not_belong_together_are_refused_before_anything_is_allocated(color: Camera) -> None:
     with pytest.raises(DataError, match="cannot be moved"):
         ColorRegistration(color, DEPTH)

@@ -25,6 +25,7 @@ from framework.records.mesh_file import write_mesh
 from framework.records.provenance import config_hash
 from tests.scenes.boxes_room import furnished, walk
 
+pytestmark = pytest.mark.usefixtures("fakes_registered")
 ROWS = {"part": ["dataset.stop=8"], "whole": []}
 
 

@@ -32,7 +32,7 @@ def saved(tmp_path: Path) -> Path:
 
 def test_header_and_arrays_come_back(saved: Path) -> None:
     header, arrays = read_map(saved, 7, list(ARRAYS))
-    assert header == HEADER
+    assert header.values == HEADER
     with np.load(saved) as file:
         assert file.files == ["header", *ARRAYS]
         for name, array in ARRAYS.items():
@@ -67,5 +67,5 @@ def test_a_changed_byte_is_found(saved: Path) -> None:
 
 
 def test_another_format_is_refused(saved: Path) -> None:
-    with pytest.raises(DataError, match="has map format 7, this version reads 8"):
+    with pytest.raises(DataError, match="it has map format 7, this version reads 8"):
         read_map(saved, 8, list(ARRAYS))

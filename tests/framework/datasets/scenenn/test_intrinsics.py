@@ -12,7 +12,7 @@ ASUS = (544.47329, 544.47329, 320.0, 240.0)
 
 
 def test_what_is_written_is_read_back_exactly(tmp_path):
-    camera = Camera(640, 480, 544.47329, 1 / 3, 319.5, -0.1)
+    camera = Camera(640, 480, 544.47329, 1600 / 3, 319.5, -0.1)
     write_intrinsics(tmp_path / "asus.ini", camera)
     assert read_intrinsics(tmp_path / "asus.ini") == (camera.fx, camera.fy, camera.cx, camera.cy)
     assert (tmp_path / "asus.ini").read_text().splitlines()[:3] == [

@@ -1,0 +1,66 @@
+"""YAML files: checked before they are loaded, for a few lines of aliases can stand for gigabytes."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import yaml
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from framework.errors import DataError, in_one_line
+from framework.files.whole_files import read_text
+
+LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, that of a sweep 20
+DEEPEST = 50  # mappings and lists in each other
+MOST_VALUES = 200_000  # keys and values, those that aliases repeat counted as often as they stand for
+
+_EventLoader = getattr(
+    yaml, "CSafeLoader", yaml.SafeLoader
+)  # the compiled one is ten times as fast, and not everywhere
+
+
+def load_yaml(path: Path) -> Any:
+    """The DictConfig or ListConfig of a YAML file. Raises DataError, naming the file, when it cannot be read."""
+    text = read_text(path, LARGEST_FILE)
+    with yaml_faults(path):
+        check_yaml(path, text)
+        return OmegaConf.create(text)
+
+
+@contextmanager
+def yaml_faults(path: Path) -> Iterator[None]:
+    """Turns what goes wrong while a file is loaded into a DataError that names it."""
+    try:
+        yield
+    except (yaml.YAMLError, OmegaConfBaseException, ValueError, RecursionError, OverflowError) as error:
+        raise DataError(f"{path} cannot be read: {in_one_line(error)}") from error
+
+
+def check_yaml(where: object, text: str) -> None:
+    """Raises DataError for YAML that is too deep or stands for too much, and YAMLError for what is none."""
+    counts = [0]  # of the values in each of the mappings and lists that are open, outermost first
+    open_anchors: list[Hashable] = []
+    anchors: dict[Hashable, int] = {}
+    for event in yaml.parse(text, _EventLoader):
+        if isinstance(event, yaml.AliasEvent):
+            if event.anchor not in anchors:
+                raise DataError(f"{where}: *{event.anchor} stands for nothing, or for what it is in")
+            counts[-1] += anchors[event.anchor]
+        elif isinstance(event, yaml.ScalarEvent):
+            counts[-1] += 1
+            anchors[event.anchor] = 1
+        elif isinstance(event, yaml.CollectionStartEvent):
+            counts.append(1)
+            open_anchors.append(event.anchor)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            count = counts.pop()
+            counts[-1] += count
+            anchors[open_anchors.pop()] = count
+        if len(counts) > DEEPEST:
+            raise DataError(f"{where}: its mappings and lists are more than {DEEPEST} deep")
+        if counts[-1] > MOST_VALUES:
+            raise DataError(f"{where}: it stands for more than {MOST_VALUES} keys and values")

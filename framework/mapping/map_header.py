@@ -1,0 +1,97 @@
+"""The header of a saved map, which anybody may have written: plain values read by name, each within its bounds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from enum import Enum
+from typing import Any, TypeVar
+
+from framework.errors import DataError
+
+MOST_CLASSES = 10_000  # that a map names; LVIS has 1,200
+LONGEST_NAME = 200  # characters of a class
+LARGEST_COUNT = 2**53  # of frames, evictions and the like: every program has these exactly
+
+Option = TypeVar("Option", bound=Enum)
+
+
+@dataclass(frozen=True)
+class MapHeader:
+    """An object of the header. Each method reads one key; it raises DataError unless that holds what it should."""
+
+    values: Mapping[str, Any]
+    name: str = "header"
+
+    @classmethod
+    def of(cls, found: object, name: str = "header") -> MapHeader:
+        """What should be an object."""
+        if not isinstance(found, dict):
+            raise DataError(f"{name} must be an object, found {found!r:.60}")
+        return cls(found, name)
+
+    def part(self, key: str) -> MapHeader:
+        """An object in this one."""
+        return MapHeader.of(self._value(key), f"{self.name}.{key}")
+
+    def parts(self, key: str) -> Iterator[MapHeader]:
+        """The objects of a list."""
+        for k, found in enumerate(self.items(key)):
+            yield MapHeader.of(found, f"{self.name}.{key}[{k}]")
+
+    def items(self, key: str) -> list[Any]:
+        """A list of whatever."""
+        found = self._value(key)
+        if not isinstance(found, list):
+            raise self._fault(key, "a list", found)
+        return found
+
+    def number(self, key: str, bounds: tuple[float, float] = (-math.inf, math.inf)) -> float:
+        """A finite number in [low, high]; a part in a million beyond counts as rounded to float32."""
+        found, (low, high) = self._value(key), bounds
+        is_number = isinstance(found, int | float) and not isinstance(found, bool) and math.isfinite(found)
+        if not is_number or not low - 1e-6 * abs(low) <= found <= high + 1e-6 * abs(high):
+            raise self._fault(key, f"a number in [{low:g}, {high:g}]", found)
+        return float(found)
+
+    def whole(self, key: str, low: int = 0, high: int = LARGEST_COUNT) -> int:
+        """A whole number in [low, high]."""
+        return whole(f"{self.name}.{key}", self._value(key), low, high)
+
+    def flag(self, key: str) -> bool:
+        """True or false."""
+        found = self._value(key)
+        if not isinstance(found, bool):
+            raise self._fault(key, "true or false", found)
+        return found
+
+    def option(self, key: str, options: type[Option]) -> Option:
+        """An option by its name."""
+        found = self._value(key)
+        if not isinstance(found, str) or found not in options.__members__:
+            raise self._fault(key, f"one of {', '.join(options.__members__)}", found)
+        return options[found]
+
+    def classes(self) -> tuple[str, ...]:
+        """The names of the map's classes."""
+        found = self.items("classes")
+        names = [name for name in found if isinstance(name, str) and len(name) <= LONGEST_NAME]
+        if len(names) < len(found) or len(found) > MOST_CLASSES:
+            raise self._fault("classes", f"at most {MOST_CLASSES} names of {LONGEST_NAME} characters", found)
+        return tuple(names)
+
+    def _value(self, key: str) -> Any:
+        if key not in self.values:
+            raise DataError(f"{self.name} has no {key!r}")
+        return self.values[key]
+
+    def _fault(self, key: str, expected: str, found: object) -> DataError:
+        return DataError(f"{self.name}.{key} must be {expected}, found {found!r:.60}")
+
+
+def whole(name: str, found: object, low: int = 0, high: int = LARGEST_COUNT) -> int:
+    """A whole number in [low, high]. Raises DataError, naming it, for anything else."""
+    if isinstance(found, bool) or not isinstance(found, int) or not low <= found <= high:
+        raise DataError(f"{name} must be a whole number in [{low}, {high}], found {found!r:.60}")
+    return found
