@@ -181,8 +181,15 @@ def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) 
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(begun(tmp_path)) == 2, first)
     workers = psutil.Process(first.pid).children(recursive=True)
+    for worker in workers:
+        worker.suspend()  # until others wait for it, however slow the machine is
     first.kill()
-    done = end(begin(tmp_path, *arguments))
+    again = begin(tmp_path, *arguments)
+    logs = (tmp_path / PLACE).glob
+    wait_until(lambda: sum("waiting for" in log.read_text() for log in logs("*/instancemap.log")) == 2, again)
+    for worker in workers:
+        worker.resume()
+    done = end(again)
     for worker in workers:
         worker.kill()  # idle by now, for some minutes
     first.communicate()
