@@ -20,9 +20,12 @@ class Interrupted(KeyboardInterrupt):
     """A signal ended the run. Whatever treats Ctrl-C well treats the others alike."""
 
     def __init__(self, number: int) -> None:
+        super().__init__(number)
         self.number = number
-        super().__init__(
-            "interrupted by Ctrl-C" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
+
+    def __str__(self) -> str:
+        return (
+            "interrupted by Ctrl-C" if self.number == signal.SIGINT else f"ended by {signal.Signals(self.number).name}"
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import signal
 import threading
 from collections.abc import Iterator
@@ -73,6 +74,11 @@ def test_every_signal_raises_in_a_process_that_asks_for_it() -> None:
             signal.raise_signal(number)
         assert isinstance(ended.value, Interrupted)
         assert ended.value.number == number
+
+
+def test_it_reaches_the_process_that_began_a_sweep() -> None:
+    copy = pickle.loads(pickle.dumps(Interrupted(signal.SIGTERM)))
+    assert (copy.number, str(copy)) == (signal.SIGTERM, "ended by SIGTERM")
 
 
 def test_other_threads_are_left_alone() -> None:

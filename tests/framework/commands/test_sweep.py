@@ -26,8 +26,9 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 FAILED = "error: a run failed: dataset tests.scenes.corner_room.CornerRoom: frames"
 PLACE = Path("outputs") / "fake_ablation"
 BY_JOBLIB = ("launcher=joblib", "hydra.launcher.n_jobs=2")
-SIX = ("row=half,broken", "seed=1,2,3")  # the broken ones fail
-RUNS = {f"row=half,seed={seed}" for seed in (1, 2, 3)}
+SLOW = "dataset.slow_s=0.1"  # so that a worker that is killed is in the middle of a run, not of handing in its result
+SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # the broken ones fail
+RUNS = {f"{SLOW},row=half,seed={seed}" for seed in (1, 2, 3)}
 PATIENCE_S = 180
 
 
@@ -97,7 +98,7 @@ def test_joblib_runs_all_and_the_failed_do_not_stop_the_others(
     assert set(recorded(directory)) == RUNS
     text = (directory / PLACE / "table.md").read_text()
     assert text in done.stdout
-    assert "Not complete: row=broken,seed=1: failed: dataset" in text
+    assert f"Not complete: {SLOW},row=broken,seed=1: failed: dataset" in text
     assert "threads=1" in text, "how fast the runs were depends on it"
 
 
@@ -106,7 +107,7 @@ def test_another_launcher_goes_on_where_the_first_ended(
 ) -> None:
     directory, _ = whole
     before = recorded(directory)
-    again = end(begin(directory, "row=half", "seed=1,2,3", "threads=2"))
+    again = end(begin(directory, "row=half", "seed=1,2,3", SLOW, "threads=2"))
     assert again.returncode == 0, again.stderr
     assert again.stderr.count("kept: the complete record in") == 3
     assert recorded(directory) == before
@@ -181,8 +182,15 @@ def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) 
     first = begin(tmp_path, *arguments)
     wait_until(lambda: len(begun(tmp_path)) == 2, first)
     workers = psutil.Process(first.pid).children(recursive=True)
+    for worker in workers:
+        worker.suspend()  # until others wait for it, however slow the machine is
     first.kill()
-    done = end(begin(tmp_path, *arguments))
+    again = begin(tmp_path, *arguments)
+    logs = (tmp_path / PLACE).glob
+    wait_until(lambda: sum("waiting for" in log.read_text() for log in logs("*/instancemap.log")) == 2, again)
+    for worker in workers:
+        worker.resume()
+    done = end(again)
     for worker in workers:
         worker.kill()  # idle by now, for some minutes
     first.communicate()
