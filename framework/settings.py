@@ -16,6 +16,7 @@ from omegaconf import DictConfig
 
 from framework.errors import ConfigError
 
+MOST = {"seed": 2**63 - 1, "threads": 4096, "ahead": 1000}  # torch takes no larger seed; no machine has more cores
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -31,18 +32,20 @@ class Settings:
     seed: int  # 0 or more
     device: str  # one of DEVICES; the stages that run networks read it
     threads: int  # 0 = all cores
+    ahead: int = 0  # frames that wait to be mapped; each with its masks takes some 10 MB
 
     def __post_init__(self) -> None:
-        for name in ("seed", "threads"):
+        for name, most in MOST.items():
             value: object = getattr(self, name)
-            if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-                raise ConfigError(f"{name} must be a whole number, 0 or more, found {value!r}")
+            if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= most:
+                raise ConfigError(f"{name} must be a whole number, 0 or more and at most {most}, found {value!r}")
         if self.device not in DEVICES:
             raise ConfigError(f"device must be one of {', '.join(DEVICES)}, found {self.device!r}")
 
     @classmethod
     def of(cls, config: DictConfig) -> Settings:
-        return cls(seed=config.seed, device=config.device, threads=config.threads)
+        ahead = config.get("ahead", 0)  # a training has none
+        return cls(seed=config.seed, device=config.device, threads=config.threads, ahead=ahead)
 
     def apply(self) -> None:
         """Limits the threads of the libraries, and seeds the random states that they keep for themselves.

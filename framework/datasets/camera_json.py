@@ -61,9 +61,6 @@ def _number(path: Path, content: Mapping[str, Any], key: str) -> float:
     if key not in content:
         raise DataError(f"{path}: the key {key!r} is missing")
     value = content[key]
-    try:
-        if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
-            return float(value)
-    except OverflowError:  # a whole number beyond the range of float
-        pass
+    if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
+        return float(value)
     raise DataError(f"{path}: {key} must be a number, found {str(value)[:40]!r}")

@@ -10,13 +10,27 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, Frame, Int32
+from framework.errors import FrameError, MapFullError
 from framework.geometry import inverse
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.sensor import Sensor, pinhole, ray_direction
-from framework.mapping.voxel_grid import BLOCK_SIDE, NO_KEY, VoxelGrid, device, find_block, grown, pack_key, unpack_key
+from framework.mapping.voxel_grid import (
+    BLOCK_SIDE,
+    FARTHEST_BLOCK,
+    NO_KEY,
+    VoxelGrid,
+    device,
+    find_block,
+    grown,
+    pack_key,
+    unpack_key,
+)
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
+MOST_SAMPLES = 4096  # along the band of a reading, half a block apart; the defaults have 6
+REPEATS = 8  # times that a chunk may pass on a block, in the mean: it remembers the latest ones
+FEWEST_KEYS = 2**20  # that a frame may always ask for, 8 MB, so that a map's own limit tells of small ones
 PROBES = 4  # pixels along each side of a block in the image, to tell whether the frame sees through it
 
 
@@ -170,7 +184,8 @@ class Allocator:
     def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
         """(N, 3) coordinates of the blocks along the truncation band of the readings `depth` (H, W) m, allocated here.
 
-        Raises MapFullError when the block budget is reached.
+        Raises MapFullError when the block budget is reached, and before memory is asked for where a single frame asks
+        for more than it; FrameError for a pose beyond where blocks can be.
         """
         coords = self._surface_coords(camera, depth, T_world_camera)
         self.voxels.allocate(coords)
@@ -184,8 +199,20 @@ class Allocator:
         # samples at most half a block apart along the ray of a corner, at the frame's greatest depth
         farthest = min(float(depth.max()), float(self.sensor.max_depth))
         band = float(self.sensor.truncation) + float(self.sensor.truncation_slope) * farthest
-        samples = 1 + int(np.ceil(4 * band * _longest_ray(camera) / block_size))
-        counts = np.zeros(CHUNKS, np.int32)
+        longest = _longest_ray(camera)
+        samples = 1 + int(np.ceil(4 * band * longest / block_size))
+        if samples > MOST_SAMPLES:
+            raise MapFullError(
+                f"the truncation band of a reading is {samples // 2} blocks deep, more than {MOST_SAMPLES // 2}: raise "
+                "fuser.voxel_size, or lower fuser.truncation_slope"
+            )
+        reach = float(np.abs(T_world_camera[:3, 3]).max()) + (farthest + band) * longest
+        if reach >= FARTHEST_BLOCK * block_size:
+            raise FrameError(
+                f"the camera sees {reach:.6g} m from the origin, and a map of {self.voxels.grid.voxel_size:g} m voxels "
+                f"ends at {FARTHEST_BLOCK * block_size:.6g} m"
+            )
+        counts = np.zeros(CHUNKS, np.int64)
         while True:
             _surface_blocks(
                 depth,
@@ -199,6 +226,12 @@ class Allocator:
             )
             if counts.max() <= self._found.shape[1]:
                 break
+            if counts.sum() > max(REPEATS * self.voxels.max_blocks, FEWEST_KEYS):
+                raise MapFullError(
+                    f"the map is full: one frame asks for {counts.sum() // REPEATS} blocks or more, and the map has at "
+                    f"most {self.voxels.max_blocks}; raise fuser.voxel_size or fuser.max_blocks, or lower "
+                    "fuser.max_depth"
+                )
             self._found = np.empty((CHUNKS, 2 * int(counts.max())), np.int64)
         keys = np.concatenate([self._found[chunk, :n] for chunk, n in enumerate(counts)])
         coords = np.empty((len(keys), 3), np.int32)

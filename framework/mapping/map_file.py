@@ -21,6 +21,7 @@ from framework.files.whole_files import check_regular, written_whole
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.map_header import LARGEST_COUNT, MapHeader, whole
+from framework.mapping.voxel_grid import FARTHEST_BLOCK
 
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
 
@@ -139,9 +140,9 @@ def check_rows(label_row: Array, rows: int) -> None:
 
 
 def check_blocks(coords: Any) -> None:
-    """Raises DataError unless blocks (B, 3) lie within 2^20 blocks of the origin, and each is named once."""
-    if len(coords) and np.abs(coords, dtype=np.int64).max() >= 1 << 20:
-        raise DataError(f"block_coords must be within 2^20 of 0, found {coords.min()} to {coords.max()}")
+    """Raises DataError unless blocks (B, 3) lie where the map has any, and each is named once."""
+    if len(coords) and np.abs(coords, dtype=np.int64).max() >= FARTHEST_BLOCK:
+        raise DataError(f"block_coords must be within {FARTHEST_BLOCK} of 0, found {coords.min()} to {coords.max()}")
     if len(np.unique(coords, axis=0)) < len(coords):
         raise DataError("block_coords has a block twice")
 

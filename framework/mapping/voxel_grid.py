@@ -49,7 +49,8 @@ def one_more(count, condition):
 
 
 _KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
-_KEY_OFFSET = 1 << (_KEY_BITS - 1)
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin, along any axis, where the map ends
+_KEY_OFFSET = FARTHEST_BLOCK
 _KEY_MASK = (1 << _KEY_BITS) - 1
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
@@ -13,6 +14,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.parameters import checked_rows
+
+_OF_ITSELF = re.compile(r"\$\{[\w.]+\}|\$\{all_of:\$\{[\w.]+\}\}")  # what our experiments write
 
 SWEEP = "multirun.yaml"  # Hydra's sweeper leaves the experiment's config under this name
 MOST_VALUES = 1000  # of a key; a range may claim any number
@@ -62,7 +65,7 @@ def _overrides(sweep: Mapping[str, Any]) -> list[Override]:
 def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
     """What the experiment's config itself asks for, as overrides: ${sequences.all} is what stands there."""
     params = _below(sweep, "sweeper", "params", dict)
-    node = OmegaConf.merge(_without_hydra(sweep), {"params": params}).params
+    node = OmegaConf.merge(_without_hydra(sweep), {"params": _of_itself(params)}).params
     for key in params:
         try:
             yield f"{key}={node[key]}"
@@ -71,7 +74,17 @@ def _params(sweep: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _without_hydra(sweep: Mapping[str, Any]) -> DictConfig:
-    return OmegaConf.create({key: value for key, value in sweep.items() if key != "hydra"})
+    """The sweep's own config, in which ${...} may stand for its other keys and for nothing else."""
+    return OmegaConf.create({key: _of_itself(value) for key, value in sweep.items() if key != "hydra"})
+
+
+def _of_itself(node: Any) -> Any:
+    """With "???", which cannot be resolved, for what asks for more: ${oc.env:...} would tell of this machine."""
+    if isinstance(node, Mapping):
+        return {key: _of_itself(value) for key, value in node.items()}
+    if isinstance(node, list):
+        return [_of_itself(value) for value in node]
+    return "???" if isinstance(node, str) and "${" in _OF_ITSELF.sub("", node) else node
 
 
 def _below(sweep: Mapping[str, Any], part: str, name: str, kind: type) -> Any:

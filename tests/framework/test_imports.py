@@ -13,10 +13,10 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = [
     ["errors"],
     ["data", "parameters", "settings"],
-    ["geometry", "label_spaces", "sensor_noise"],
+    ["geometry", "sensor_noise"],
     ["interfaces"],
     ["files"],
-    ["configs"],
+    ["configs", "label_spaces"],
     ["registry"],
     ["rendering"],
     ["detection", "mapping", "refinement", "tracking"],

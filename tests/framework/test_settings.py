@@ -86,5 +86,5 @@ def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.
 
 @pytest.mark.parametrize("threads", [-1, 1.0, True])
 def test_threads_are_a_number_of_threads(threads: object) -> None:
-    with pytest.raises(ConfigError, match="threads must be a whole number, 0 or more, found"):
+    with pytest.raises(ConfigError, match="threads must be a whole number, 0 or more and at most 4096, found"):
         Settings(seed=0, device="cpu", threads=threads)  # type: ignore[arg-type]

@@ -165,8 +165,8 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
     """The camera of exported colour, which the SensReader may have made smaller without touching the intrinsics."""
-    camera = read_matrix(path).camera(*COLOR_SIZE)
-    if _fits(read_matrix(path).camera(width, height)) or not _fits(camera):
+    matrix = read_matrix(path)
+    if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
     u, v = width / camera.width, height / camera.height
     # pixel centres are at integers

@@ -202,7 +202,4 @@ def _whole_numbers(where: str, values: Sequence[Any]) -> Int64:
     wrong = [value for value in values if type(value) is not int]
     if wrong:
         raise DataError(f"{where}: expected whole numbers, found {type(wrong[0]).__name__}")
-    try:
-        return np.array(values, np.int64)
-    except OverflowError as error:
-        raise DataError(f"{where}: expected whole numbers of 64 bits: {error}") from error
+    return np.array(values, np.int64)

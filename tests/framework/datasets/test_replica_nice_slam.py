@@ -135,7 +135,7 @@ def test_a_bad_line_of_poses_is_named(root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"w": "wide"}, {"h": 16.5}, {"fx": -1.0}, {"cy": float("nan")}, {"scale": 0}, {"fy": 10**400}]
+    "changes", [{"w": "wide"}, {"h": 16.5}, {"fx": -1.0}, {"cy": float("nan")}, {"scale": 0}, {"fy": 10**18}]
 )
 def test_a_bad_camera_value_is_named(root: Path, changes: dict[str, Any]) -> None:
     write_camera(root, **changes)
@@ -153,6 +153,6 @@ def test_a_file_without_a_camera(root: Path, text: str) -> None:
 def test_images_of_another_size(root: Path) -> None:
     write_depth(root / "room0/results/depth000002.png", 1, (8, 12))
     assert "is 12x8, but" in fault_of(ReplicaNiceSlam(root, scene="room0"), 2)
-    write_camera(root, w=1200, h=680)
-    with pytest.raises(DataError, match=r"frame000000\.jpg is 24x16, but .*cam_params\.json says 1200x680"):
+    write_camera(root, w=120, h=68)
+    with pytest.raises(DataError, match=r"frame000000\.jpg is 24x16, but .*cam_params\.json says 120x68"):
         ReplicaNiceSlam(root, scene="room0")

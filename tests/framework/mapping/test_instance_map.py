@@ -144,7 +144,7 @@ def test_a_file_of_another_format_is_refused(other: int, tmp_path: Path) -> None
     """Before anything else is expected of it: other versions have other arrays."""
     path = tmp_path / "map.npz"
     np.savez(path, header=np.frombuffer(json.dumps({"format": other}).encode(), np.uint8))
-    told = re.escape(f"{path} has map format {other}, this version reads {FORMAT}; map again")
+    told = re.escape(f"{path}: it has map format {other}, this version reads {FORMAT}; map again")
     with pytest.raises(DataError, match=f"^{told}$"):
         InstanceMap.load(path)
 

@@ -58,5 +58,5 @@ def test_a_fault_is_one_line_that_names_the_place(tmp_path: Path, content: str, 
 def test_a_file_that_is_not_there_or_not_text_is_told(tmp_path: Path) -> None:
     (tmp_path / "timings.csv").write_bytes(b"\xff\xfe")
     for name in ("timings.csv", "none.csv"):
-        with pytest.raises(DataError, match=f"{name} cannot be read"):
+        with pytest.raises(DataError, match=f"{name} could not be read"):
             read_timings(tmp_path / name)

@@ -266,7 +266,12 @@ def test_an_entry_that_is_wrong_is_told_in_one_line(tmp_path: Path, changes: dic
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [("[{]", "is not JSON"), ('{"annotations": []}', "must hold a list"), ("[]", "no detection"), ("[3]", "entry 0")],
+    [
+        ("[{]", "is not valid JSON"),
+        ('{"annotations": []}', "must hold a list"),
+        ("[]", "no detection"),
+        ("[3]", "entry 0"),
+    ],
 )
 def test_a_file_that_is_none_is_told(tmp_path: Path, content: str, said: str) -> None:
     (tmp_path / "results.json").write_text(content)

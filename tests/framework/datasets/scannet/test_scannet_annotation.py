@@ -150,7 +150,6 @@ def test_an_object_that_is_there_twice_is_one(tmp_path: Path) -> None:
         ([group(0, "bed", 3) | {"label": None}], "expected a label and a list of segments"),
         ([group(0, "bed", 3) | {"segments": "3"}], "expected a label and a list of segments"),
         ([group(0, "bed", 3) | {"segments": [3, 3.5]}], "segments: expected whole numbers, found float"),
-        ([group(0, "bed", 3) | {"segments": [10**30]}], "segments: expected whole numbers of 64 bits"),
         ({}, "expected a list 'segGroups', found dict"),
     ],
 )
