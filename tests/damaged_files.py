@@ -7,6 +7,7 @@ import re
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from hypothesis import strategies as st
 
@@ -17,6 +18,26 @@ SLOWEST = 2.0  # s, for files of at most some 100 KB on a busy machine
 NUMBER = re.compile(rb"-?\d+(?:\.\d+)?")
 ODD_NUMBERS = (b"0", b"-1", b"3", b"65536", b"2147483648", b"4294967295", b"1" * 20, b"1" * 5000, b"1e400", b"-0.5")
 NO_NUMBERS = (b"nan", b"-inf", b"1_0", b"0x1p3", b"x", b"", b"\xff", b"\x00", b"1 1", b"\n")
+
+
+LARGE = (0, 1, -1, 2, 255, 256, -2, 32767, 2**20, 10**8, 2**31 - 1, -(2**31), 2**31, 2**63 - 1, 10**30, 10**400)
+ODD = (*LARGE, 0.5, 1e-300, 1e300, -1e-9, float("nan"), float("inf"), None, True, "", "x", "\n" * 300, [], {}, [[]])
+
+
+@st.composite
+def changed_json(draw: st.DrawFn, node: Any) -> Any:
+    """JSON with one of its values, somewhere, replaced, taken away or doubled."""
+    if isinstance(node, dict) and node and draw(st.integers(0, 9)):
+        key = draw(st.sampled_from(sorted(node)))
+        if draw(st.integers(0, 9)) == 0:
+            return {name: value for name, value in node.items() if name != key}
+        return node | {key: draw(changed_json(node[key]))}
+    if isinstance(node, list) and node and draw(st.integers(0, 4)):
+        k = draw(st.integers(0, len(node) - 1))
+        if draw(st.integers(0, 4)) == 0:
+            return node[:k] + node[k : k + 1] * draw(st.sampled_from((0, 2))) + node[k + 1 :]
+        return [*node[:k], draw(changed_json(node[k])), *node[k + 1 :]]
+    return draw(st.sampled_from(ODD))
 
 
 @st.composite
