@@ -28,6 +28,7 @@ DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.save
 HEADER = "header"
 LARGEST_HEADER = 2**28  # bytes, of an hour with thousands of instances some 10 MB
 LARGEST_ID = 2**24  # of an instance
+MOST_EVIDENCE = 1e12  # for a class
 SHARE_OF_MEMORY = 0.5  # of the machine, that a map may take when it is loaded
 
 
@@ -188,10 +189,11 @@ def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
         last_frame=entry.whole("last_frame", -LARGEST_COUNT),
         observed_in={whole(f"{entry.name}.observed_in", k, -LARGEST_COUNT) for k in entry.items("observed_in")},
         in_view=FrameSet(_span(f"{entry.name}.in_view", found) for found in entry.items("in_view")),
-        score_sum=entry.number("score_sum", (0.0, float(LARGEST_COUNT))),
+        score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
         detections=entry.whole("detections"),
     )
-    check_array(f"{entry.name}.class_evidence", record.class_evidence, (classes,), np.float64)
+    if not np.abs(record.class_evidence).max() <= MOST_EVIDENCE:
+        raise DataError(f"{entry.name}.class_evidence must be within {MOST_EVIDENCE:g} of 0, found {evidence!r:.60}")
     return record
 
 

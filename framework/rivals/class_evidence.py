@@ -30,6 +30,7 @@ from framework.mapping.map_file import check_known, check_like
 from framework.mapping.pixel_lists import PixelLists
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
+MOST_EXPONENT = 700.0  # of a ratio that float64 can hold
 MOST_FRAMES = np.uint16(65535)  # that a voxel counts
 
 
@@ -223,6 +224,7 @@ class ClassRows:
         check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
         if len(arrays["rest"]) and not classes:
             raise DataError("rest has rows, and the map no class")
+        _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
         self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
         self.row_count = len(self.evidence.rest)
 
@@ -242,6 +244,17 @@ class ClassRows:
         self.evidence.last_frame[new] = -1
         self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
         self.row_count = needed
+
+
+def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
+    """Raises DataError unless the best class is in slot 0, and `rest` far from above all where it stands for none."""
+    named = class_ids != NO_CLASS
+    ratios = np.where(named, log_ratio, np.float32(-np.inf))
+    best = ratios.max(axis=-1, initial=-np.inf)
+    if (ratios[..., :1] < best[..., None]).any():
+        raise DataError("log_ratio must have the best class of each voxel in slot 0")
+    if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MOST_EXPONENT)).any():
+        raise DataError("rest is too large in a voxel that names all classes")
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:

@@ -40,6 +40,7 @@ NEAR = 0.05  # m, where rays start
 RANGE_TILE = 8  # px of the image for one of the map of ranges that rays search, Open3D's default
 FRAGMENTS = 2**18  # pieces of blocks in view that the map of ranges has room for; a view of 10,000 blocks takes 20,000
 FRAGMENT = 16 * 16  # pixels of the map of ranges in a piece
+MOST_RANGE_PIXELS = 2**24  # of that first image: coarse voxels need fewer fragments
 CPU = o3d.core.Device("CPU:0")
 
 
@@ -94,7 +95,7 @@ class BlockGrid:
 
         Open3D sizes that buffer by the first image. Where it is too small, a view has holes, and stdout a warning.
         """
-        side = int(np.ceil(np.sqrt(FRAGMENTS * FRAGMENT * self.settings.voxel_size)))
+        side = int(np.ceil(np.sqrt(min(FRAGMENTS * FRAGMENT * self.settings.voxel_size, MOST_RANGE_PIXELS))))
         nowhere = Tensor(np.zeros((1, 3), np.int32))
         self.blocks.ray_cast(
             nowhere, Tensor(np.eye(3)), Tensor(np.eye(4)), side, side, ["depth"], METRES, range_map_down_factor=1

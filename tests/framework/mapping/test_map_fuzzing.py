@@ -64,7 +64,9 @@ def use(scene: SceneMap) -> None:
     assert scene.byte_count >= 0
     assert scene.instance_count >= 0
     for instance in instances.values():
-        assert 0 <= instance.class_probabilities.argmax() < len(scene.classes)
+        assert instance.class_probabilities.shape == (len(scene.classes),)
+        assert instance.class_probabilities.sum() == pytest.approx(1, abs=1e-3)
+        assert 0 <= instance.confidence < 1.001
 
 
 def load_and_use(path: Path, content: bytes) -> str:
@@ -94,6 +96,7 @@ def archive(arrays: dict[str, np.ndarray]) -> bytes:
 
 def changed_array(draw: st.DrawFn, array: np.ndarray) -> np.ndarray:
     """The array with other numbers, another length, shape or type."""
+    array = np.atleast_1d(array)
     match draw(st.sampled_from(("number", "number", "number", "all", "cut", "repeat", "type", "shape", "roll"))):
         case "number" if array.size:
             array = array.copy()
