@@ -10,6 +10,10 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import ConfigError
 
+MOST_DETECTIONS = 1000  # of an image, each with a mask of its size; COCO's evaluation takes 100
+MOST_PROPOSALS = 100_000  # that a network looks at
+LONGEST_SIDE = 2**13  # px, of the image that a network takes
+
 
 def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
     """Raises ConfigError unless each named parameter lies in its closed interval (low, high). NaN never does."""
@@ -22,6 +26,11 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
     """Raises ConfigError unless the condition holds, in one line like "detector.nms must be in (0, 1], found 2"."""
     if not holds:
         raise ConfigError(f"{name} must be {allowed}, found {value}")
+
+
+def check_count(name: str, value: int, most: int) -> None:
+    """Raises ConfigError unless a number of things is from 1 to `most`, which memory has room for."""
+    require(1 <= value <= most, name, value, f"at least 1 and at most {most}")
 
 
 def checked_rows(node: Any) -> dict[str, list[str]]:

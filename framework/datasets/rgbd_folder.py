@@ -26,8 +26,8 @@ import numpy as np
 from framework.data import FrameTruth, Int32, SceneTruth
 from framework.datasets.camera_json import camera_of, distortion_of, read_json_object
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
-from framework.datasets.scene_truth import LabeledDepth, fuse_scene_truth
-from framework.errors import ConfigError, DataError, FrameError
+from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
+from framework.errors import DataError, FrameError
 from framework.files.image_files import read_uint16
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import TumLine, read_tum_lines
@@ -47,8 +47,7 @@ class RgbdFolder(Recording):
     truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
 
     def __post_init__(self) -> None:
-        if not self.truth_voxel > 0:
-            raise ConfigError(f"dataset.truth_voxel must be positive metres, found {self.truth_voxel}")
+        check_truth_voxel(self.truth_voxel)
         super().__post_init__()
 
     def open(self) -> Contents:

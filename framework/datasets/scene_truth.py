@@ -10,10 +10,11 @@ import numpy as np
 from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32, Int64, SceneTruth
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 
 KEY_BITS = 21  # of a voxel coordinate in a packed key: 2^20 voxels of 2 cm to each side are 20 km
 KEY_OFFSET = 1 << (KEY_BITS - 1)
+SMALLEST_VOXEL, LARGEST_VOXEL = 1e-3, 1.0  # m
 INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half are taken
 
 
@@ -25,6 +26,14 @@ class LabeledDepth:
     instance_ids: Int32  # (H, W), 0 = no instance
     camera: Camera
     T_world_camera: Float64  # (4, 4)
+
+
+def check_truth_voxel(size: float) -> None:
+    """Raises ConfigError for a spacing of true points that no recording has."""
+    if not SMALLEST_VOXEL <= size <= LARGEST_VOXEL:  # NaN is neither
+        raise ConfigError(
+            f"dataset.truth_voxel must be positive metres, in [{SMALLEST_VOXEL:g}, {LARGEST_VOXEL:g}], found {size}"
+        )
 
 
 def fuse_scene_truth(

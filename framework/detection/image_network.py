@@ -11,7 +11,7 @@ from framework.detection.letterbox import Letterbox, Placement, network_input
 from framework.detection.litert_network import LitertNetwork
 from framework.detection.network_outputs import Outputs
 from framework.detection.onnx_network import OnnxNetwork
-from framework.parameters import require
+from framework.parameters import LONGEST_SIDE, require
 
 
 class ImageNetwork:
@@ -35,7 +35,8 @@ class ImageNetwork:
         white: float,
     ) -> None:
         require(len(sha256) in (0, 64), "detector.sha256", sha256, "64 hexadecimal digits, or empty")
-        require(input_size >= 0, "detector.input_size", input_size, "0 (the network's own) or positive px")
+        allowed = f"0 (the network's own) or positive px, at most {LONGEST_SIDE}"
+        require(0 <= input_size <= LONGEST_SIDE, "detector.input_size", input_size, allowed)
         require(0 <= padding <= 255, "detector.padding", padding, "in [0, 255]")
         require(bool(np.isfinite([black, white]).all()) and black != white, "detector.white", white, f"not {black}")
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")

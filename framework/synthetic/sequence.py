@@ -10,7 +10,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
-from framework.datasets.scene_truth import LabeledDepth, fuse_scene_truth
+from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError
 from framework.interfaces import RGBDSequence
@@ -19,6 +19,8 @@ from framework.synthetic.renderer import Renderer, ids_met
 from framework.synthetic.room import RoomKind, furnish
 from framework.synthetic.walk import FRAME_RATE, plan_path
 
+MOST_FRAMES = 10**6  # nine hours
+MOST_SIDE = 5792  # px; its square is MOST_PIXELS
 FOCAL_LENGTH = 525.0 / 640  # image widths: a Kinect's colour camera
 TRUTH_VIEWS = 60  # frames whose exact depth makes up the true surface; neighbours show nearly the same
 
@@ -47,17 +49,19 @@ class Synthetic(RGBDSequence):
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.share)
-        for name, value, lowest in (("frames", self.frames, 1), ("width", self.width, 16), ("height", self.height, 16)):
-            if value < lowest:
-                raise ConfigError(f"dataset.{name} must be at least {lowest}, found {value}")
+        bounds = {"frames": (1, MOST_FRAMES), "width": (16, MOST_SIDE), "height": (16, MOST_SIDE)}
+        for name, (lowest, most) in bounds.items():
+            if not lowest <= getattr(self, name) <= most:
+                raise ConfigError(
+                    f"dataset.{name} must be at least {lowest} and at most {most}, found {getattr(self, name)}"
+                )
         if self.seed < 0:
             raise ConfigError(f"seed must be 0 or positive, found {self.seed}")
         if not (math.isfinite(self.noise) and self.noise >= 0):
             raise ConfigError(f"dataset.noise must be 0 (exact) or positive, found {self.noise}")
         if not self.max_depth > 0:
             raise ConfigError(f"dataset.max_depth must be positive metres, found {self.max_depth}")
-        if not self.truth_voxel > 0:
-            raise ConfigError(f"dataset.truth_voxel must be positive metres, found {self.truth_voxel}")
+        check_truth_voxel(self.truth_voxel)
         self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.share, self.seed)
         self.name = self.scene
         focal = FOCAL_LENGTH * self.width

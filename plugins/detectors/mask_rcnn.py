@@ -20,7 +20,7 @@ from framework.detection.mask_rcnn.published_weights import find_network
 from framework.detection.masks import paste_masks, without_duplicates
 from framework.errors import DataError
 from framework.interfaces import Detector
-from framework.parameters import require
+from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 
 
 @dataclass
@@ -58,11 +58,13 @@ class MaskRCNNDetector(Detector):
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        for name in ("proposals_before_nms", "proposals", "max_detections"):
-            require(getattr(self, name) >= 1, f"detector.{name}", getattr(self, name), "at least 1")
+        most = {"proposals_before_nms": MOST_PROPOSALS, "proposals": MOST_PROPOSALS, "max_detections": MOST_DETECTIONS}
+        for name, limit in most.items():
+            check_count(f"detector.{name}", getattr(self, name), limit)
         for name in ("short_side", "long_side"):
             side = getattr(self, name)
-            require(side == 0 or side >= 32, f"detector.{name}", side, "at least 32 px, or 0")
+            allowed = f"at least 32 px, or 0, and at most {LONGEST_SIDE}"
+            require(side == 0 or 32 <= side <= LONGEST_SIDE, f"detector.{name}", side, allowed)
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         self._device = torch_device(self.device)
         try:

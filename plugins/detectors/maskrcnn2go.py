@@ -27,7 +27,7 @@ from framework.files.search_paths import candidates
 from framework.files.whole_files import read_bytes
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
-from framework.parameters import require
+from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 
 LARGEST_FILE = 2**26  # bytes; the published ones have 3 MB
 SHA256 = {
@@ -72,11 +72,14 @@ class MaskRCNN2Go(Detector):
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        require(self.proposals >= 1, "detector.proposals", self.proposals, "at least 1")
-        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        check_count("detector.proposals", self.proposals, MOST_PROPOSALS)
+        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(self.short_side >= 32, "detector.short_side", self.short_side, "at least 32 px")
         require(
-            self.long_side >= self.short_side, "detector.long_side", self.long_side, f"at least {self.short_side} px"
+            self.short_side <= self.long_side <= LONGEST_SIDE,
+            "detector.long_side",
+            self.long_side,
+            f"at least {self.short_side} px and at most {LONGEST_SIDE}",
         )
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         self._device = torch_device(self.device)

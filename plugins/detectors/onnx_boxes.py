@@ -14,7 +14,7 @@ from framework.detection.letterbox import Placement
 from framework.detection.masks import without_duplicates
 from framework.interfaces import Detector
 from framework.label_spaces import read_labels, to_coco
-from framework.parameters import require
+from framework.parameters import MOST_DETECTIONS, check_count, require
 
 log = logging.getLogger(__name__)
 
@@ -55,7 +55,7 @@ class OnnxBoxes(Detector):
         require(0 < self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in (0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(0 <= self.significance <= 1, "detector.significance", self.significance, "in [0, 1]")
         require(0 < self.max_slant < 90, "detector.max_slant", self.max_slant, "in (0, 90) degrees")
         require(0 <= self.min_readings <= 1, "detector.min_readings", self.min_readings, "in [0, 1]")

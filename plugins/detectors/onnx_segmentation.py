@@ -15,7 +15,7 @@ from framework.detection.prototype_masks import masks_from_prototypes
 from framework.detection.segmentation_output import BoxKind, recognise
 from framework.interfaces import Detector
 from framework.label_spaces import read_labels, to_coco
-from framework.parameters import require
+from framework.parameters import MOST_DETECTIONS, check_count, require
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +63,7 @@ class OnnxSegmentation(Detector):
         require(0 < self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in (0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         self._labels = read_labels(self.labels)
         self._meaning = to_coco(self._labels)

@@ -16,7 +16,7 @@ from framework.detection.masks import paste_masks, tight_boxes
 from framework.detection.truth import TrueInstances, true_instances
 from framework.interfaces import Detector
 from framework.label_spaces import COCO
-from framework.parameters import require
+from framework.parameters import MOST_DETECTIONS, require
 
 # fmt: off
 LOOKALIKES = (
@@ -128,9 +128,12 @@ class SimulatedDetector(Detector):
         for name in ("confusion", "score_threshold"):
             value = getattr(self, name)
             require(0 <= value < 1, f"detector.{name}", value, "in [0, 1)")
-        require(bool(np.isfinite(self.bleed)), "detector.bleed", self.bleed, "a number of px")
+        require(self.false_positives <= MOST_DETECTIONS, "detector.false_positives", self.false_positives,
+                f"at most {MOST_DETECTIONS}")  # fmt: skip
+        require(abs(self.bleed) <= 1000, "detector.bleed", self.bleed, "a number of px, at most 1000")
         require(2 <= self.boundary_scale < np.inf, "detector.boundary_scale", self.boundary_scale, "at least 2 px")
-        require(self.mask_grid == 0 or self.mask_grid >= 4, "detector.mask_grid", self.mask_grid, "0 or at least 4")
+        grid = self.mask_grid
+        require(grid == 0 or 4 <= grid <= 4096, "detector.mask_grid", grid, "0 or at least 4 and at most 4096")
         require(0 < self.score_scale <= 1, "detector.score_scale", self.score_scale, "in (0, 1]")
         concentration = self.confusion_concentration
         require(0 < concentration < np.inf, "detector.confusion_concentration", concentration, "positive")

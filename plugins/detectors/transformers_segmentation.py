@@ -22,7 +22,7 @@ from framework.errors import ConfigError, DataError, in_one_line
 from framework.files.json_file import read_json
 from framework.interfaces import Detector
 from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
-from framework.parameters import require
+from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, check_count, require
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what the files leave out by default
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers, as the files have them
@@ -96,7 +96,7 @@ class TransformersSegmentation(Detector):
     def __post_init__(self) -> None:
         require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
-        require(self.max_detections >= 1, "detector.max_detections", self.max_detections, "at least 1")
+        check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         require(
             self.short_side == 0 or self.short_side >= 32,
@@ -105,10 +105,12 @@ class TransformersSegmentation(Detector):
             "0 (as published) or at least 32 px",
         )
         require(
-            self.long_side >= self.short_side if self.short_side else self.long_side == 0,
+            self.short_side <= self.long_side <= LONGEST_SIDE if self.short_side else self.long_side == 0,
             "detector.long_side",
             self.long_side,
-            f"at least {self.short_side} px" if self.short_side else "0 where short_side is 0",
+            f"at least {self.short_side} px and at most {LONGEST_SIDE}"
+            if self.short_side
+            else "0 where short_side is 0",
         )
         self._device = torch_device(self.device)
         checkpoint = Checkpoint(self.model, self.revision)

@@ -168,6 +168,33 @@ def test_a_camera_checks_itself(wrong: dict[str, float]) -> None:
         Camera(**(numbers | wrong))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (
+            {"fx": 0.82, "fy": 1.09, "cx": 0.5, "cy": 0.5},
+            "are these numbers in px, and not shares of width and height?",
+        ),
+        ({"fx": 1e-300}, "more than 10 m sideways"),
+        ({"fy": 1e-5}, "more than 10 m sideways"),
+        ({"cx": 1e9}, "more than 10 m sideways"),
+        ({"cy": -1e9}, "more than 10 m sideways"),
+        ({"fx": 1e300}, "at most 1e\\+06 px"),
+        ({"width": 10**9, "height": 10**9}, "at most 33554432 px, not 1000000000x1000000000"),
+    ],
+)
+def test_a_camera_that_there_cannot_be_is_refused(wrong: dict[str, float], said: str) -> None:
+    numbers = {"width": 640, "height": 480, "fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5}
+    with pytest.raises(DataError, match=said):
+        Camera(**(numbers | wrong))  # type: ignore[arg-type]
+
+
+def test_parts_of_an_image_and_wide_and_long_lenses_are_cameras() -> None:
+    Camera(1, 1, 525.0, 525.0, -319.5, 239.5)  # its last pixel, alone
+    Camera(640, 480, 60.0, 60.0, 319.5, 239.5)  # 160 degrees
+    Camera(640, 480, 20000.0, 20000.0, 319.5, 239.5)  # 2 degrees
+
+
 def test_a_pose_is_rigid_within_the_digits_that_files_carry() -> None:
     rounded = np.round(exp_se3(np.array([1, 2, 3, 0.3, -0.7, 0.2])), 4)
     Pose(rounded)

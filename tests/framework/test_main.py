@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.__main__ import COMMANDS, main
+from framework.__main__ import COMMANDS, leave_working_folder, main
 from framework.files.search_paths import CONF
 from framework.records.provenance import config_hash
 
@@ -54,6 +54,12 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
         ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),
         ("tracker=null", ["group override must be a string"]),
+        ("ahead=x", ["ERROR", "ahead must be a whole number, 0 or more and at most 1000, found 'x'"]),
+        ("threads=1000000", ["ERROR", "threads must be", "at most 4096, found 1000000"]),
+        (f"detector={'x' * 100_000}", ["File name too long", "characters)"]),
+        (f"seed={'x' * 100_000}", ["seed must be a whole number", "characters)"]),
+        ("--experimental-rerun=config.pickle", ["--experimental-rerun reads a pickle, which may bring code"]),
+        ("--experimental-r=config.pickle", ["--experimental-rerun reads a pickle, which may bring code"]),
     ],
 )
 def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: list[str]) -> None:
@@ -61,8 +67,41 @@ def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: l
     assert done.returncode == 1
     assert done.stdout == ""
     assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert len(done.stderr) < 1200
     for words in said:
         assert words in done.stderr
+
+
+def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> None:
+    camera = {"width": 4, "height": 4, "fx": 4, "fy": 4, "cx": 2, "cy": 2, "depth_scale": 1000}
+    (tmp_path / "camera.json").write_text(json.dumps(camera))
+    for folder in ("color", "depth"):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / os.fsdecode(b"\xff_0.png")).write_text("no picture")
+    done = start(tmp_path, "dataset=rgbd_folder", f"dataset.root={tmp_path}")
+    assert done.returncode == 1
+    assert len(done.stderr.splitlines()) == 3, done.stderr
+    for said in (done.stderr, (tmp_path / "instancemap.log").read_text("utf-8")):
+        assert f"frame skipped: {tmp_path}/color/\\udcff_0.png is neither a JPEG nor a PNG file" in said
+
+
+@pytest.mark.parametrize(("options", "at"), [([], None), (["--config-dir", "conf"], -1), (["-cd=conf"], -1)])
+def test_modules_are_not_looked_for_in_the_working_folder(
+    options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With --config-dir, which registers some of one's own, there too, but last."""
+    monkeypatch.chdir(tmp_path)
+    for first in ("", str(tmp_path)):
+        monkeypatch.setattr(sys, "path", [first, "/elsewhere"])
+        leave_working_folder(["detector=x", *options])
+        assert sys.path == (["/elsewhere"] if at is None else ["/elsewhere", str(tmp_path)])
+    monkeypatch.setattr(sys, "path", ["/usr/bin", "/elsewhere"])  # as the console script has it
+    leave_working_folder([])
+    assert sys.path == ["/usr/bin", "/elsewhere"]
+    monkeypatch.chdir(CHECKOUT)
+    monkeypatch.setattr(sys, "path", [str(CHECKOUT)])
+    leave_working_folder([])
+    assert sys.path == [str(CHECKOUT)], "where the project itself is"
 
 
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+from omegaconf import OmegaConf
 from scipy.spatial import cKDTree
 
 from framework.errors import ConfigError
@@ -82,6 +83,24 @@ print(torch.initial_seed())
 def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delattr(os, "sched_getaffinity")
     assert available_cores() == os.cpu_count()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "most"),
+    [
+        *[("ahead", wrong, 1000) for wrong in ("x", -1, 1.5, 10**6, None, True)],
+        *[("threads", wrong, 4096) for wrong in (10**6, "all", None)],
+        *[("seed", wrong, 2**63 - 1) for wrong in (2**63, 10**400, "x" * 100_000)],
+    ],
+)
+def test_settings_are_within_bounds_that_the_message_says(name: str, value: object, most: int) -> None:
+    config = OmegaConf.create({"seed": 0, "device": "cpu", "threads": 0, "ahead": 2})
+    config[name] = value
+    with pytest.raises(
+        ConfigError, match=f"^{name} must be a whole number, 0 or more and at most {most}, found"
+    ) as told:
+        Settings.of(config)
+    assert len(str(told.value)) < 400
 
 
 @pytest.mark.parametrize("threads", [-1, 1.0, True])

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+import os
 from codecs import BOM_UTF8
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
+from framework.api import load_map
 from framework.datasets.camera_json import read_json_object
 from framework.datasets.scannet.scannet_annotation import read_label_table
+from framework.datasets.scannet.sens_file import open_sens
 from framework.datasets.scenenn.intrinsics import read_intrinsics
 from framework.datasets.scenenn.scenenn_annotation import read_annotation
 from framework.datasets.scenenn.timestamps import read_timestamps
 from framework.datasets.scenenn.trajectory_log import read_trajectory_log
 from framework.detection.coco_results import CategoryIds, read_results
-from framework.errors import DataError, FrameError
+from framework.detection.mask_rcnn.checkpoint import read_network
+from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
+from framework.errors import ConfigError, DataError, FrameError
+from framework.files.hashing import path_hash
 from framework.files.image_files import read_color, read_uint16
+from framework.files.json_file import read_json
 from framework.files.matrix_file import read_matrix_lines
 from framework.files.ply import read_ply
 from framework.files.tum_trajectory import read_tum
-from framework.files.whole_files import read_text
+from framework.files.whole_files import read_bytes, read_text, written_whole
 from framework.label_spaces import COCO, read_labels
+from framework.records.stored_runs import read_yaml
+from framework.records.timings_file import read_timings
 
 
 @pytest.mark.parametrize(
@@ -69,3 +78,64 @@ def test_a_byte_order_mark_is_left_out(tmp_path: Path, read: Callable[[Path], ob
     plain.write_bytes(content)
     marked.write_bytes(BOM_UTF8 + content)
     assert repr(read(marked)).replace("marked", "plain") == repr(read(plain))
+
+
+READERS = (
+    *(read_text, read_tum, read_matrix_lines, read_timestamps, read_trajectory_log, read_json_object, read_ply),
+    *(read_color, read_uint16, read_json, read_yaml, read_timings, read_annotation, read_intrinsics, path_hash),
+    *(load_map, open_sens, read_network, read_pickle, lambda path: read_bytes(path, 10)),
+    lambda path: read_results(path, COCO, CategoryIds.FROM_ONE),
+)
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("kind", ["pipe", "/dev/zero", "/dev/null", "folder"])
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object], kind: str) -> None:
+    """A pipe to which nobody writes would be waited for, and zeros never end."""
+    path = tmp_path / "name"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        if read is path_hash:
+            return  # which takes folders
+        path.mkdir()
+    else:
+        path.symlink_to(kind)
+    with pytest.raises(DataError, match=f"{path} is no file but a") as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_labels_are_no_device(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "labels.txt")
+    with pytest.raises(ConfigError, match="labels must be one of"):
+        read_labels(str(tmp_path / "labels.txt"))
+
+
+@pytest.mark.parametrize("kind", ["pipe", "/dev/full", "/dev/null", "folder"])
+def test_only_files_are_replaced(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "out.json"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(kind)
+    before = path.stat().st_mode
+    with pytest.raises(DataError, match="is no file but a"), written_whole(path) as temporary:
+        temporary.write_text("{}")
+    assert path.stat().st_mode == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    for target in (tmp_path / "real" / "there.txt", tmp_path / "real" / "not_yet.txt"):
+        link = tmp_path / f"to_{target.name}"
+        link.symlink_to(target)
+        with written_whole(link) as temporary:
+            assert temporary.parent == target.parent
+            temporary.write_text("new")
+        assert link.is_symlink()
+        assert target.read_text() == "new"
+        assert not target.is_symlink()

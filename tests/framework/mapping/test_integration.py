@@ -1,13 +1,18 @@
 """The TSDF against a slow reference and against exact surfaces."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
 from framework.data import Frame
+from framework.errors import FrameError, MapFullError
 from framework.geometry import inverse
 from framework.mapping.integration import GOLDEN, LEAST_BEHIND, Integrator
 from framework.mapping.sensor import Sensor
+from framework.mapping.tsdf import VoxelHashing
 from framework.mapping.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
+from framework.registry import assemble
 from tests.scenes.analytic_scene import CAMERA, pose, room, walk
 from tests.thread_counts import by_one_thread_and_two
 
@@ -112,6 +117,36 @@ def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float)
     integrator = new_integrator()
     integrator.integrate(frame, np.eye(4), VOXEL)
     assert integrator.voxels.block_count == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "T", "error", "said"),
+    [
+        (
+            {"voxel_size": 1e-4, "truncation_slope": 1.0, "max_depth": 1000.0},
+            0.0,
+            MapFullError,
+            "blocks deep, more than",
+        ),
+        ({"voxel_size": 1e-4, "truncation": 50.0}, 0.0, MapFullError, "one frame asks for [0-9]+ blocks or more"),
+        ({"voxel_size": 1e-3}, 9e3, FrameError, "sees 90[0-9.]+ m from the origin"),
+    ],
+)
+def test_what_one_frame_asks_for_is_limited_before_memory_is(
+    options: dict[str, float], T: float, error: type[Exception], said: str
+) -> None:
+    volume = assemble(VoxelHashing, max_blocks=1000, **options).new_volume()
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = T
+    depth = np.linspace(0.5, 4.5, CAMERA.width * CAMERA.height, dtype=np.float32).reshape(CAMERA.shape)
+    frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth, CAMERA)
+    tracemalloc.start()
+    try:
+        with pytest.raises(error, match=said):
+            volume.integrate(frame, T_world_camera, 0.01)
+        assert tracemalloc.get_traced_memory()[1] < 3e8
+    finally:
+        tracemalloc.stop()
 
 
 def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:

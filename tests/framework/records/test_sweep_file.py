@@ -29,6 +29,14 @@ def test_rows_say_what_was_run() -> None:
         sweep_rows({"rows": ["a"]})
 
 
+def test_a_stored_sweep_asks_for_nothing_of_this_machine(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    config = {"rows": {"a": ["x=${oc.env:SECRET}"], "b": ["x=${c}"]}, "c": "${oc.env:SECRET}"}
+    assert "hunter2" not in repr(sweep_rows(config))
+    asked = config | sweep({"seed": "${oc.env:SECRET}", "other": "${c}"}, [])
+    assert asked_runs(asked, ["seed"]) == asked_runs(asked, ["other"]) == []
+
+
 def test_the_sequences_are_those_that_the_experiment_names() -> None:
     asked = {"sequences": {"all": "a,b"}} | sweep({"dataset.scene": "${sequences.all}", "seed": 0, "x": "${y}"}, [])
     assert asked_runs(asked, ["seed", "dataset.scene"]) == [("0", "a"), ("0", "b")]

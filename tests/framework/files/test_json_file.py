@@ -1,0 +1,50 @@
+"""JSON that is no JSON, too deep or too large is refused in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from framework.errors import DataError
+from framework.files.json_file import DEEPEST, parse_json, read_json, write_json
+
+
+def test_what_is_written_comes_back(tmp_path: Path) -> None:
+    content = {"a": [1, 0.1, 2**62, None, True, "\u00e9"], "b": {"c": {}}}
+    write_json(tmp_path / "a.json", content)
+    assert read_json(tmp_path / "a.json") == content
+
+
+@pytest.mark.parametrize("marked", [b"\xef\xbb\xbf[1]", b"\xff\xfe[\x001\x00]\x00"])
+def test_a_byte_order_mark_is_left_out(marked: bytes) -> None:
+    assert parse_json("here", marked) == [1]
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "Expecting value"),
+        (b"[1", "delimiter"),
+        (b"\xff", "decode"),
+        (b"[" * 10**6, "deep"),
+        (b'{"a":' * 10**5, "deep"),
+        (b"[" * (DEEPEST + 1) + b"]" * (DEEPEST + 1), "more than 50 deep"),
+        (b'{"a":' * 51 + b"1" + b"}" * 51, "more than 50 deep"),
+        (b"[" + b"9" * 100_000 + b"]", "a whole number of 100000 digits, more than 63 bits"),
+        (b"[9223372036854775808]", "more than 63 bits"),
+    ],
+)
+def test_a_fault_is_one_line_that_names_the_place(content: bytes, said: str) -> None:
+    with pytest.raises(DataError, match=said) as caught:
+        parse_json("results.json", content)
+    assert str(caught.value).startswith("results.json cannot be read: it is not valid JSON")
+    assert len(str(caught.value)) < 300
+
+
+def test_the_deepest_that_is_read(tmp_path: Path) -> None:
+    (tmp_path / "deep.json").write_text("[" * DEEPEST + "]" * DEEPEST)
+    found = read_json(tmp_path / "deep.json")
+    for _ in range(DEEPEST - 1):
+        [found] = found
+    assert found == []
