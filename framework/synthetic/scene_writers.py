@@ -28,6 +28,7 @@ from tqdm import tqdm
 from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.datasets.scenenn.scenenn import MADE_BY
 from framework.errors import ConfigError, DataError
+from framework.files.json_file import read_json
 from framework.files.whole_files import written_whole
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
@@ -77,8 +78,8 @@ def _begin(root: Path, recording: Recording) -> None:
     wanted = {"generation": GENERATION, **asdict(recording)}
     if made_by.exists():
         try:
-            found = json.loads(made_by.read_text("utf-8"))
-        except (OSError, ValueError) as error:
+            found = read_json(made_by)
+        except DataError as error:
             raise DataError(f"{made_by} is damaged; delete it with its folder, or choose another folder") from error
         if found != wanted:
             raise ConfigError(

@@ -27,6 +27,7 @@ from tqdm import tqdm
 from framework.data import Bool, Camera, Float64, UInt8
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint16
+from framework.files.json_file import read_json
 from framework.synthetic.depth_camera import noisy_color
 from framework.synthetic.layout import CELL
 from framework.synthetic.renderer import Renderer
@@ -150,7 +151,7 @@ class RoomPictures:
             if not room.is_dir():
                 raise DataError(f"{room} is missing: render the rooms first")
             self.files += sorted(room.glob("*.jpg"))
-            classes = json.loads((room / "classes.json").read_text())
+            classes = read_json(room / "classes.json")
             self._names[room] = {int(i): str(name) for i, name in classes.items()}
 
     def __len__(self) -> int:

@@ -75,6 +75,7 @@ def test_a_fault_is_one_line_and_a_status(tmp_path: Path, override: str, said: l
 def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> None:
     camera = {"width": 4, "height": 4, "fx": 4, "fy": 4, "cx": 2, "cy": 2, "depth_scale": 1000}
     (tmp_path / "camera.json").write_text(json.dumps(camera))
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
     for folder in ("color", "depth"):
         (tmp_path / folder).mkdir()
         (tmp_path / folder / os.fsdecode(b"\xff_0.png")).write_text("no picture")
