@@ -16,10 +16,10 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult
-from omegaconf import DictConfig
+from omegaconf import DictConfig, ListConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
 
-from framework.errors import ConfigError, printable
+from framework.errors import ConfigError, DataError, printable
 from framework.files.search_paths import CONF
 from framework.files.whole_files import read_text
 from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
@@ -30,7 +30,7 @@ def composed(*overrides: str, name: str = "config") -> DictConfig:
     try:
         with config_directory():
             return compose(name, [*overrides])
-    except (HydraException, OmegaConfBaseException) as error:
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra answers some faults with ValueError
         raise ConfigError(one_line(error)) from error
 
 
@@ -56,7 +56,11 @@ class FileConfigSource(file_config_source.FileConfigSource):
             return super().load_config(config_path)
         with yaml_faults(path):
             check_yaml(path, read_text(path, LARGEST_FILE))
-            return super().load_config(config_path)
+            found = super().load_config(config_path)
+        config: Any = found.config
+        if "defaults" in config and not isinstance(config.get("defaults"), ListConfig):
+            raise DataError(f"{path}: defaults must be a list")  # Hydra has no word for some of what else it may be
+        return found
 
 
 Plugins.instance()  # registers Hydra's own sources

@@ -76,7 +76,7 @@ class Pipeline:
                 raise journal.stopped_by
             return journal.result()
         if self.fuser.scene.voxel_count == 0:
-            raise DataError(f"{sequence.name}: nothing was mapped: {self.why_nothing(journal)}")
+            raise DataError(f"{sequence.name}: {self.why_nothing(journal)}")
         return journal.result()
 
     def why_nothing(self, journal: Journal) -> str:
@@ -95,7 +95,9 @@ class Pipeline:
             (result.frames_lost, f"are lost, the first because: {lost or 'the tracker gave no reason'}"),
             (rest, f"have no depth that is mapped, {nearest:g} to {farthest:g} m"),
         ]
-        return f"of {result.frames} frames " + "; ".join(f"{count} {what}" for count, what in parts if count)
+        return f"nothing was mapped: of {result.frames} frames " + "; ".join(
+            f"{count} {what}" for count, what in parts if count
+        )
 
     def map_all(self, sequence: RGBDSequence, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""

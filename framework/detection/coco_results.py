@@ -109,8 +109,8 @@ def _read_box(found: Any) -> Float32 | None:
     if found is None:
         return None
     whole = isinstance(found, list) and len(found) == 4
-    if not whole or not all(isinstance(x, int | float) and np.isfinite(x) for x in found) or min(found[2:]) < 0:
-        raise DataError(f"bbox must be [x, y, width, height] px, found {found!r}")
+    if not whole or not all(isinstance(x, int | float) and abs(x) <= MOST_PIXELS for x in found) or min(found[2:]) < 0:
+        raise DataError(f"bbox must be [x, y, width, height] px, at most {MOST_PIXELS}, found {found!r:.200}")
     x, y, width, height = found
     return np.array([x, y, x + width, y + height], np.float32)
 

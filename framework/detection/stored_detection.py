@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from framework.detection.run_length import decode
 from framework.errors import DataError
 
 ROUNDED_SUM = 0.05  # |sum - 1| of a row of probabilities that counts as rounded when it was printed
+LARGEST = 1e6  # probability that is read before the sum is looked at
 
 
 class Segmentation(ABC):
@@ -107,8 +107,8 @@ def read_probabilities(found: Any, index: Mapping[str, int]) -> Float32 | None:
         raise DataError(f"class_probabilities must be a list or an object, found {found!r}")
     if len(given) != len(index):
         raise DataError(f"class_probabilities must have {len(index)} values, one for each label, found {len(given)}")
-    if not all(isinstance(p, int | float) and math.isfinite(p) and p >= 0 for p in given):
-        raise DataError("class_probabilities must be numbers, 0 or more")
+    if not all(isinstance(p, int | float) and 0 <= p <= LARGEST for p in given):  # NaN is none
+        raise DataError("class_probabilities must be numbers, 0 or more and about 1 together")
     row = np.array(given, np.float32)
     total = float(row.sum(dtype=np.float64))
     if abs(total - 1) > ROUNDED_SUM:

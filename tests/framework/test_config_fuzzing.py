@@ -51,7 +51,7 @@ TOKENS = (
         b"~: 1\n",
     ),
 )
-SLOWEST = 5.0  # s
+SLOWEST = 5.0  # s of this process: others may keep the machine busy
 BOMB = "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
 
 
@@ -65,14 +65,14 @@ def option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def line_of(option: Path, content: bytes) -> str:
     """The line that refuses the option; "" = it was built. Fails for everything else that can happen."""
     option.write_bytes(content)
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         build(Detector, composed("~dataset", "detector=mine").get("detector"))  # type: ignore[type-abstract]
     except InstanceMapError as error:
         line = str(error)
     else:
         line = ""
-    assert time.perf_counter() - began < SLOWEST
+    assert time.process_time() - began < SLOWEST
     assert line.isprintable()
     assert len(line) < 1000
     return line

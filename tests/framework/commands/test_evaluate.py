@@ -198,7 +198,7 @@ def _truncated_mesh(directory: Path) -> None:
         (_another_size, "vertices, but"),
         (_truncated_mesh, "mesh.ply, byte"),
         (lambda directory: (directory / "mesh.ply").unlink(), "mesh.ply"),
-        (lambda directory: (directory / "instances.json").unlink(), "instances.json cannot be read"),
+        (lambda directory: (directory / "instances.json").unlink(), "instances.json could not be read"),
         (lambda directory: _with_dataset(directory, truth=False), "true instances that the dataset has no longer"),
         (lambda directory: _with_dataset(directory, colour=1), "there is no parameter 'colour'"),
     ],

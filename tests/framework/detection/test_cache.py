@@ -409,6 +409,8 @@ def test_the_folder_is_the_users_by_default(monkeypatch: pytest.MonkeyPatch, tmp
     assert detector.directory == tmp_path / "instancemap" / "detections"
 
 
+@pytest.mark.usefixtures("fakes_registered")
+@pytest.mark.usefixtures("fakes_registered")
 def test_a_run_with_the_cache_is_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The whole record, but for times: without, while it fills, and from it."""
     asked: list[int] = []

@@ -24,7 +24,7 @@ from tests.damaged_files import EXAMPLES, LARGE, changed_json
 from tests.scenes.analytic_scene import room, walk
 from tests.true_masks import fuse_masks, masks_of
 
-SLOWEST = 5.0  # s
+SLOWEST = 5.0  # s of this process: others may keep the machine busy
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
 KINDS = ("bayesian_tsdf", "exact", "last_write", "object_volumes", "open3d_vbg", "semantic_components")
 
@@ -72,7 +72,7 @@ def use(scene: SceneMap) -> None:
 def load_and_use(path: Path, content: bytes) -> str:
     """The line that refuses the file; "" = it was used."""
     path.write_bytes(content)
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         scene = load_map(path)
     except DataError as error:
@@ -80,7 +80,7 @@ def load_and_use(path: Path, content: bytes) -> str:
     else:
         line = ""
         use(scene)
-    assert time.perf_counter() - began < SLOWEST
+    assert time.process_time() - began < SLOWEST
     assert line.isprintable()
     assert len(line) < 1000
     assert not line or line.startswith(str(path))

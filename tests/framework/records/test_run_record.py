@@ -236,9 +236,9 @@ def test_lost_frames_are_not_in_the_trajectory(record: RunRecord, room: CornerRo
     assert metrics_of(record)["frames_lost"] == 2
 
 
-def test_a_run_that_tracked_nothing_leaves_a_record(record: RunRecord, room: CornerRoom) -> None:
-    record.write(room, mapped(room, lost_from=0, lost_to=6))
-    assert (metrics_of(record)["frames_lost"], metrics_of(record)["instances.count"]) == (6, 0)
+def test_a_run_that_tracked_its_first_frame_alone_leaves_a_record(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room, lost_from=1, lost_to=6))
+    assert (metrics_of(record)["frames_lost"], metrics_of(record)["trajectory.ate_rmse_m"]) == (5, 0.0)
 
 
 def test_timings_are_a_table(record: RunRecord, room: CornerRoom) -> None:
@@ -256,14 +256,15 @@ def test_timings_are_a_table(record: RunRecord, room: CornerRoom) -> None:
 def test_the_tracker_says_where_poses_come_from(room: CornerRoom) -> None:
     """Whatever the poses are: a tracker's first one is the true one, and lost ones are no one's."""
     one_frame = CornerRoom(frames=1)
-    given = [mapped(room), mapped(room, lost_to=99), mapped(one_frame)]
+    given = [mapped(room), mapped(room, lost_from=1, lost_to=99), mapped(one_frame)]
     assert [run_metrics(result)["pose_source"] for result in given] == ["ground_truth"] * 3
 
     class Tracks(GivenPose):
         pose_source = "tracked"
 
     for sequence, lost_to in ((room, 0), (room, 99), (one_frame, 0)):
-        result = Pipeline(SphereDetector(), Tracks(lost_to=lost_to), KeepAll(), GridFuser()).run(sequence)
+        tracker = Tracks(lost_from=1, lost_to=lost_to)
+        result = Pipeline(SphereDetector(), tracker, KeepAll(), GridFuser()).run(sequence)
         assert run_metrics(result)["pose_source"] == "tracked"
 
 
