@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from difflib import get_close_matches
@@ -66,8 +67,25 @@ def leave_working_folder(arguments: list[str]) -> None:
         sys.path.append(here)
 
 
+def open_standard_streams() -> None:
+    """Opens /dev/null for those that were closed (`2>&-`).
+
+    Else a file of the record gets the number of one, and what a library prints goes into that file.
+    """
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            mode = "r" if number == 0 else "w"
+            # the lowest free number is the one that was closed, as they are gone through in order
+            stream = Path(os.devnull).open(mode, encoding="utf-8")  # noqa: SIM115  (open until the process ends)
+            setattr(sys, name, stream)
+            setattr(sys, f"__{name}__", stream)
+
+
 def main() -> None:
     """The console script `instancemap`."""
+    open_standard_streams()
     leave_working_folder(sys.argv[1:])
     if any(word.startswith("--e") and RERUN.startswith(word.partition("=")[0]) for word in sys.argv[1:]):
         sys.exit(f"error: {RERUN} reads a pickle, which may bring code that runs; give the run's overrides instead")
@@ -79,7 +97,10 @@ def main() -> None:
     if word in ("--help", "-h", "help"):
         width = max(map(len, COMMANDS))
         listed = "\n".join(f"  {name:<{width}}  {says}" for name, says in COMMANDS.items())
-        print(HELP.format(program=program, commands=listed), end="")
+        try:
+            print(HELP.format(program=program, commands=listed), end="", flush=True)
+        except OSError as error:
+            sys.exit(f"error: the help could not be written: {error.strerror}")
         return
     if word in COMMANDS:
         sys.argv[:2] = [f"{program} {word}"]

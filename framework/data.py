@@ -18,6 +18,7 @@ through these types, and the code behind them trusts what it gets.
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -154,6 +155,8 @@ class Frame:
 
     def __post_init__(self) -> None:
         where = f"frame {self.index}: "
+        if not isinstance(self.timestamp, int | float | np.integer | np.floating) or not math.isfinite(self.timestamp):
+            raise DataError(f"{where}timestamp must be a finite number of seconds, found {self.timestamp!r}")
         check_array(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
         check_array(where + "depth", self.depth, self.camera.shape, np.float32)
         if self.depth.size and self.depth.min() < 0:
@@ -354,6 +357,8 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
     if not isinstance(array, np.ndarray) or array.dtype != dtype:
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
         raise DataError(f"{name} must be an array of {np.dtype(dtype)}, found {found}")
+    if isinstance(array, np.ma.MaskedArray):
+        raise DataError(f"{name} is a masked array, whose mask would get lost; fill what is masked: {name}.filled(0)")
     matches = len(array.shape) == len(shape) and all(
         want in (None, have) for have, want in zip(array.shape, shape, strict=True)
     )

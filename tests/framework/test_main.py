@@ -189,6 +189,28 @@ def test_a_run_leaves_its_record(tmp_path: Path) -> None:
     assert str(tmp_path / "overview.png") in done.stderr
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="sh closes the streams")
+def test_a_run_with_closed_streams_leaves_its_record(tmp_path: Path) -> None:
+    line = command(f"hydra.run.dir={tmp_path}")
+    closed = ["sh", "-c", 'exec "$@" <&- >&- 2>&-', "sh", *line]
+    assert subprocess.run(closed, cwd=tmp_path, env=environment(), check=False).returncode == 0
+    assert {path.name for path in tmp_path.iterdir()} >= RECORD
+    log = (tmp_path / "instancemap.log").read_text()
+    assert "ERROR" not in log
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_help_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        line = [sys.executable, "-m", "framework", "--help"]
+        done = subprocess.run(
+            line, cwd=tmp_path, env=environment(), stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[0] == "error: the help could not be written: No space left on device"
+    assert "Traceback" not in done.stderr
+
+
 def test_a_failed_job_does_not_stop_a_sweep(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.frames=2,many,1", "seed=0", sweep=True)
     assert done.returncode == 1
