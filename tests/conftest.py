@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import os
 import random
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,12 @@ from tests.scenes.corner_room import CornerRoom
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
 CHECKOUT = Path(__file__).resolve().parent.parent
+
+# who starts the tests in the background has them, and all that they start, ignore Ctrl-C; nohup, a closed terminal
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
 @pytest.fixture(autouse=True)
