@@ -46,9 +46,9 @@ __all__ = [
 
 def pipeline_of(config: DictConfig) -> Pipeline:
     """The stages that a config names, the detector behind the cache that it asks for."""
-    fuser, refiner = build(MapFuser, config.fuser), build(ClusterRefiner, config.refiner)
-    tracker = build(PoseTracker, config.tracker)
-    detector = with_cache(build(Detector, config.detector), config)  # last, for loading a network takes its time
+    fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
+    tracker = build(PoseTracker, config.get("tracker"))
+    detector = with_cache(build(Detector, config.get("detector")), config)  # last, as loading a network takes its time
     return Pipeline(detector, tracker, refiner, fuser, config.ahead)
 
 
@@ -63,6 +63,11 @@ class Mapper:
     scene: SceneMap  # the map: mesh(), render(), instances(), save()
 
     def __init__(self, *overrides: str) -> None:
+        for override in overrides:
+            if not isinstance(override, str):
+                raise ConfigError(f"Mapper takes words such as 'fuser.voxel_size=0.02', found {override!r}")
+            if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
+                raise ConfigError(f"Mapper: {override} is of a run on the command line; here the frames are yours")
         config = composed("~dataset", *overrides)
         Settings.of(config).apply()
         self.pipeline = pipeline_of(config)
@@ -77,6 +82,8 @@ class Mapper:
         FrameError when the frame cannot be used, as one without a pose where poses are given, which leaves the map as
         it was, and MapFullError at the end of `fuser.max_blocks`.
         """
+        if not isinstance(frame, Frame):
+            raise DataError(f"Mapper.add takes an instancemap.Frame, found {type(frame).__name__}")
         self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
         self._journal.tracked.clear()
         return self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)

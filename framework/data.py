@@ -22,6 +22,8 @@ import math
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from numbers import Integral, Real
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -56,6 +58,12 @@ class Camera:
     cy: float  # px, of the pixel centre
 
     def __post_init__(self) -> None:
+        for name in ("width", "height", "fx", "fy", "cx", "cy"):
+            value = getattr(self, name)
+            kind: type = Integral if name in ("width", "height") else Real
+            if isinstance(value, bool) or not isinstance(value, kind):
+                expected = "a whole number of px" if kind is Integral else "a number of px"
+                raise DataError(f"Camera.{name} must be {expected}, found {value!r}")
         if self.width < 1 or self.height < 1:
             raise DataError(f"Camera: the image is at least 1x1 px, not {self.width}x{self.height}")
         if self.width * self.height > MOST_PIXELS:
@@ -154,7 +162,12 @@ class Frame:
     truth: FrameTruth | None = None
 
     def __post_init__(self) -> None:
+        index, camera = cast(object, self.index), cast(object, self.camera)  # whatever a caller gave
+        if isinstance(index, bool) or not isinstance(index, int | np.integer) or index < 0:
+            raise DataError(f"Frame.index must be a whole number, 0 or more, found {index!r}")
         where = f"frame {self.index}: "
+        if not isinstance(camera, Camera):
+            raise DataError(f"{where}camera must be a Camera, found {type(camera).__name__}")
         if not isinstance(self.timestamp, int | float | np.integer | np.floating) or not math.isfinite(self.timestamp):
             raise DataError(f"{where}timestamp must be a finite number of seconds, found {self.timestamp!r}")
         check_array(where + "color", self.color, (*self.camera.shape, 3), np.uint8)
@@ -163,9 +176,9 @@ class Frame:
             raise DataError(f"{where}depth must be 0 or positive, found {self.depth.min()} m")
         if self.T_world_camera is not None:
             check_rigid(where + "T_world_camera", self.T_world_camera)
-        # the kernels are compiled for this layout; a view such as bgr[..., ::-1] is copied into it
-        object.__setattr__(self, "color", np.ascontiguousarray(self.color))
-        object.__setattr__(self, "depth", np.ascontiguousarray(self.depth))
+        # the kernels are compiled for this; a view such as bgr[..., ::-1], or what is read only, is copied
+        object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
+        object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
         if self.truth is not None and self.truth.shape != self.camera.shape:
             raise DataError(f"{where}truth.instance_ids must have shape {self.camera.shape}, found {self.truth.shape}")
 

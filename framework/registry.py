@@ -40,7 +40,7 @@ REGISTER = "; a class of your own needs a YAML {stage}/NAME.yaml in a folder tha
 Plugin = TypeVar("Plugin")
 
 
-def build(interface: type[Plugin], node: DictConfig) -> Plugin:
+def build(interface: type[Plugin], node: DictConfig | None) -> Plugin:
     """The plugin that a config node describes: `_target_` names the class, every other key is a parameter of it.
 
     The class must be one that an option of the stage names: those of this project, of installed packages and, in a run,

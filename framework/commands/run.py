@@ -64,7 +64,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     Settings.of(config).apply()
     pipeline = pipeline_of(config)
-    sequence = build(RGBDSequence, config.dataset)  # after the stages: making up a room takes longest
+    sequence = build(RGBDSequence, config.get("dataset"))  # after the stages: making up a room takes longest
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)

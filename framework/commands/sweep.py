@@ -18,7 +18,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.commands.choices import check_sweep
 from framework.configs import one_line
-from framework.errors import InstanceMapError
+from framework.errors import ConfigError, InstanceMapError
 from framework.files.directory_lock import locked, new_directory
 from framework.files.whole_files import remove_left_over
 from framework.parameters import checked_rows
@@ -55,7 +55,7 @@ class PlaceCallback(Callback):
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         HydraConfig.instance().set_config(config)  # as it does itself a moment later: the place names the dataset
         if self.of_run:
-            self.take(lambda: locked(Path(config.hydra.run.dir), wait=config.resume is True))
+            self.take(lambda: locked(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.resume is True))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self.take(lambda: sweep_of(config))
@@ -67,10 +67,18 @@ class PlaceCallback(Callback):
             sys.exit(f"error: {one_line(error)}")
 
 
+def place_of(key: str, chosen: str) -> Path:
+    """The directory that was chosen. Raises ConfigError for an empty name, which would be the working folder."""
+    if not chosen.strip():
+        raise ConfigError(f"{key} is empty; {key}=. is the working folder")
+    return Path(chosen)
+
+
 def sweep_of(config: DictConfig) -> AbstractContextManager[None]:
     """The place of a sweep, once it is known that it has runs. Raises InstanceMapError."""
     check_sweep(config.hydra.overrides.task, checked_rows(config.get("rows")))
-    return sweep_in(Path(config.hydra.sweep.dir), "table" in config, config.get("figure") is not None)
+    directory = place_of("hydra.sweep.dir", config.hydra.sweep.dir)
+    return sweep_in(directory, "table" in config, config.get("figure") is not None)
 
 
 @contextmanager

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,10 @@ from framework.datasets.undistortion import Distortion
 from framework.errors import DataError
 from framework.files.json_file import read_json
 from framework.files.whole_files import MOST_TEXT
+
+DISTORTION = "distortion"  # the key of the lens distortion
+
+log = logging.getLogger(__name__)
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
@@ -46,11 +52,25 @@ def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tu
         raise DataError(f"{path}: {error}") from error
 
 
+def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> None:
+    """Says in the log which keys of `content` of the file `path` are not read, as they are none of the `known`.
+
+    Raises DataError for one that is nearly a known one: a misspelt lens distortion would be left out without a word.
+    """
+    unread = [key for key in content if key not in known]
+    for key in unread:
+        close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
+        if close:
+            raise DataError(f"{path}: there is no key {key!r}; did you mean {close[0]!r}?")
+    if unread:
+        log.warning("%s: not read: %s; its keys are %s", path, ", ".join(unread), ", ".join(known))
+
+
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
     """The lens distortion that `content` of the file `path` gives, None without one. Raises DataError."""
-    if "distortion" not in content:
+    if DISTORTION not in content:
         return None
-    values = content["distortion"]
+    values = content[DISTORTION]
     if not isinstance(values, list) or len(values) != len(fields(Distortion)):
         raise DataError(f"{path}: distortion must be [k1, k2, p1, p2, k3], found {str(values)[:60]}")
     named = {f"distortion[{k}]": value for k, value in enumerate(values)}

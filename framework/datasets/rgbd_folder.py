@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import FrameTruth, Int32, SceneTruth
-from framework.datasets.camera_json import camera_of, distortion_of, read_json_object
+from framework.datasets.camera_json import DISTORTION, camera_of, check_keys, distortion_of, read_json_object
 from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
 from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
@@ -54,6 +54,7 @@ class RgbdFolder(Recording):
     def open(self) -> Contents:
         path = self.folder / "camera.json"
         content = _read_json(path)
+        check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
         camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))

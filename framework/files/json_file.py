@@ -30,7 +30,7 @@ def read_json(path: Path, most: int = MOST_TEXT) -> Any:
 def parse_json(where: object, content: bytes | str) -> Any:
     """What JSON text says, with or without a byte order mark. `where` it is from begins a DataError's line."""
     try:
-        found = json.loads(content, parse_int=_whole)
+        found = json.loads(content, parse_int=_whole, object_pairs_hook=_once)
     except RecursionError as error:
         raise DataError(f"{where} cannot be read: {TOO_DEEP}") from error
     except (ValueError, MemoryError) as error:
@@ -44,6 +44,15 @@ def _whole(digits: str) -> int:
     if len(digits) > MOST_BITS or (value := int(digits)).bit_length() > MOST_BITS:
         raise ValueError(f"{digits[:20]}... is a whole number of {len(digits)} digits, more than {MOST_BITS} bits hold")
     return value
+
+
+def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """An object: JSON lets a key be there twice, and readers take the last value or the first."""
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        twice = next(key for k, (key, _) in enumerate(pairs) if key in {before for before, _ in pairs[:k]})
+        raise ValueError(f"the key {twice!r} is twice in an object")
+    return found
 
 
 def _is_shallow(content: Any) -> bool:

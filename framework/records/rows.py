@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, TypeGuard
+from typing import Any
 
 import numpy as np
 
 from framework.records.provenance import leaves, relevant
-from framework.records.stored_runs import Record
+from framework.records.stored_runs import Record, is_number
 
 CHOICE = "choice."  # starts the keys of metrics.json that say which option was chosen of a config group
 DATA = "dataset.root"  # the key of the config that says where recorded data are
@@ -83,7 +82,7 @@ class Row:
     def values(self, column: str) -> dict[Run, float]:
         """The runs' figures, without those that are not defined."""
         found = {run: record.metrics.get(column) for run, record in self.records.items()}
-        return {run: float(value) for run, value in found.items() if _is_number(value)}
+        return {run: float(value) for run, value in found.items() if is_number(value)}
 
     def mean(self, column: str) -> Mean:
         return Mean.of(self.values(column).values())
@@ -208,7 +207,3 @@ def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
 def natural(run: Run) -> tuple[tuple[float, str], ...]:
     """Seeds in their order as numbers, other words after them."""
     return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)
-
-
-def _is_number(value: Any) -> TypeGuard[float]:
-    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max

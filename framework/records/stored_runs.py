@@ -5,10 +5,11 @@ from __future__ import annotations
 import logging
 import os
 import re
+import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -25,6 +26,8 @@ METRICS = "metrics.json"  # there exactly when the run completed
 PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
 LOG = "instancemap.log"
 EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
+
+FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # begin the keys of numbers in METRICS
 
 _LOG_LINE = re.compile(r"\S+ (?P<level>DEBUG|INFO|WARNING|ERROR|CRITICAL) +(?P<message>.*)")
 
@@ -168,7 +171,15 @@ def _read_flat(path: Path) -> dict[str, Any]:
         raise DataError(f"{path} must hold an object, found {type(content).__name__}")
     if nested := [key for key, value in content.items() if isinstance(value, dict | list)]:
         raise DataError(f"{path} must be flat, found more below {nested[0]!r}")
+    for key, value in content.items():
+        if key.startswith(FIGURES) and value is not None and not is_number(value):
+            raise DataError(f"{path}: {key} must be a number or null, found {value!r}")
     return content
+
+
+def is_number(value: Any) -> TypeGuard[float]:
+    """Whether it is a finite number, and none of Python's truth values."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) <= sys.float_info.max
 
 
 def _run_directories(root: Path) -> Iterator[Path]:

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,6 +53,11 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
     assert not mapper.add(room[2]).lost
 
 
+def test_what_is_no_frame_is_told() -> None:
+    with pytest.raises(DataError, match=r"Mapper\.add takes an instancemap\.Frame, found NoneType"):
+        Mapper(*STAGES).add(None)  # type: ignore[arg-type]
+
+
 @pytest.mark.parametrize(
     ("override", "said"),
     [
@@ -60,9 +66,13 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
         ("fuser.voxel_size=-1", "voxel_size must be in"),
         ("detection_cache=bogus", "detection_cache must be one of off, read_write, read_only"),
         ("seed=-1", "seed must be a whole number"),
+        ("~refiner", "refiner: expected a plugin's config .*; choose refiner=NAME"),
+        ("dataset=desk", "dataset=desk is of a run on the command line; here the frames are yours"),
+        ("hydra.run.dir=x", "hydra.run.dir=x is of a run on the command line"),
+        (None, "Mapper takes words such as 'fuser.voxel_size=0.02', found None"),
     ],
 )
-def test_a_name_or_a_value_that_there_is_not_is_one_line(override: str, said: str) -> None:
+def test_a_name_or_a_value_that_there_is_not_is_one_line(override: Any, said: str) -> None:
     with pytest.raises(ConfigError, match=said.replace("?", r"\?")) as refused:
         Mapper(*STAGES, override)
     assert "\n" not in str(refused.value)

@@ -42,6 +42,37 @@ def frame(**changes: Any) -> Frame:
     return Frame(**(parts | changes))
 
 
+@pytest.mark.parametrize("index", [1.5, "a", -5, None, True])
+def test_a_frames_index_is_a_whole_number(index: object) -> None:
+    with pytest.raises(DataError, match=r"Frame\.index must be a whole number, 0 or more, found"):
+        frame(index=index)
+
+
+def test_numpys_numbers_are_numbers() -> None:
+    camera = Camera(np.int64(4), np.int32(3), np.float32(5), np.float64(5), np.int64(1), 1)  # type: ignore[arg-type]
+    assert frame(index=np.int64(3), timestamp=np.float32(1), camera=camera).index == 3
+
+
+@pytest.mark.parametrize("camera", [None, (4, 3, 5.0, 5.0, 1.5, 1.0)])
+def test_a_frames_camera_is_a_camera(camera: object) -> None:
+    with pytest.raises(DataError, match="frame 7: camera must be a Camera, found"):
+        frame(camera=camera)
+
+
+@pytest.mark.parametrize(("name", "value"), [("width", "160"), ("height", 3.0), ("fx", None), ("cy", True)])
+def test_a_camera_is_made_of_numbers(name: str, value: object) -> None:
+    with pytest.raises(DataError, match=rf"Camera\.{name} must be a (whole )?number of px, found"):
+        replace(CAMERA, **{name: value})
+
+
+def test_read_only_images_are_copied_and_others_are_not() -> None:
+    """numba compiles its kernels anew for arrays that it must not write to."""
+    depth = np.ones((3, 4), np.float32)
+    assert frame(depth=depth).depth is depth
+    depth.flags.writeable = False
+    assert frame(depth=depth).depth.flags.writeable
+
+
 def detections(**changes: Any) -> Detections:
     parts = {
         "masks": np.zeros((2, 3, 4), np.bool_),

@@ -113,6 +113,14 @@ def test_modules_are_not_looked_for_in_the_working_folder(
     assert sys.path == [str(CHECKOUT)], "where the project itself is"
 
 
+@pytest.mark.parametrize("sweep", [False, True])
+def test_a_place_without_a_name_is_refused(tmp_path: Path, sweep: bool) -> None:
+    done = start(tmp_path, f"hydra.{'sweep' if sweep else 'run'}.dir=", "seed=0", sweep=sweep)
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert "dir is empty" in done.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_debug_shows_the_traceback(tmp_path: Path) -> None:
     done = start(tmp_path, "dataset.frames=many", "debug=true")
     assert done.returncode == 1

@@ -268,6 +268,20 @@ def test_what_is_there_and_cannot_be_read_does_not_count_as_missing(folder, name
         RgbdFolder(folder)
 
 
+@pytest.mark.parametrize("key", ["Distortion", "distorsion", "depthscale", "Width"])
+def test_a_misspelt_key_of_the_camera_is_told(folder, key):
+    change_camera(folder, **{key: 1})
+    with pytest.raises(DataError, match=f"there is no key '{key}'; did you mean"):
+        RgbdFolder(folder)
+
+
+def test_keys_of_the_camera_that_are_not_read_are_named(folder, caplog):
+    change_camera(folder, serial="A7", k1=0.1)
+    assert len(RgbdFolder(folder)) > 0
+    [record] = caplog.records
+    assert "camera.json: not read: serial, k1; its keys are width, height, fx" in record.message
+
+
 def test_fewer_poses_than_frames(folder):
     lines = (folder / "poses.txt").read_text().splitlines()
     (folder / "poses.txt").write_text("\n".join(lines[:-1]))

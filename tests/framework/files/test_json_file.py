@@ -33,6 +33,7 @@ def test_a_byte_order_mark_is_left_out(marked: bytes) -> None:
         (b'{"a":' * 51 + b"1" + b"}" * 51, "more than 50 deep"),
         (b"[" + b"9" * 100_000 + b"]", "a whole number of 100000 digits, more than 63 bits"),
         (b"[9223372036854775808]", "more than 63 bits"),
+        (b'[{"fx": 1, "fy": 2, "fx": 3}]', "the key 'fx' is twice in an object"),
     ],
 )
 def test_a_fault_is_one_line_that_names_the_place(content: bytes, said: str) -> None:
