@@ -17,7 +17,7 @@ from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, ListConfig
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError, OmegaConfBaseException
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
 from framework.errors import ConfigError, DataError, printable
 from framework.files.search_paths import CONF
@@ -101,6 +101,10 @@ def _said(error: BaseException) -> str:
         return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
     if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
         return _joined(f"{error} {error.__cause__}")
+    if isinstance(error, InterpolationResolutionError):  # what a resolver says stands between its kind and the key
+        return _joined(
+            str(error).partition("\n")[0].partition(" raised while resolving interpolation: ")[2] or str(error)
+        )
     if isinstance(error, OSError) and error.filename is not None:
         return f"{error.filename}: {error.strerror}"
     return _joined(str(error)) or type(error).__name__

@@ -19,16 +19,22 @@ log = logging.getLogger(__name__)
 
 
 def new_directory(wanted: str) -> str:
-    """Makes a directory that was not there: `wanted`, or where others were faster `wanted`_2, _3 ..."""
+    """Makes a directory that was not there: `wanted`, or where others were faster `wanted`_2, _3 ...
+
+    Raises DataError when the disk does not take it.
+    """
     path, number = Path(wanted), 1
-    path.parent.mkdir(parents=True, exist_ok=True)
-    while True:
-        try:
-            path.mkdir()  # of several processes that try, one succeeds
-            return str(path)
-        except FileExistsError:
-            number += 1
-            path = Path(f"{wanted}_{number}")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        while True:
+            try:
+                path.mkdir()  # of several processes that try, one succeeds
+                return str(path)
+            except FileExistsError:
+                number += 1
+                path = Path(f"{wanted}_{number}")
+    except OSError as error:
+        raise DataError(f"the directory {path} could not be made: {error.strerror}") from error
 
 
 @contextmanager

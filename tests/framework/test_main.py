@@ -113,6 +113,14 @@ def test_modules_are_not_looked_for_in_the_working_folder(
     assert sys.path == [str(CHECKOUT)], "where the project itself is"
 
 
+def test_a_place_that_cannot_be_made_is_told_in_one_line(tmp_path: Path) -> None:
+    (tmp_path / "outputs").touch()
+    line = command("seed=0")
+    done = subprocess.run(line, cwd=tmp_path, env=environment(), capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert re.fullmatch(r"error: the directory outputs/.*_fake could not be made: .*\n", done.stderr)
+
+
 @pytest.mark.parametrize("sweep", [False, True])
 def test_a_place_without_a_name_is_refused(tmp_path: Path, sweep: bool) -> None:
     done = start(tmp_path, f"hydra.{'sweep' if sweep else 'run'}.dir=", "seed=0", sweep=sweep)

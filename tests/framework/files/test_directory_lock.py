@@ -85,3 +85,9 @@ def test_who_asks_for_a_new_directory_at_the_same_moment_gets_one_of_his_own(tmp
         made = list(processes.map(new_directory, [wanted] * 40))
     assert set(made) == {wanted, *(f"{wanted}_{number}" for number in range(2, 41))}
     assert len(made) == len(list((tmp_path / "outputs").iterdir())) == 40
+
+
+def test_a_directory_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(DataError, match=r"the directory .*run could not be made: "):
+        new_directory(str(tmp_path / "file" / "run"))
