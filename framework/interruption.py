@@ -6,9 +6,11 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from multiprocessing import active_children
 from types import FrameType
 
 ENDING = tuple(
@@ -49,6 +51,7 @@ class Interruption:
     """What signals have asked for while they were deferred."""
 
     asked: Interrupted | None = None
+    quiet: bool = False  # where another process says what happens
     _when: str = "after this frame"  # when the step that is in work is done, in words
     _at_once: bool = False  # whether a further signal raises
 
@@ -72,7 +75,8 @@ class Interruption:
     def hear(self, number: int, _frame: FrameType | None) -> None:
         if self.asked is None:
             self.asked = Interrupted(number)
-            _say(f"{self.asked}: ending {self._when}; a second time ends at once\n")
+            if not self.quiet:
+                _say(f"{self.asked}: ending {self._when}; a second time ends at once\n")
         elif self._at_once:
             raise Interrupted(number)
 
@@ -85,6 +89,7 @@ def _say(text: str) -> None:
 
 
 _deferring: Interruption | None = None
+_in_worker = ExitStack()  # which nobody leaves
 
 
 @contextmanager
@@ -113,3 +118,44 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
         for number, handler in taken.items():
             signal.signal(number, handler)
         _deferring = None
+
+
+def heard_from_sweep() -> Interruption:
+    """In a worker process of a sweep: what the sweep has asked for by SIGTERM, since the worker's first job.
+
+    Of the other signals, which a terminal sends to all of its processes, the sweep decides what they mean.
+    """
+    for number in set(ENDING) - {signal.SIGTERM}:
+        signal.signal(number, signal.SIG_IGN)
+    if _deferring is None:
+        _in_worker.enter_context(signals_deferred(signal.SIGTERM)).quiet = True
+    assert _deferring is not None
+    return _deferring
+
+
+@contextmanager
+def signals_passed_on(at_work: Callable[[], bool]) -> Iterator[None]:
+    """While the body runs, the first signal is passed on to the worker processes of this one, and raises in the end.
+
+    That is when nobody is `at_work` any more; the second signal raises at once.
+    """
+
+    def end_workers(number: int, _frame: FrameType | None) -> None:
+        asked = Interrupted(number)
+        for each in taken:
+            signal.signal(each, _raise_interrupted)
+        _say(f"{asked}: ending once the runs in work have left their records; a second time ends at once\n")
+        for worker in active_children():
+            worker.terminate()
+        while at_work():
+            time.sleep(0.1)
+        raise asked
+
+    taken = [number for number in ENDING if signal.getsignal(number) in OURS_TO_HANDLE]
+    for number in taken:
+        signal.signal(number, end_workers)
+    try:
+        yield
+    finally:
+        for number in taken:
+            signal.signal(number, _raise_interrupted)

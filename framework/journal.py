@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -94,7 +95,8 @@ class Journal:
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
-        quiet = os.environ.get("TQDM_DISABLE") == "1"  # tqdm itself does not look where `disable` is given
+        # tqdm itself does not look where `disable` is given; a program without a console has no stderr
+        quiet = os.environ.get("TQDM_DISABLE") == "1" or sys.stderr is None
         self._bar = self._screen.enter_context(
             tqdm(total=self.frames_expected, unit=" frames", disable=quiet or None, dynamic_ncols=True)
         )

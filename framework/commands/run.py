@@ -16,11 +16,11 @@ from omegaconf import DictConfig
 from framework.commands.choices import fault_of_first_run
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.experiment import with_row
-from framework.commands.sweep import ending
+from framework.commands.sweep import ending, has_workers
 from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
-from framework.interruption import ENDING, Interruption, raise_on_signals, signals_deferred
+from framework.interruption import ENDING, Interruption, heard_from_sweep, raise_on_signals, signals_deferred
 from framework.records.stored_runs import is_recorded
 
 log = logging.getLogger(__name__)
@@ -32,6 +32,8 @@ jobs = Jobs()
 def job(config: DictConfig) -> None:
     """One run: builds the stages that the config names, maps the sequence, leaves the record in Hydra's directory."""
     hydra_config = HydraConfig.get()
+    if is_of_sweep(hydra_config) and has_workers(hydra_config):
+        heard_from_sweep().check()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)
     # where a sweep was killed and not its workers, they go on; a run by itself has its place since it was started

@@ -6,11 +6,12 @@ import os
 import sys
 import textwrap
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf
@@ -19,8 +20,9 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.commands.choices import check_sweep
 from framework.configs import one_line
 from framework.errors import ConfigError, InstanceMapError
-from framework.files.directory_lock import locked, new_directory
+from framework.files.directory_lock import is_locked, locked, new_directory
 from framework.files.whole_files import remove_left_over
+from framework.interruption import signals_passed_on
 from framework.parameters import checked_rows
 from framework.settings import available_cores
 
@@ -78,22 +80,30 @@ def sweep_of(config: DictConfig) -> AbstractContextManager[None]:
     """The place of a sweep, once it is known that it has runs. Raises InstanceMapError."""
     check_sweep(config.hydra.overrides.task, checked_rows(config.get("rows")))
     directory = place_of("hydra.sweep.dir", config.hydra.sweep.dir)
-    return sweep_in(directory, "table" in config, config.get("figure") is not None)
+    workers = has_workers(config.hydra)
+    return sweep_in(directory, "table" in config, config.get("figure") is not None, workers)
+
+
+def has_workers(own: DictConfig | HydraConf) -> bool:
+    """Whether the jobs of a sweep are run by processes that this one has started."""
+    return str(own.launcher._target_).endswith(".JoblibLauncher")
 
 
 @contextmanager
-def sweep_in(directory: Path, with_table: bool, with_figure: bool) -> Iterator[None]:
+def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool = False) -> Iterator[None]:
     """Has `directory` to itself while the body runs, and prints the table of the runs in it however the body ends.
 
     The picture of the runs is drawn, too, but for Ctrl-C, which shall end at once. Raises InstanceMapError, in place of
-    what the launchers raise when a worker is killed.
+    what the launchers raise when a worker is killed. Where it has `workers`, a signal is theirs, too: their runs leave
+    a partial record, and the sweep ends after them.
     """
     # joblib ends its workers without their help, and Python's own clean-up warns of that
     os.environ["PYTHONWARNINGS"] = ",".join(filter(None, (os.environ.get("PYTHONWARNINGS"), "ignore:resource_tracker")))
     with locked(directory):
         remove_left_over(directory)
         try:
-            yield
+            with signals_passed_on(lambda: any(map(is_locked, directory.iterdir()))) if workers else nullcontext():
+                yield
         except BaseException as error:
             with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
                 _report(directory, with_table, with_figure and isinstance(error, Exception))

@@ -57,6 +57,21 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
         lock.release()
 
 
+def is_locked(directory: Path) -> bool:
+    """Whether a process has `directory` to itself at this moment."""
+    if not (directory / LOCK).exists():
+        return False
+    lock = FileLock(directory / LOCK, fallback_to_soft=False)
+    try:
+        lock.acquire(blocking=False)
+    except Timeout:
+        return True
+    except OSError:  # a file system without locks
+        return False
+    lock.release()
+    return False
+
+
 def _acquire(lock: FileLock, directory: Path, wait: bool) -> None:
     try:
         lock.acquire(blocking=False)

@@ -66,10 +66,10 @@ class RunRecord:
         remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS):
             (directory / name).unlink(missing_ok=True)
-        with written_whole(directory / CONFIG) as temporary:
-            OmegaConf.save(OmegaConf.create(resolved), temporary)
+        record = cls(directory, asked, choices, inputs, provenance)
+        record._write_config()
         _reset_peak_memory()
-        return cls(directory, asked, choices, inputs, provenance)
+        return record
 
     def write(
         self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None
@@ -88,6 +88,8 @@ class RunRecord:
         scene, attempt = result.scene, _Attempts(result.stopped_by)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
+        if not (self.directory / CONFIG).exists():  # somebody has deleted the directory meanwhile
+            attempt(self._write_config)
         attempt(write_tum, self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
@@ -114,6 +116,10 @@ class RunRecord:
             attempt(self._write_partial, sequence, figures, attempt.fault)
         self._announce(title, labels if found is not None else {}, figures, attempt.fault)
         return attempt.fault
+
+    def _write_config(self) -> None:
+        with written_whole(self.directory / CONFIG) as temporary:
+            OmegaConf.save(OmegaConf.create(dict(self.config)), temporary)
 
     def _metrics(self, sequence: RGBDSequence, figures: Metrics) -> Metrics:
         return {

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import sys
 import threading
 from dataclasses import dataclass, field, replace
 
@@ -298,3 +299,8 @@ def test_quiet_when_not_a_terminal(room: CornerRoom, capfd: pytest.CaptureFixtur
     logging.getLogger("framework").setLevel(logging.INFO)
     pipeline().run(room)
     assert capfd.readouterr() == ("", "")
+
+
+def test_a_program_without_a_console_maps(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "stderr", None)  # as under pythonw
+    assert pipeline().run(room).frames == len(room)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -104,6 +105,17 @@ def test_a_fault_of_a_stage_leaves_a_partial_record(tmp_path: Path, kind: str, s
     assert said in str(left["partial"])
     assert left["frames"] in (3, 4)  # the detector fails before the frame is taken, masks when they are lifted
     assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
+
+
+def test_a_folder_that_is_deleted_meanwhile_is_made_again(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *ENDLESS, "dataset.frames=100", f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    config = (place / "config.yaml").read_bytes()
+    shutil.rmtree(place)
+    assert end(process)[0] == 0
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.json"}
+    assert (place / "config.yaml").read_bytes() == config
 
 
 def test_a_fault_before_anything_is_mapped_leaves_nothing_to_keep(tmp_path: Path) -> None:

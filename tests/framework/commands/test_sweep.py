@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -21,6 +22,7 @@ from framework.configs import one_line
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.records.provenance import config_hash
+from framework.records.run_record import MAPPED
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 FAILED = "error: a run failed: dataset tests.scenes.corner_room.CornerRoom: frames"
@@ -173,6 +175,52 @@ def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Sig
     assert done.returncode == 128 + told
     assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
     assert not psutil.wait_procs(family, timeout=10)[1]
+
+
+ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=100000")
+
+
+@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("all_at_once", [False, True])
+def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
+    tmp_path: Path, told: signal.Signals, all_at_once: bool
+) -> None:
+    """A terminal sends Ctrl-C to the workers, too; `kill` does not."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2,3", *ENDLESS, "fuser.note=${seed}.note")
+    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == 2, process)
+    if all_at_once:
+        os.killpg(process.pid, told)
+    else:
+        process.send_signal(told)
+    done = end(process)
+    assert done.returncode == 128 + told
+    assert done.stderr.count("ending once the runs in work have left their records; a second time ends at once") == 1
+    assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
+    assert "Traceback" not in done.stderr
+    partial = list((tmp_path / PLACE).glob("*/metrics.partial.json"))
+    assert len(partial) == 2
+    for file in partial:
+        assert json.loads(file.read_text())["partial"] == "ended by SIGTERM"
+        assert {path.name for path in file.parent.iterdir()} >= set(MAPPED)
+
+
+def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    slow_record = ("fuser.slow_save_s=100", "fuser.note=${seed}.note")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1", *ENDLESS, *slow_record)
+    wait_until(lambda: list(tmp_path.glob("*.note")), process)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    wait_until(lambda: list((tmp_path / PLACE).glob("*/mesh.ply")), process)
+    process.send_signal(signal.SIGINT)
+    sent = time.monotonic()
+    done = end(process)
+    assert time.monotonic() - sent < 15
+    assert done.returncode == 128 + signal.SIGINT
+    assert not psutil.wait_procs(family, timeout=10)[1]
+    [partial] = (tmp_path / PLACE).glob("*/metrics.partial.json")
+    assert json.loads(partial.read_text())["frames"] > 0
 
 
 def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) -> None:

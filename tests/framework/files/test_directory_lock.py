@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.files.directory_lock import locked, new_directory
+from framework.files.directory_lock import is_locked, locked, new_directory
 
 
 def test_the_second_is_told_who_has_it(tmp_path: Path) -> None:
@@ -23,6 +23,14 @@ def test_the_second_is_told_who_has_it(tmp_path: Path) -> None:
         pytest.fail("two are in one place")
     with locked(place):
         pass
+
+
+def test_it_is_seen_from_outside_whether_somebody_has_it(tmp_path: Path) -> None:
+    assert not is_locked(tmp_path)
+    assert not list(tmp_path.iterdir())
+    with locked(tmp_path):
+        assert is_locked(tmp_path)
+    assert not is_locked(tmp_path)
 
 
 def test_an_error_gives_it_back(tmp_path: Path) -> None:
