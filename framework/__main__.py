@@ -14,6 +14,7 @@ COMMANDS = {
     "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
     "ranks": "whether the rows of an experiment rank alike in several places: Spearman's rho",
     "figures": "run records below a folder become the paper's figures",
+    "check": "looks whether a recording will map, and says what to set where it will not",
     "evaluate": "evaluates stored runs anew, without running them again",
     "detect": "writes a video's detections as a COCO result file",
     "show-refinement": "draws one frame's masks before and after refinement",

@@ -58,6 +58,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     The first signal ends it after the frame, or the record, that is in work, the second one at once.
     """
     from framework.api import pipeline_of  # here: a misspelt name is answered before these load
+    from framework.checking.recording_check import warn_of_poses
     from framework.detection.cache import cache_metrics
     from framework.interfaces import RGBDSequence
     from framework.records.run_record import RunRecord, reason
@@ -70,6 +71,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)
+    warn_of_poses(sequence)
     with signals_deferred(*ENDING) as interruption:
         result = pipeline.run_to_any_end(sequence)
         with interruption.second_ends_at_once("once the record is written"):

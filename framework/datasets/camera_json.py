@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.data import Camera
-from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.reading import COARSEST_DEPTH, FINEST_DEPTH
 from framework.datasets.undistortion import Distortion
 from framework.errors import DataError
 from framework.files.json_file import read_json

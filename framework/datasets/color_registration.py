@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from framework.data import MOST_PIXELS, Camera, UInt8, UInt16
-from framework.datasets.recording import StoredImages
+from framework.datasets.stored_frames import StoredImages
 from framework.errors import DataError, FrameError
 
 LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp

@@ -5,78 +5,27 @@ from __future__ import annotations
 import logging
 import math
 from abc import abstractmethod
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
+from framework.data import Camera, Float32, Frame, FrameTruth
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
+from framework.datasets.reading import DepthReading, PoseReading
+from framework.datasets.stored_frames import RecordedFrame
 from framework.datasets.undistortion import Distortion, Undistortion
 from framework.errors import ConfigError, DataError, FrameError
-from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
 FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
 FRAME_RATE = 30.0  # Hz, of recordings without timestamps, or with some that cannot be
-COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # units a metre that stored depth may have; most sensors' have 1000
 NO_READING = 65535  # uint16 that several sensors write instead of 0
 
 log = logging.getLogger(__name__)
-
-
-class StoredImages(Protocol):
-    """The two images of a frame, registered to each other and not read yet. Reading raises FrameError."""
-
-    @property
-    def color_name(self) -> Path | str:
-        """For messages: the file, and where in it."""
-
-    @property
-    def depth_name(self) -> Path | str:
-        """Likewise."""
-
-    def color(self) -> UInt8:
-        """(H, W, 3) RGB."""
-
-    def depth(self) -> UInt16:
-        """(H, W) in the recording's units; 0 or 65535 = no reading."""
-
-
-@dataclass(frozen=True)
-class ImageFiles:
-    """Images in files of their own, JPEG or PNG."""
-
-    color_name: Path
-    depth_name: Path
-
-    def color(self) -> UInt8:
-        return read_color(self.color_name)
-
-    def depth(self) -> UInt16:
-        return read_uint16(self.depth_name)
-
-
-@dataclass(frozen=True)
-class RecordedFrame:
-    """One frame of a recording, images not read yet."""
-
-    images: StoredImages
-    timestamp: float  # s
-    T_world_camera: Float64 | None = None  # (4, 4), None = not known
-    fault: str = ""  # why the frame cannot be used, as where its pose is no pose; "" = it can
-
-    @classmethod
-    def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
-        """The frame with what `pose` returns; the DataError that it raises where there is no pose is its fault."""
-        try:
-            return cls(images, timestamp, pose())
-        except DataError as error:
-            return cls(images, timestamp, fault=str(error))
 
 
 @dataclass(frozen=True)
@@ -106,6 +55,8 @@ class Recording(RGBDSequence):
     share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
     seed: int = 0  # of the share
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
+    pose_reading: PoseReading = field(default_factory=PoseReading)
+    depth_reading: DepthReading = field(default_factory=DepthReading)
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.share)
@@ -117,15 +68,19 @@ class Recording(RGBDSequence):
             project = "" if self.root.is_absolute() else ", neither here nor in a checkout of the project"
             raise DataError(f"dataset.root: the folder {self.folder} does not exist{project}")
         self.name = self.folder.resolve().name
-        contents = self.open()
-        frames = [_within_reach(recorded) for recorded in contents.frames]
-        self.contents = replace(contents, frames=_in_order_of_time(self.name, frames))
+        self.contents = self._read(self.open())
         self.camera = self.contents.camera
-        self.lens = Undistortion(self.camera, contents.distortion) if contents.distortion else None
+        self.lens = Undistortion(self.camera, self.contents.distortion) if self.contents.distortion else None
         self.chosen = choose_frames(
             len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
         )
         self._check_first_image()
+
+    def _read(self, stored: Contents) -> Contents:
+        """What is stored, as it is meant."""
+        posed = [_posed(recorded, self.pose_reading) for recorded in stored.frames]
+        frames = self.depth_reading.frames(_in_order_of_time(self.name, posed))
+        return replace(stored, frames=frames, depth_scale=self.depth_reading.depth_scale or stored.depth_scale)
 
     @abstractmethod
     def open(self) -> Contents:
@@ -193,13 +148,14 @@ class Recording(RGBDSequence):
                 raise DataError(f"{name} is {_size(shape)}, but {self._expected_size()}")
 
 
-def _within_reach(recorded: RecordedFrame) -> RecordedFrame:
-    """The frame, with a fault where its pose is farther off than anything is mapped."""
+def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
+    """The frame with the pose that is meant, or with a fault where that is farther off than anything is mapped."""
     if recorded.T_world_camera is None:
         return recorded
-    distance = math.hypot(*recorded.T_world_camera[:3, 3])
+    T_world_camera = reading.pose(recorded.T_world_camera)
+    distance = math.hypot(*T_world_camera[:3, 3])
     if distance <= FARTHEST:
-        return recorded
+        return replace(recorded, T_world_camera=T_world_camera)
     fault = f"{recorded.images.color_name}: its pose is {distance:.6g} m from the origin, more than {FARTHEST:g}"
     return RecordedFrame(recorded.images, recorded.timestamp, fault=fault)
 

@@ -16,7 +16,8 @@ from pathlib import Path
 
 from framework.data import Camera
 from framework.datasets.camera_json import camera_of, read_json_object
-from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
+from framework.datasets.recording import FRAME_RATE, Contents, Recording, numbered_images
+from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import DataError
 from framework.files.matrix_file import PrintedMatrix, read_matrix_lines
 

@@ -25,8 +25,9 @@ import numpy as np
 
 from framework.data import FrameTruth, Int32, SceneTruth
 from framework.datasets.camera_json import DISTORTION, camera_of, check_keys, distortion_of, read_json_object
-from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, Recording, numbered_images
+from framework.datasets.recording import FRAME_RATE, Contents, Recording, numbered_images
 from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
+from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import DataError, FrameError
 from framework.files.image_files import read_uint16
 from framework.files.number_lines import SHOWN

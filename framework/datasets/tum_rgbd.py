@@ -24,7 +24,8 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float64
-from framework.datasets.recording import Contents, ImageFiles, RecordedFrame, Recording
+from framework.datasets.recording import Contents, Recording
+from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.datasets.undistortion import Distortion
 from framework.errors import ConfigError, DataError
 from framework.files.number_lines import SHOWN, read_lines

@@ -21,7 +21,7 @@ LAYERS = [
     ["rendering"],
     ["detection", "mapping", "refinement", "tracking"],
     ["rivals", "datasets"],
-    ["synthetic"],
+    ["checking", "synthetic"],
     ["journal"],
     ["pipeline"],
     ["evaluation"],

@@ -160,6 +160,7 @@ FAULTY = {
     "tables": ["nowhere"],
     "ranks": ["nowhere", "elsewhere"],
     "figures": ["nowhere"],
+    "check": ["out=check.jpg"],
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],

@@ -27,7 +27,7 @@ from framework.data import Array, Camera
 from framework.datasets.color_registration import ColorRegistration, RegisteredImages
 from framework.datasets.labeled_mesh import LabeledMesh
 from framework.datasets.labeled_recording import LabeledRecording, mesh_of
-from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
+from framework.datasets.recording import FRAME_RATE, Contents, numbered_images
 from framework.datasets.scannet.scannet_annotation import (
     FIRST_LABEL_TABLE,
     LABEL_TABLE,
@@ -35,6 +35,7 @@ from framework.datasets.scannet.scannet_annotation import (
     read_labeled_mesh,
 )
 from framework.datasets.scannet.sens_file import SensFile, open_sens
+from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import DataError, FrameError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import PrintedMatrix, read_matrix

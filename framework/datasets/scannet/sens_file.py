@@ -26,7 +26,7 @@ from typing import BinaryIO
 import numpy as np
 
 from framework.data import MOST_PIXELS, Camera, Float64, UInt8, UInt16
-from framework.datasets.recording import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.reading import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, FrameError
 from framework.files.image_files import decode_color
 from framework.files.matrix_file import PrintedMatrix

@@ -25,11 +25,12 @@ import numpy as np
 from framework.data import Camera
 from framework.datasets.labeled_mesh import LabeledMesh
 from framework.datasets.labeled_recording import LabeledRecording, mesh_of
-from framework.datasets.recording import FRAME_RATE, Contents, ImageFiles, RecordedFrame, numbered_images
+from framework.datasets.recording import FRAME_RATE, Contents, numbered_images
 from framework.datasets.scenenn.intrinsics import read_intrinsics
 from framework.datasets.scenenn.scenenn_annotation import Annotated, read_annotation
 from framework.datasets.scenenn.timestamps import read_timestamps
 from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
+from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError, FrameError
 from framework.files.ply import read_ply

@@ -1,0 +1,1 @@
+"""Whether a recording can be mapped, and which of its conventions stands in the way."""

@@ -1,0 +1,162 @@
+"""The picture of a checked recording: what lies on what, and by how much which reading misses."""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+
+import cv2
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from framework.checking.finding import Verdict
+from framework.checking.matched_pairs import MatchedPair
+from framework.checking.pose_fit import PoseFit, PoseJudgement, motion_of
+from framework.checking.recording_check import RecordingCheck
+from framework.checking.registration import depth_edges
+from framework.data import Float64, Frame, UInt8
+from framework.datasets.reading import CameraAxes, PoseKind, PoseReading, QuaternionOrder
+from framework.files.whole_files import written_whole
+from framework.geometry import back_project, project, transform
+
+SIZE_IN, DPI = (15.0, 9.4), 100
+TITLE_PT, TEXT_PT = 10.0, 9.0
+LINE = 180  # letters of a line of findings
+COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.FAULT: "#cf222e"}
+CHOSEN, OTHER = "#1a7f37", "#b0b6be"
+
+
+def write_check(path: Path, check: RecordingCheck) -> None:
+    """Writes the picture as a PNG, whole or not at all."""
+    figure = Figure(SIZE_IN, facecolor="white")
+    grid = figure.add_gridspec(
+        3, 4, height_ratios=(1, 1, 0.75), left=0.02, right=0.98, top=0.9, bottom=0.01, wspace=0.16
+    )
+    figure.suptitle(check.summary, fontsize=TITLE_PT + 2, x=0.02, ha="left")
+    frame = check.pair.first if check.pair is not None else check.frames[len(check.frames) // 2]
+    _image(figure.add_subplot(grid[0, 0]), f"colour of frame {frame.index}", frame.color)
+    _depth(figure.add_subplot(grid[0, 1]), frame)
+    _image(figure.add_subplot(grid[0, 2]), "edges of its depth (red) on colour", _edges_on_color(frame))
+    _delays(figure.add_subplot(grid[0, 3]), check)
+    _warped(figure.add_subplot(grid[1, 0]), "as it is read", check.pair, check.poses.given)
+    if check.poses.best is not None:
+        _warped(figure.add_subplot(grid[1, 1]), "as it fits best", check.pair, check.poses.best)
+    _readings(figure.add_subplot(grid[1, 2:]), check.poses)
+    _findings(figure.add_subplot(grid[2, :]), check)
+    with written_whole(path) as temporary:
+        figure.savefig(temporary, dpi=DPI)
+
+
+def _image(axes: Axes, title: str, image: UInt8) -> None:
+    axes.imshow(image)
+    axes.set_title(title, fontsize=TITLE_PT)
+    axes.set_xticks([])
+    axes.set_yticks([])
+
+
+def _depth(axes: Axes, frame: Frame) -> None:
+    shown = axes.imshow(np.ma.masked_equal(frame.depth, 0), cmap="turbo_r")
+    axes.set_facecolor("black")
+    axes.set_title("depth, m (black: no reading)", fontsize=TITLE_PT)
+    axes.set_xticks([])
+    axes.set_yticks([])
+    assert axes.figure is not None
+    axes.figure.colorbar(shown, ax=axes, fraction=0.035, pad=0.02).ax.tick_params(labelsize=TEXT_PT)
+
+
+def _edges_on_color(frame: Frame) -> UInt8:
+    gray = cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY)
+    shown = np.repeat((96 + gray // 2 + gray // 8)[:, :, None], 3, axis=2)
+    thick = cv2.dilate(depth_edges(frame.depth).astype(np.uint8), np.ones((2, 2), np.uint8)) > 0
+    shown[thick] = (220, 20, 30)
+    return np.asarray(shown, np.uint8)
+
+
+def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | None) -> None:
+    """A frame in red, and where its points lie in its neighbour, in cyan: what fits is grey."""
+    if pair is None:
+        _say(axes, "no two frames show enough in common")
+        return
+    if fit is None:
+        T_second_first, factor, title = pair.T_second_first, 1.0, "by the images alone"
+    else:
+        T_second_first, factor = motion_of(pair, fit.reading), fit.depth_factor
+    title = f"{title}: frame {pair.first.index} red,\n{pair.second.index} moved into it cyan, grey = they fit"
+    _image(axes, title, _moved(pair, T_second_first, factor))
+
+
+def _moved(pair: MatchedPair, T_second_first: Float64, factor: float) -> UInt8:
+    frame = pair.first
+    v, u = np.nonzero(frame.depth > 0)
+    points = back_project(
+        frame.camera, np.stack([u, v], axis=1).astype(np.int32), frame.depth[v, u] * np.float32(factor)
+    )
+    moved = transform(T_second_first, points)
+    with np.errstate(all="ignore"):
+        at = np.where(moved[:, 2:] > 0, project(pair.second.camera, moved), -1.0)
+    where = np.full((*frame.depth.shape, 2), -1.0, np.float32)
+    where[v, u] = np.nan_to_num(at, nan=-1.0, posinf=-1.0, neginf=-1.0)
+    gray = cv2.cvtColor(pair.second.color, cv2.COLOR_RGB2GRAY)
+    other = cv2.remap(gray, where[..., 0], where[..., 1], cv2.INTER_LINEAR, borderValue=0.0)
+    own = np.where(frame.depth > 0, cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY), 0)
+    return np.stack([own, other, other], axis=2).astype(np.uint8)
+
+
+def _readings(axes: Axes, poses: PoseJudgement) -> None:
+    """How far each reading of the poses leaves points from where they belong."""
+    if poses.best is None or not poses.others:
+        _say(axes, f"poses: {poses.findings[0].text}")
+        return
+    fits = sorted(poses.others, key=_error)
+    chosen = [fit.reading == poses.best.reading for fit in fits]
+    axes.barh(range(len(fits)), [_error(fit) for fit in fits], color=[CHOSEN if best else OTHER for best in chosen])
+    for k, fit in enumerate(fits):
+        name = f" {_short(fit.reading)}: {_error(fit):.1f}"
+        axes.text(0, k, name, fontsize=TEXT_PT - 1, va="center")
+    axes.set_yticks([])
+    axes.invert_yaxis()
+    axes.tick_params(axis="x", labelsize=TEXT_PT)
+    axes.set_title("how far each reading of the poses leaves points from where they belong, px", fontsize=TITLE_PT)
+
+
+def _delays(axes: Axes, check: RecordingCheck) -> None:
+    """How well depth edges lie on colour edges, by which frame's depth is taken."""
+    if not check.by_delay:
+        _say(axes, "too few edges to compare colour and depth")
+        return
+    best = max(agreement.strength for agreement in check.by_delay)
+    delays = [agreement.delay for agreement in check.by_delay]
+    strengths = [agreement.strength for agreement in check.by_delay]
+    axes.bar(delays, strengths, color=[CHOSEN if strength == best else OTHER for strength in strengths])
+    axes.set_xticks(delays)
+    axes.tick_params(labelsize=TEXT_PT)
+    axes.set_ylim(0, 1.1 * max(best, 1e-3))
+    axes.set_title("how well the depth so many frames\nlater fits to colour", fontsize=TITLE_PT)
+
+
+def _findings(axes: Axes, check: RecordingCheck) -> None:
+    axes.axis("off")
+    place = 1.0
+    for finding in check.findings:
+        lines = textwrap.wrap(str(finding), LINE, subsequent_indent=" " * 7)
+        axes.text(
+            0, place, "\n".join(lines), color=COLORS[finding.verdict], fontsize=TEXT_PT, va="top", family="monospace"
+        )
+        place -= 0.1 * len(lines) + 0.02
+
+
+def _say(axes: Axes, text: str) -> None:
+    axes.axis("off")
+    axes.text(0.5, 0.5, "\n".join(textwrap.wrap(text, 44)), ha="center", va="center", fontsize=TITLE_PT)
+
+
+def _error(fit: PoseFit) -> float:
+    return float(np.median(fit.errors))
+
+
+def _short(reading: PoseReading) -> str:
+    parts = [reading.pose_kind.value]
+    parts += [reading.camera_axes.name] if reading.camera_axes is not CameraAxes.OPENCV else []
+    parts += ["w x y z"] if reading.quaternion_order is not QuaternionOrder.XYZW else []
+    return ", ".join(parts) if reading != PoseReading(PoseKind.T_WORLD_CAMERA) else "T_world_camera, OpenCV"

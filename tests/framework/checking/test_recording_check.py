@@ -1,0 +1,261 @@
+"""What a check says of real recordings: nothing where they are sound, and what to set where one convention is not."""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.checking.finding import Finding, Verdict
+from framework.checking.recording_check import check, warn_of_poses
+from framework.data import Float64, Frame
+from framework.datasets.reading import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
+from framework.datasets.recording import Recording
+from framework.datasets.replica_nice_slam import ReplicaNiceSlam
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.datasets.scannet.scannet import ScanNet
+from framework.datasets.seven_scenes import SevenScenes
+from framework.datasets.tum_rgbd import TumRgbd
+from framework.errors import DataError, FrameError
+from framework.geometry import inverse
+from framework.interfaces import RGBDSequence
+from tests.framework.checking.damaged import write_damaged
+
+FARTHEST = 5.0  # m, that is mapped
+DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
+
+
+def in_axes(axes: CameraAxes) -> Callable[[Float64], Float64]:
+    """The pose of the same camera, of which other axes are meant."""
+    T_axes_camera = np.eye(4)
+    T_axes_camera[:3, :3] = axes.R_axes_camera
+    return lambda T_world_camera: T_world_camera @ inverse(T_axes_camera)
+
+
+def scalar_first(T: Float64) -> Float64:
+    """What x y z w makes of a file with w x y z."""
+    misread = T.copy()
+    x, y, z, w = Rotation.from_matrix(T[:3, :3]).as_quat()
+    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()
+    return misread
+
+
+def in_millimetres(T: Float64) -> Float64:
+    moved = T.copy()
+    moved[:3, 3] *= 1000
+    return moved
+
+
+def both(T: Float64) -> Float64:
+    return inverse(in_axes(CameraAxes.OPENGL)(T))
+
+
+INVERTED = {"pose": inverse}
+OPENGL = {"pose": in_axes(CameraAxes.OPENGL)}
+ROS = {"pose": in_axes(CameraAxes.ROS)}
+KIND, AXES, SCALE, DELAY = (f"dataset.{name}=" for name in ("pose_kind", "camera_axes", "depth_scale", "depth_delay"))
+TEN: list[tuple[str, Mapping[str, Any], str]] = [
+    ("redkitchen", INVERTED, KIND + "T_CAMERA_WORLD"),
+    ("redkitchen", ROS, AXES + "ROS"),
+    ("redkitchen", {"depth_late": 3}, DELAY + "3"),
+    ("redkitchen", {"scale": 10.0}, SCALE + "1000"),
+    ("replica_floor2", OPENGL, AXES + "OPENGL"),
+    ("replica_floor2", {"scale": 0.001}, SCALE + "1000"),
+    ("replica_floor2", {"depth_late": -2}, DELAY + "-2"),
+    ("freiburg1", {"scale": 0.2}, SCALE + "5000"),
+    ("freiburg1", {"pose": both}, f"{KIND}T_CAMERA_WORLD {AXES}OPENGL"),
+    ("freiburg1", {"scale": 0.1}, SCALE + "5000"),
+]
+
+
+def shared_recording(shared_data: Path, name: str) -> Recording:
+    if name == "freiburg1":
+        return TumRgbd(shared_data / "tum_fr1_rpy_a", scene="rgbd_dataset_freiburg1_rpy")
+    return RgbdFolder(shared_data / name)
+
+
+def settings(findings: tuple[Finding, ...]) -> list[str]:
+    return [finding.setting for finding in findings if finding.verdict is Verdict.FAULT]
+
+
+@pytest.mark.parametrize(("name", "damage", "setting"), TEN)
+def test_ten_damaged_recordings(
+    shared_data: Path, tmp_path: Path, name: str, damage: Mapping[str, Any], setting: str
+) -> None:
+    place = write_damaged(tmp_path / "damaged", shared_recording(shared_data, name), **damage)
+    assert settings(check(RgbdFolder(place), FARTHEST).findings) == [setting]
+
+
+@pytest.mark.parametrize(
+    ("damage", "setting"),
+    [
+        (INVERTED, KIND + "T_CAMERA_WORLD"),
+        (OPENGL, AXES + "OPENGL"),
+        (ROS, AXES + "ROS"),
+        ({"pose": scalar_first}, "dataset.quaternion_order=WXYZ"),
+        ({"pose": in_millimetres}, "dataset.pose_unit=0.001"),
+        ({"depth_late": 2}, DELAY + "2"),
+        ({"depth_late": -1}, DELAY + "-1"),
+        ({"scale": 0.01}, SCALE + "5000"),
+    ],
+)
+def test_the_desk_with_one_convention_changed(tmp_path: Path, damage: Mapping[str, Any], setting: str) -> None:
+    place = write_damaged(tmp_path / "damaged", DESK, **damage)
+    assert settings(check(RgbdFolder(place), FARTHEST).findings) == [setting]
+
+
+def test_the_originals_are_sound(shared_data: Path) -> None:
+    originals = shared_data / "originals"
+    recordings: list[Recording] = [
+        DESK,
+        *(
+            shared_recording(shared_data, name)
+            for name in ("redkitchen", "replica_floor2", "freiburg1", "mit76", "redwood5")
+        ),
+        ScanNet(shared_data / "scannet_scene0000", scene="scene0000_00"),
+        ReplicaNiceSlam(originals / "replica_nice_slam", scene="office0"),
+        SevenScenes(originals / "seven_scenes" / "redkitchen", scene="seq-01"),
+    ]
+    for recording in recordings:
+        found = check(recording, FARTHEST)
+        assert not found.faults, recording.name
+        assert found.findings[0].subject == "depth"
+
+
+def test_what_is_asked_for_is_what_is_checked(tmp_path: Path) -> None:
+    """The parameter that was named makes the recording sound; one more is a fault again."""
+    place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1)
+    reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL)
+    depth = DepthReading(depth_scale=5000, depth_delay=1)
+    assert not check(RgbdFolder(place, pose_reading=reading, depth_reading=depth), FARTHEST).faults
+    wrong = replace(reading, quaternion_order=QuaternionOrder.WXYZ)
+    found = check(RgbdFolder(place, pose_reading=wrong, depth_reading=replace(depth, depth_delay=3)), FARTHEST)
+    assert settings(found.findings) == ["dataset.quaternion_order=XYZW", DELAY + "1"]
+
+
+def test_poses_of_another_walk_fit_in_no_axes(tmp_path: Path) -> None:
+    turned = iter(range(1000))
+
+    def another(_: Float64) -> Float64:
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_rotvec((0, 0, 0.5 * next(turned))).as_matrix()
+        return T
+
+    [fault] = check(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=another)), FARTHEST).faults
+    assert fault.subject == "poses"
+    assert "in any axes" in fault.text
+    assert "tracker=voxel_hashing_icp" in fault.setting
+
+
+@dataclass
+class MovedDepth(RGBDSequence):
+    """The desk with depth zoomed and moved by an affine map (2, 3), as from a camera beside that of the colours."""
+
+    moved: Float64
+
+    def __post_init__(self) -> None:
+        self.camera, self.name = DESK.camera, "moved"
+
+    def __len__(self) -> int:
+        return len(DESK)
+
+    def __getitem__(self, k: int) -> Frame:
+        frame = DESK[k]
+        size = frame.depth.shape[::-1]
+        return replace(frame, depth=cv2.warpAffine(frame.depth, self.moved, size, flags=cv2.INTER_NEAREST))
+
+
+@pytest.mark.parametrize(("zoom", "x", "y"), [(1.0, 12, 0), (1.0, -20, 8), (1.11, 0, 0), (0.9, 14, -6)])
+def test_depth_that_is_not_registered_is_told(zoom: float, x: float, y: float) -> None:
+    moved = cv2.getRotationMatrix2D((319.5, 239.5), 0, zoom)
+    moved[:, 2] += (x, y)
+    [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).faults if fault.subject == "colour and depth"]
+    assert "not registered" in fault.text
+    if zoom == 1:
+        found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+) %", fault.text))
+        assert found_x == pytest.approx(-100 * x / 640, abs=0.4)  # % of the width, to move it back
+        assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
+
+
+@dataclass
+class Part(RGBDSequence):
+    """Some frames of the desk, without poses; what is changed in them."""
+
+    count: int
+    change: Callable[[Frame], Frame] = lambda frame: frame
+
+    def __post_init__(self) -> None:
+        self.camera, self.name = DESK.camera, "part"
+
+    def __len__(self) -> int:
+        return self.count
+
+    def __getitem__(self, k: int) -> Frame:
+        return self.change(replace(DESK[k], T_world_camera=None))
+
+    def has_poses(self) -> bool:
+        return False
+
+
+def verdicts(sequence: RGBDSequence) -> dict[str, Verdict]:
+    return {finding.subject: finding.verdict for finding in check(sequence, FARTHEST).findings}
+
+
+def test_a_single_frame_and_frames_without_poses_can_be_checked() -> None:
+    fine = dict.fromkeys(("depth", "poses", "sharpness"), Verdict.FINE)
+    assert verdicts(Part(1)) == fine | dict.fromkeys(("motion", "colour and depth"), Verdict.UNKNOWN)
+    assert verdicts(Part(20)) == fine | dict.fromkeys(("motion", "colour and depth"), Verdict.FINE)
+
+
+def test_what_is_seen_in_single_frames() -> None:
+    def blurred(frame: Frame) -> Frame:
+        return replace(frame, color=cv2.GaussianBlur(frame.color, (0, 0), 12))
+
+    def gray(frame: Frame) -> Frame:
+        return replace(frame, color=np.full_like(frame.color, 128))
+
+    def nothing(frame: Frame) -> Frame:
+        return replace(frame, depth=np.zeros_like(frame.depth))
+
+    def sparse(frame: Frame) -> Frame:
+        depth = frame.depth.copy()
+        depth[::2] = depth[:, ::2] = 0
+        return replace(frame, depth=depth)
+
+    assert verdicts(Part(8, blurred))["sharpness"] is Verdict.NOTE
+    assert verdicts(Part(8, gray))["motion"] is Verdict.NOTE
+    assert verdicts(Part(8, gray))["colour and depth"] is Verdict.UNKNOWN
+    assert verdicts(Part(8, nothing))["depth"] is Verdict.FAULT
+    assert verdicts(Part(8, sparse))["depth"] is Verdict.NOTE
+
+
+def test_frames_that_cannot_be_read_are_told() -> None:
+    def unreadable(frame: Frame) -> Frame:
+        if frame.index % 3 == 0:
+            raise FrameError("torn")
+        return frame
+
+    def none(_: Frame) -> Frame:
+        raise FrameError("torn")
+
+    assert verdicts(Part(30, unreadable))["frames"] is Verdict.NOTE
+    with pytest.raises(DataError, match="can be read; the first: torn"):
+        check(Part(8, none), FARTHEST)
+
+
+def test_a_run_warns_of_what_a_glance_shows(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.WARNING)
+    warn_of_poses(DESK)
+    warn_of_poses(Part(20))
+    assert not caplog.text
+    warn_of_poses(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=inverse)))
+    assert "poses: at a glance, they are T_camera_world" in caplog.text
+    assert "`python -m framework check` looks closer" in caplog.text
