@@ -19,7 +19,7 @@ from framework.detection.fingerprint import fingerprint
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.files.hashing import add_array
-from framework.files.whole_files import written_whole
+from framework.files.whole_files import is_there, read_bytes, written_whole
 from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)
@@ -27,6 +27,7 @@ log = logging.getLogger(__name__)
 FORMAT = 2  # of the entries: another one makes other keys, so that no entry is ever misread
 CHECKSUM_BYTES = 32  # SHA-256 of an entry's place and content, before the content
 SUFFIX = ".detections"
+LARGEST_ENTRY = 2**30  # bytes; a thousand masks of 1 MB of run lengths
 FRAME_FIELDS = tuple(field.name for field in fields(Frame))
 KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored as they are
 
@@ -106,12 +107,12 @@ class CachedDetector(Detector):
         return {"detection_cache.hits": self.hits, "detection_cache.misses": self.misses}
 
     def _read(self, path: Path) -> Detections | None:
-        try:
-            data = path.read_bytes()
-        except FileNotFoundError:
+        if not is_there(path):
             return None
-        except OSError as error:
-            log.warning("detection cache: %s could not be read (%s): detected again", path, error.strerror)
+        try:
+            data = read_bytes(path, LARGEST_ENTRY)
+        except DataError as error:
+            log.warning("detection cache: %s: detected again", error)
             return None
         content = data[CHECKSUM_BYTES:]
         if _checksum(path, content) != data[:CHECKSUM_BYTES]:
