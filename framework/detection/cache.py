@@ -21,6 +21,7 @@ from framework.errors import ConfigError, DataError
 from framework.files.hashing import add_array
 from framework.files.whole_files import is_there, read_bytes, written_whole
 from framework.interfaces import Detector
+from framework.parameters import checked_path
 
 log = logging.getLogger(__name__)
 
@@ -164,8 +165,8 @@ def cache_metrics(detector: Detector) -> Mapping[str, int]:
 
 def cache_directory(chosen: str | None) -> Path:
     """The folder chosen, or the one that the system has for such things."""
-    if chosen:
-        return Path(chosen).expanduser().absolute()
+    if chosen is not None:
+        return checked_path("detection_cache_dir", chosen)
     import platformdirs
 
     return Path(platformdirs.user_cache_dir("instancemap", appauthor=False)) / "detections"

@@ -410,6 +410,12 @@ def test_off_is_the_detector_itself(off: str) -> None:
     assert cache_metrics(detector) == {}
 
 
+@pytest.mark.parametrize("chosen", ["7", "[a]", "''"])
+def test_a_folder_that_is_no_path_is_told(chosen: str) -> None:
+    with pytest.raises(ConfigError, match="detection_cache_dir must be a path; quote"):
+        with_cache(Noise(), config("detection_cache=read_write", f"detection_cache_dir={chosen}"))
+
+
 def test_a_misspelt_mode_is_told() -> None:
     with pytest.raises(ConfigError, match="detection_cache must be one of off, read_write, read_only, found 'on'"):
         with_cache(Noise(), config("detection_cache=on"))
