@@ -139,6 +139,12 @@ def test_any_map_is_read_back(fuser: str, room: CornerRoom, tmp_path: Path) -> N
     assert list(scene.instances()) == list(made.scene.instances())
 
 
+@pytest.mark.parametrize("place", [None, 7])
+def test_a_place_that_is_no_path_is_told(place: Any) -> None:
+    with pytest.raises(DataError, match=f"a map is saved to a path, found {place}"):
+        Mapper(*STAGES).scene.save(place)
+
+
 @pytest.mark.parametrize("content", [b"", b"PK", b"[]"])
 def test_what_is_no_map_is_told_in_one_line(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "map.npz").write_bytes(content)

@@ -255,7 +255,7 @@ def test_names_with_more_than_one_number(folder, names):
     for kind in ("color", "depth", "instance"):
         for k, name in enumerate(names):
             (folder / kind / f"{k:06d}.png").rename(folder / kind / f"{name}.png")
-    with pytest.raises(DataError, match="color: .* differ in more than one number"):
+    with pytest.raises(DataError, match=r"color: .* differ in more than one number"):
         RgbdFolder(folder)
 
 
