@@ -66,8 +66,7 @@ class RunRecord:
         remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS):
             (directory / name).unlink(missing_ok=True)
-        with written_whole(directory / CONFIG) as temporary:
-            OmegaConf.save(OmegaConf.create(resolved), temporary)
+        _write_config(directory / CONFIG, asked)
         _reset_peak_memory()
         return cls(directory, asked, choices, inputs, provenance)
 
@@ -83,9 +82,11 @@ class RunRecord:
         goes on, metrics.partial.json tells what there is: who is killed in the middle of it leaves a partial record.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        for name in MAPPED:  # of an earlier run into the same directory
-            (self.directory / name).unlink(missing_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
+        for name in MAPPED:  # of an earlier run into the same directory
+            attempt((self.directory / name).unlink, missing_ok=True)
+        if not (self.directory / CONFIG).exists():  # the directory was removed meanwhile
+            attempt(_write_config, self.directory / CONFIG, self.config)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
         attempt(write_tum, self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
@@ -164,6 +165,11 @@ class _Attempts:
             log.warning("%s", reason(error))
             self.fault = self.fault or error
             return None
+
+
+def _write_config(path: Path, config: Mapping[str, Any]) -> None:
+    with written_whole(path) as temporary:
+        OmegaConf.save(OmegaConf.create(dict(config)), temporary)
 
 
 def _found(scene: SceneMap) -> tuple[InstanceMesh, Mapping[int, Instance]]:
