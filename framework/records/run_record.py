@@ -28,7 +28,7 @@ from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
 from framework.records.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, METRICS, PARTIAL_METRICS
+from framework.records.stored_runs import CONFIG, MAPPED, METRICS, PARTIAL_METRICS
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 
@@ -36,9 +36,6 @@ log = logging.getLogger(__name__)
 
 LIKELY = 0.3  # confidence from which on an instance is in the picture and in what a run says; files have them all
 
-
-MAPPED = ("trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz", "overview.png")
-"""What is written of a map, in this order: on a disk that is full the small ones still find a place."""
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")

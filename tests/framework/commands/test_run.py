@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from framework.files.directory_lock import locked
-from framework.records.run_record import MAPPED
+from framework.records.stored_runs import MAPPED
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]

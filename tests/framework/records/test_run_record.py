@@ -25,8 +25,8 @@ from framework.records import provenance, run_record
 from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
 from framework.records.metrics import instance_metrics, run_metrics, trajectory_metrics
-from framework.records.run_record import MAPPED, RunRecord, headline
-from framework.records.stored_runs import read_record
+from framework.records.run_record import RunRecord, headline
+from framework.records.stored_runs import MAPPED, read_record
 from tests import registered
 from tests.scenes.corner_room import (
     CLASSES,
