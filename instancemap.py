@@ -20,6 +20,11 @@ What else a map does, also one that a run left behind:
     mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex
     view = scene.render(camera, T_world_camera)  # depth, normals, colour and instances, as the camera would see them
 
+A viewer in another thread looks at the map between two frames:
+
+    with mapper.lock:
+        mesh = mapper.scene.mesh()
+
 Metres, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
 pixel centres at integers; instance 0 = none. Every fault that is yours to mend is an InstanceMapError of one line.
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from omegaconf import DictConfig
 
@@ -58,9 +60,13 @@ class Mapper:
     The arguments are those of a run on the command line, with its defaults for what is recorded; `dataset` is left out,
     since the frames are yours, and `ahead` and `resume` mean nothing here. Raises ConfigError for a name or a value
     that there is not.
+
+    Several threads may share one: `add` and `instances` wait for each other. Whoever reads `scene` while another thread
+    may be in `add` holds `lock` meanwhile, `with mapper.lock: mesh = mapper.scene.mesh()`: half a frame may be in it.
     """
 
     scene: SceneMap  # the map: mesh(), render(), instances(), save()
+    lock: threading.RLock  # held while a frame is mapped
 
     def __init__(self, *overrides: str) -> None:
         for override in overrides:
@@ -74,6 +80,7 @@ class Mapper:
         warn_outside_domain(self.pipeline.detector, None)
         self.scene = self.pipeline.fuser.scene
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
+        self.lock = threading.RLock()
 
     def add(self, frame: Frame) -> Pose:
         """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
@@ -84,13 +91,22 @@ class Mapper:
         """
         if not isinstance(frame, Frame):
             raise DataError(f"Mapper.add takes an instancemap.Frame, found {type(frame).__name__}")
-        self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
-        self._journal.tracked.clear()
-        return self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
+        with self.lock:
+            self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
+            self._journal.tracked.clear()
+            return self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
 
     def instances(self) -> Mapping[int, Instance]:
         """The objects found so far, by id; `scene.classes` names their classes, `scene.mesh()` has their vertices."""
-        return self.scene.instances()
+        with self.lock:
+            return self.scene.instances()
+
+    def __getstate__(self) -> dict[str, Any]:
+        with self.lock:
+            return {name: value for name, value in vars(self).items() if name != "lock"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, lock=threading.RLock())
 
 
 def load_map(path: Path | str) -> SceneMap:

@@ -179,6 +179,8 @@ class Frame:
         # the kernels are compiled for this; a view such as bgr[..., ::-1], or what is read only, is copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))
+        if self.truth is not None and not isinstance(cast(object, self.truth), FrameTruth):
+            raise DataError(f"{where}truth must be a FrameTruth, found {type(self.truth).__name__}")
         if self.truth is not None and self.truth.shape != self.camera.shape:
             raise DataError(f"{where}truth.instance_ids must have shape {self.camera.shape}, found {self.truth.shape}")
 
@@ -363,6 +365,13 @@ def check_rigid(name: str, T: Float64) -> None:
     error = float(np.abs(R @ R.T - np.eye(3)).max())
     if error > ROTATION_TOLERANCE or np.linalg.det(R) < 0 or not np.allclose(T[3], (0, 0, 0, 1)):
         raise DataError(f"{name} is not a rigid transform: |R R^T - I| is {error:.2g}, det R {np.linalg.det(R):.2g}")
+
+
+def check_view(camera: Camera, T_world_camera: Float64) -> None:
+    """Raises DataError unless a map can be seen from there."""
+    if not isinstance(cast(object, camera), Camera):
+        raise DataError(f"camera must be a Camera, found {type(camera).__name__}")
+    check_rigid("T_world_camera", T_world_camera)
 
 
 def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: npt.DTypeLike) -> None:

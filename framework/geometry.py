@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
@@ -113,8 +114,10 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
     """Each mask's pixels that have a depth reading, as points in the world: eq. [5] of the paper.
 
     Overlapping masks give overlapping clusters. A mask without any reading gives an empty cluster, so that cluster k
-    always is detection k. Raises DataError for masks of another size than the frame.
+    always is detection k. Raises DataError for masks of another size than the frame, and for what are no Detections.
     """
+    if not isinstance(cast(object, detections), Detections):
+        raise DataError(f"frame {frame.index}: a detector must return Detections, found {type(detections).__name__}")
     height, width = frame.depth.shape
     if detections.masks.shape[1:] != (height, width):
         raise DataError(f"frame {frame.index}: masks must be {(height, width)}, found {detections.masks.shape[1:]}")

@@ -146,7 +146,7 @@ class SceneMap(ABC):
 
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """What `camera` would see of the map, by ray-casting."""
+        """What `camera` would see of the map, by ray-casting. Raises DataError where T_world_camera is no pose."""
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
         """The surface that `camera` would see where it reads `depth` (H, W) m: what a tracker compares a frame with.

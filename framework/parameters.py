@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from omegaconf import OmegaConf
@@ -26,6 +27,12 @@ def require(holds: bool, name: str, value: object, allowed: str) -> None:
     """Raises ConfigError unless the condition holds, in one line like "detector.nms must be in (0, 1], found 2"."""
     if not holds:
         raise ConfigError(f"{name} must be {allowed}, found {value}")
+
+
+def checked_path(name: str, value: object) -> Path:
+    """The place that a key of the config names, absolute. Raises ConfigError for what YAML takes for no text."""
+    require(isinstance(value, str) and value != "", name, repr(value), "a path; quote what looks like a number")
+    return Path(str(value)).expanduser().absolute()
 
 
 def check_count(name: str, value: int, most: int) -> None:

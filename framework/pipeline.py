@@ -10,7 +10,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
 from functools import partial
-from typing import TypeVar
+from typing import TypeVar, cast
 
 import numba
 
@@ -151,6 +151,8 @@ class Pipeline:
         """Track, lift, refine, fuse: what happens to one frame. Raises FrameError when it cannot be used."""
         with journal.timed(frame.index, "track"):
             pose = self.tracker.track(frame, self.fuser.scene)
+        if not isinstance(cast(object, pose), Pose):
+            raise DataError(f"frame {frame.index}: a tracker must return a Pose, found {type(pose).__name__}")
         journal.frame_tracked(frame, pose)
         if pose.lost:
             return pose

@@ -300,6 +300,17 @@ def test_fuser_maps_the_depths_that_it_says(fuser: MapFuser, room: CornerRoom) -
     assert len(fuser.scene.mesh().vertices)
 
 
+def test_fusers_map_is_seen_by_cameras_from_poses_only(fuser: MapFuser) -> None:
+    scene, pose, depth = fuser.scene, pose_at(0), np.ones(CAMERA.shape, np.float32)
+    for no_pose in (2 * pose, pose[:3], pose.tolist(), np.full((4, 4), np.nan), None):
+        with pytest.raises(DataError, match="T_world_camera"):
+            scene.render(CAMERA, no_pose)
+        with pytest.raises(DataError, match="T_world_camera"):
+            scene.render_near(CAMERA, no_pose, depth)
+    with pytest.raises(DataError, match="camera must be a Camera, found ndarray"):
+        scene.render(CAMERA.K, pose)  # type: ignore[arg-type]
+
+
 def test_fusers_map_survives_saving(fuser: MapFuser, tmp_path: Path) -> None:
     scene = fused(fuser, frames=3).scene
     path = tmp_path / "map.npz"

@@ -21,9 +21,10 @@ from framework.commands.choices import check_sweep
 from framework.configs import one_line
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.directory_lock import is_locked, locked, new_directory
-from framework.files.whole_files import remove_left_over
+from framework.files.whole_files import check_regular, remove_left_over
 from framework.interruption import signals_passed_on
 from framework.parameters import checked_rows
+from framework.records.stored_runs import LOG
 from framework.settings import available_cores
 
 ending = ExitStack()
@@ -57,7 +58,7 @@ class PlaceCallback(Callback):
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         HydraConfig.instance().set_config(config)  # as it does itself a moment later: the place names the dataset
         if self.of_run:
-            self.take(lambda: locked(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.resume is True))
+            self.take(lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.resume is True))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self.take(lambda: sweep_of(config))
@@ -74,6 +75,15 @@ def place_of(key: str, chosen: str) -> Path:
     if not chosen.strip():
         raise ConfigError(f"{key} is empty; {key}=. is the working folder")
     return Path(chosen)
+
+
+@contextmanager
+def run_in(directory: Path, wait: bool) -> Iterator[None]:
+    """Has `directory` to itself while the body runs. Raises DataError."""
+    with locked(directory, wait):
+        if (directory / LOG).exists():
+            check_regular(directory / LOG)  # Hydra opens it, and would wait for who reads a pipe
+        yield
 
 
 def sweep_of(config: DictConfig) -> AbstractContextManager[None]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -172,18 +173,20 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """The folder's images by the number in which their names end, in the order of these numbers.
 
-    Raises DataError when there is none, a name has no number, or two have the same.
+    Raises DataError when there is none, a name has no number, two have the same, or the names differ in other digits,
+    too: the decimals of a time are no order.
     """
     if not folder.is_dir():
         raise DataError(f"the folder {folder} is missing")
     files: dict[int, Path] = {}
     for path in _images(folder, suffixes):
-        digits = path.stem[len(path.stem.rstrip("0123456789")) :]
+        digits = path.stem[len(_before_number(path)) :]
         if not digits:
             raise DataError(f"{path}: the file name must end in the frame's number, like 000000{path.suffix}")
         if int(digits) in files:
             raise DataError(f"{path} and {files[int(digits)].name} have the same frame number {int(digits)}")
         files[int(digits)] = path
+    _check_one_number(list(files.values()))
     if not files:
         raise DataError(f"{folder} holds no image ({', '.join(suffixes)})")
     return dict(sorted(files.items()))
@@ -193,6 +196,20 @@ def _images(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in suffixes and not path.name.startswith("."):
             yield path
+
+
+def _check_one_number(files: Sequence[Path]) -> None:
+    for path in files:
+        before, of_first = _before_number(path), _before_number(files[0])
+        if before != of_first and re.search("[0-9]", before + of_first):
+            raise DataError(
+                f"{path.parent}: {files[0].name} and {path.name} differ in more than one number; number the frames in "
+                "their order, 000000.png, 000001.png ..."
+            )
+
+
+def _before_number(path: Path) -> str:
+    return path.stem.rstrip("0123456789")
 
 
 def _size(shape: tuple[int, ...]) -> str:

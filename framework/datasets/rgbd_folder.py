@@ -8,8 +8,9 @@
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is one
                                             of COCO's names, or null = not known
 
-Files belong together by the number in their names; the numbers may start anywhere and have gaps. Line k of poses.txt
-(comments and empty lines not counted) is the k-th frame in the order of these numbers.
+Files belong together by the number in their names; the numbers may start anywhere and have gaps. Times are no such
+numbers: 1305031102.175304.png is refused. Line k of poses.txt (comments and empty lines not counted) is the k-th frame
+in the order of these numbers.
 """
 
 from __future__ import annotations

@@ -126,8 +126,14 @@ class Trajectory:
 
     @classmethod
     def read(cls, path: Path, max_difference: float) -> Trajectory:
-        """The trajectory of a file, empty where there is none."""
-        lines = sorted(read_tum_lines(path), key=lambda line: line.timestamp) if is_there(path) else []
+        """The trajectory of a file, empty where there is none; of lines with one timestamp the first."""
+        found = read_tum_lines(path) if is_there(path) else []
+        at: dict[float, TumLine] = {}
+        for line in found:
+            at.setdefault(line.timestamp, line)
+        if len(at) < len(found):
+            log.warning("%s: %d poses are left out, as one before has the same timestamp", path, len(found) - len(at))
+        lines = sorted(at.values(), key=lambda line: line.timestamp)
         return cls(lines, np.array([line.timestamp for line in lines]), max_difference)
 
     def at(self, timestamp: float) -> Float64 | None:

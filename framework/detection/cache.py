@@ -19,14 +19,16 @@ from framework.detection.fingerprint import fingerprint
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.files.hashing import add_array
-from framework.files.whole_files import written_whole
+from framework.files.whole_files import is_there, read_bytes, written_whole
 from framework.interfaces import Detector
+from framework.parameters import checked_path
 
 log = logging.getLogger(__name__)
 
 FORMAT = 2  # of the entries: another one makes other keys, so that no entry is ever misread
 CHECKSUM_BYTES = 32  # SHA-256 of an entry's place and content, before the content
 SUFFIX = ".detections"
+LARGEST_ENTRY = 2**30  # bytes; a thousand masks of 1 MB of run lengths
 FRAME_FIELDS = tuple(field.name for field in fields(Frame))
 KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored as they are
 
@@ -106,12 +108,12 @@ class CachedDetector(Detector):
         return {"detection_cache.hits": self.hits, "detection_cache.misses": self.misses}
 
     def _read(self, path: Path) -> Detections | None:
-        try:
-            data = path.read_bytes()
-        except FileNotFoundError:
+        if not is_there(path):
             return None
-        except OSError as error:
-            log.warning("detection cache: %s could not be read (%s): detected again", path, error.strerror)
+        try:
+            data = read_bytes(path, LARGEST_ENTRY)
+        except DataError as error:
+            log.warning("detection cache: %s: detected again", error)
             return None
         content = data[CHECKSUM_BYTES:]
         if _checksum(path, content) != data[:CHECKSUM_BYTES]:
@@ -163,8 +165,8 @@ def cache_metrics(detector: Detector) -> Mapping[str, int]:
 
 def cache_directory(chosen: str | None) -> Path:
     """The folder chosen, or the one that the system has for such things."""
-    if chosen:
-        return Path(chosen).expanduser().absolute()
+    if chosen is not None:
+        return checked_path("detection_cache_dir", chosen)
     import platformdirs
 
     return Path(platformdirs.user_cache_dir("instancemap", appauthor=False)) / "detections"

@@ -61,7 +61,8 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         raise DataError(f"{path} must hold a list of results, as COCO's evaluation reads them, found an object")
     index = {name: k for k, name in enumerate(labels)}
     names: dict[int, str] | None = None
-    found = []
+    found: list[StoredDetection] = []
+    folders: dict[int, PurePosixPath] = {}
     for k, entry in enumerate(entries):
         where = f"{path}, entry {k}"
         if not isinstance(entry, Mapping):
@@ -70,6 +71,8 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
             names = dict(zip(ids.of(labels), labels, strict=True))
         try:
             found.append(_read_entry(where, entry, index, names or {}))
+            if isinstance(entry["image_id"], str):
+                _check_folder(folders, found[-1].frame, PurePosixPath(entry["image_id"]))
         except DataError as error:
             raise DataError(f"{where}: {error}") from error
     return found
@@ -96,10 +99,18 @@ def _read_entry(
     )
 
 
+def _check_folder(folders: dict[int, PurePosixPath], frame: int, image: PurePosixPath) -> None:
+    """Raises DataError where a frame's detections are of images in several folders, so of several sequences."""
+    other = folders.setdefault(frame, image.parent)
+    if image.parent != other:
+        raise DataError(f"{image} and another image in {other}/ are both frame {frame}; a file is of one sequence")
+
+
 def _read_image_id(found: Any) -> int:
     if type(found) is int and found >= 0:
         return found
-    stem = PurePosixPath(found).stem if isinstance(found, str) else ""
+    name = PurePosixPath(found if isinstance(found, str) else "")
+    stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is no file name
     if not (stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS):
         raise DataError(f"image_id must be the frame's number, or a file name that is one, found {found!r}")
     return int(stem)

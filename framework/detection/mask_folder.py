@@ -47,21 +47,30 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
     where known, "class_probabilities". Ids that it does not list are no detections. Masks cannot overlap here.
     """
     index = {name: k for k, name in enumerate(labels)}
-    found = []
+    found: list[StoredDetection] = []
+    images: dict[int, Path] = {}
     for path in sorted(folder.glob("*.png")):
         if not (path.stem.isascii() and path.stem.isdigit()):
             raise DataError(f"{path}: expected the frame's number as the name, such as 000012.png")
+        frame = int(path.stem)
+        if images.setdefault(frame, path) != path:
+            raise DataError(f"{path} and {images[frame].name} are both of frame {frame}; keep one of them")
         description = path.with_suffix(".json")
+        ids: set[int] = set()
         for k, entry in enumerate(_read_list(description)):
             where = f"{description}, entry {k}"
             try:
+                instance = _read_id(entry.get("id"))
+                if instance in ids:
+                    raise DataError(f"id {instance} is there twice")
+                ids.add(instance)
                 found.append(
                     StoredDetection(
                         where=where,
-                        frame=int(path.stem),
+                        frame=frame,
                         label=read_label(entry.get("class"), index),
                         score=read_score(entry.get("score")),
-                        segmentation=InstanceOfImage(path, _read_id(entry.get("id"))),
+                        segmentation=InstanceOfImage(path, instance),
                         probabilities=read_probabilities(entry.get("class_probabilities"), index),
                     )
                 )

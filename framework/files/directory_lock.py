@@ -12,6 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from framework.errors import DataError
+from framework.files.whole_files import read_text, written_whole
 
 LOCK, HOLDER = ".lock", ".lock_holder"  # what is locked, and who has it: on Windows a locked file cannot be read
 
@@ -51,7 +52,8 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
     except OSError as error:
         log.warning("%s cannot be locked (%s): start nothing else there meanwhile", directory, error.strerror)
     try:
-        (directory / HOLDER).write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+        with written_whole(directory / HOLDER) as temporary:
+            temporary.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
         yield
     finally:
         lock.release()
@@ -76,8 +78,11 @@ def _acquire(lock: FileLock, directory: Path, wait: bool) -> None:
     try:
         lock.acquire(blocking=False)
     except Timeout as error:
-        file = directory / HOLDER
-        holder = (file.read_text().strip() if os.access(file, os.R_OK) else "") or "another process"
+        try:
+            holder = read_text(directory / HOLDER).strip()
+        except DataError:
+            holder = ""
+        holder = holder or "another process"
         if not wait:
             message = f"{directory} is in use by {holder}; wait until it has ended, or end it"
             raise DataError(message) from error

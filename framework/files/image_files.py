@@ -97,8 +97,11 @@ def check_image(name: Path | str, data: bytes) -> None:
     try:
         image = kind(io.BytesIO(data))  # not Image.open, which warns of large pictures and has its own limit
         width, height = image.size
+        pictures = getattr(image, "n_frames", 1)
         image.verify()
     except Exception as error:  # Pillow has no base of its own
         raise FrameError(f"{name} is damaged: {in_one_line(error)}") from error
+    if pictures > 1:
+        raise FrameError(f"{name} is an animation of {pictures} pictures; a frame is one")
     if not 0 < width * height <= MOST_PIXELS:
         raise FrameError(f"{name} claims to be {width}x{height} px; it is damaged, or larger than {MOST_PIXELS} px")

@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Camera, Float32, Float64, SurfaceView, View
+from framework.data import Camera, Float32, Float64, SurfaceView, View, check_array, check_view
 from framework.geometry import inverse
 from framework.mapping.evidence import Evidence, best_class, best_instance
 from framework.mapping.frustum import solid_blocks_in_view
@@ -397,7 +397,8 @@ def render(voxels: VoxelGrid, evidence: Evidence, sensor: Sensor, camera: Camera
 
 
 def render_surface(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> SurfaceView:
-    """The same without labels."""
+    """The same without labels. Raises DataError where the camera or its pose is none."""
+    check_view(camera, T_world_camera)
     depth, normals = cast_view(voxels, sensor, camera, T_world_camera)
     color = np.empty((*camera.shape, 3), np.uint8)
     paint(voxels.grid, pinhole(camera, T_world_camera), depth, color)
@@ -409,8 +410,11 @@ def render_near(
 ) -> SurfaceView:
     """The surface that `camera` sees at its `readings` (H, W) m, or in front of them.
 
-    Readings beyond the sensor's farthest depth are not looked for: the map has not taken them either.
+    Readings beyond the sensor's farthest depth are not looked for: the map has not taken them either. Raises DataError
+    where the camera, its pose or the readings are none.
     """
+    check_view(camera, T_world_camera)
+    check_array("depth", readings, camera.shape, np.float32)
     tile_near, tile_far = tile_bounds(voxels, sensor, camera, T_world_camera)
     view = pinhole(camera, T_world_camera)
     stride = _stride(camera, float(voxels.grid.voxel_size), float(sensor.max_depth))

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 from omegaconf import OmegaConf
 
 from framework.data import SceneTruth
@@ -16,10 +15,9 @@ from framework.evaluation.instances import PredictedInstances
 from framework.files.directory_lock import locked
 from framework.files.json_file import write_json
 from framework.interfaces import RGBDSequence
-from framework.records.instances_file import read_instances
-from framework.records.mesh_file import read_mesh
 from framework.records.metrics import TRUTH, evaluation_metrics, is_evaluation
 from framework.records.provenance import code_version, leaves
+from framework.records.stored_map import read_objects
 from framework.records.stored_runs import EVALUATION, METRICS, Record
 from framework.registry import build
 
@@ -114,21 +112,7 @@ def read_predictions(record: Record) -> PredictedInstances:
 
     Raises DataError when mesh.ply and instances.json are not of this run.
     """
-    mesh_path, instances_path = record.directory / "mesh.ply", record.directory / "instances.json"
-    instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
-    if len(instances) != record.metrics.get("instances.count"):
-        raise DataError(
-            f"{instances_path} lists {len(instances)} instances, but {METRICS} counts "
-            f"{record.metrics.get('instances.count')}: they are not of one run; run it again"
-        )
-    ids, counts = np.unique(mesh.instance_ids, return_counts=True)
-    vertices = dict(zip(ids.tolist(), counts.tolist(), strict=True))
-    for instance in instances:
-        if vertices.get(instance.id, 0) != instance.vertices:
-            raise DataError(
-                f"{instances_path} gives instance {instance.id} {instance.vertices} vertices, but {mesh_path} has "
-                f"{vertices.get(instance.id, 0)}: they are not of one run; run it again"
-            )
+    mesh, instances = read_objects(record)
     return PredictedInstances.on_mesh(
         mesh,
         [instance.id for instance in instances],

@@ -28,7 +28,7 @@ from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
 from framework.records.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, METRICS, PARTIAL_METRICS
+from framework.records.stored_runs import CONFIG, MAPPED, METRICS, PARTIAL_METRICS
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 
@@ -36,9 +36,6 @@ log = logging.getLogger(__name__)
 
 LIKELY = 0.3  # confidence from which on an instance is in the picture and in what a run says; files have them all
 
-
-MAPPED = ("trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz", "overview.png")
-"""What is written of a map, in this order: on a disk that is full the small ones still find a place."""
 
 Arguments = ParamSpec("Arguments")
 Made = TypeVar("Made")
@@ -66,10 +63,9 @@ class RunRecord:
         remove_left_over(directory)
         for name in (METRICS, PARTIAL_METRICS):
             (directory / name).unlink(missing_ok=True)
-        record = cls(directory, asked, choices, inputs, provenance)
-        record._write_config()
+        _write_config(directory / CONFIG, asked)
         _reset_peak_memory()
-        return record
+        return cls(directory, asked, choices, inputs, provenance)
 
     def write(
         self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None
@@ -83,13 +79,13 @@ class RunRecord:
         goes on, metrics.partial.json tells what there is: who is killed in the middle of it leaves a partial record.
         """
         self.directory.mkdir(parents=True, exist_ok=True)
-        for name in MAPPED:  # of an earlier run into the same directory
-            (self.directory / name).unlink(missing_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
+        for name in MAPPED:  # of an earlier run into the same directory
+            attempt((self.directory / name).unlink, missing_ok=True)
+        if not (self.directory / CONFIG).exists():  # the directory was removed meanwhile
+            attempt(_write_config, self.directory / CONFIG, self.config)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
-        if not (self.directory / CONFIG).exists():  # somebody has deleted the directory meanwhile
-            attempt(self._write_config)
         attempt(write_tum, self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
@@ -116,10 +112,6 @@ class RunRecord:
             attempt(self._write_partial, sequence, figures, attempt.fault)
         self._announce(title, labels if found is not None else {}, figures, attempt.fault)
         return attempt.fault
-
-    def _write_config(self) -> None:
-        with written_whole(self.directory / CONFIG) as temporary:
-            OmegaConf.save(OmegaConf.create(dict(self.config)), temporary)
 
     def _metrics(self, sequence: RGBDSequence, figures: Metrics) -> Metrics:
         return {
@@ -170,6 +162,11 @@ class _Attempts:
             log.warning("%s", reason(error))
             self.fault = self.fault or error
             return None
+
+
+def _write_config(path: Path, config: Mapping[str, Any]) -> None:
+    with written_whole(path) as temporary:
+        OmegaConf.save(OmegaConf.create(dict(config)), temporary)
 
 
 def _found(scene: SceneMap) -> tuple[InstanceMesh, Mapping[int, Instance]]:

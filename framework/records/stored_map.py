@@ -11,9 +11,9 @@ from framework.data import Float64, InstanceMesh, Int32, SceneTruth
 from framework.errors import DataError
 from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
 from framework.files.tum_trajectory import read_tum
-from framework.records.instances_file import read_instances
+from framework.records.instances_file import StoredInstance, read_instances
 from framework.records.mesh_file import read_mesh
-from framework.records.stored_runs import Record
+from framework.records.stored_runs import METRICS, Record
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,8 @@ class StoredMap:
 
     @classmethod
     def of(cls, record: Record) -> StoredMap:
-        """Raises DataError, naming the file, when one cannot be read or nothing was mapped."""
-        mesh = read_mesh(record.directory / "mesh.ply")
-        instances = read_instances(record.directory / "instances.json")
+        """Raises DataError, naming the file, when one cannot be read or is of another run, or nothing was mapped."""
+        mesh, instances = read_objects(record)
         _, poses = read_tum(record.directory / "trajectory.txt")
         if not len(mesh.triangles) or not len(poses):
             raise DataError(f"{record.directory}: nothing was mapped")
@@ -41,3 +40,23 @@ class StoredMap:
     def true_ids(self, truth: SceneTruth) -> Int32:
         """(V,) the true instance nearest to each vertex, 0 = none, or none as near as the evaluation asks."""
         return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
+
+
+def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
+    """mesh.ply and instances.json. Raises DataError when they are not of this run."""
+    mesh_path, instances_path = record.directory / "mesh.ply", record.directory / "instances.json"
+    instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
+    if len(instances) != record.metrics.get("instances.count"):
+        raise DataError(
+            f"{instances_path} lists {len(instances)} instances, but {METRICS} counts "
+            f"{record.metrics.get('instances.count')}: they are not of one run; run it again"
+        )
+    ids, counts = np.unique(mesh.instance_ids, return_counts=True)
+    vertices = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    for instance in instances:
+        if vertices.get(instance.id, 0) != instance.vertices:
+            raise DataError(
+                f"{instances_path} gives instance {instance.id} {instance.vertices} vertices, but {mesh_path} has "
+                f"{vertices.get(instance.id, 0)}: they are not of one run; run it again"
+            )
+    return mesh, instances

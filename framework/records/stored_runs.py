@@ -25,6 +25,9 @@ CONFIG = "config.yaml"
 METRICS = "metrics.json"  # there exactly when the run completed
 PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
 LOG = "instancemap.log"
+MAPPED = ("trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz", "overview.png")
+"""What is written of a map, in this order: on a disk that is full the small ones still find a place."""
+
 EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
 
 FIGURES = ("instances.", "trajectory.", "stage_ms.", "map.", "frames", "fps")  # begin the keys of numbers in METRICS
@@ -136,6 +139,8 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
         said = ", ".join(f"{key.rpartition('.')[2]}={value}" for key, value in settings.items())
         log.info("run again: the times in %s are of other settings or another machine: %s", directory, said)
         return False
+    if lost := [name for name in MAPPED if not (directory / name).exists()]:
+        log.warning("%s has lost %s; resume=false would make it again", directory, ", ".join(lost))
     now = commit_of(code_version())
     if record.commit == now and not now.endswith(WITH_CHANGES):  # two trees with changes may differ
         log.info("kept: the complete record in %s", directory)

@@ -16,7 +16,7 @@ import numpy.typing as npt
 import open3d as o3d
 from open3d.core import Tensor
 
-from framework.data import Array, Bool, Camera, Float32, Float64, Frame, Int32, Int64, SurfaceView, UInt8
+from framework.data import Array, Bool, Camera, Float32, Float64, Frame, Int32, Int64, SurfaceView, UInt8, check_view
 from framework.errors import MapFullError
 from framework.geometry import inverse
 from framework.mapping.map_file import check_blocks, check_like
@@ -211,7 +211,8 @@ class BlockGrid:
         return np.asarray(self.blocks.attribute(attribute).numpy()).reshape(-1)
 
     def ray_cast(self, camera: Camera, T_world_camera: Float64) -> SurfaceView:
-        """The surface that `camera` sees."""
+        """The surface that `camera` sees. Raises DataError where the camera or its pose is none."""
+        check_view(camera, T_world_camera)
         depth, normals, color = _blank(camera)
         blocks, far = self._blocks_in_view(camera, T_world_camera)
         if len(blocks):

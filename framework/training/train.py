@@ -26,6 +26,7 @@ from framework.detection.domain import RENDERED_ROOMS
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import Fact, load_network, save_network
 from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
+from framework.errors import ConfigError
 from framework.evaluation.mask_ap import MaskAp, mask_ap
 from framework.files.whole_files import written_whole
 from framework.interfaces import Detector
@@ -48,16 +49,14 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
     """Renders the rooms that are missing, trains for the steps that are left, evaluates."""
     Settings.of(config).apply()
     torch.manual_seed(config.seed)
+    network = _started(config.network)
+    schedule = Schedule(**dict(config.schedule), seed=config.seed)
     wanted = config.pictures
     rooms = Path(wanted.folder or Path(platformdirs.user_cache_dir("instancemap")) / "rooms")
     processes = wanted.processes or available_cores()
     render_rooms(rooms, 0, wanted.rooms, wanted.views, processes)
     render_rooms(rooms, HELD_OUT, wanted.held_out, wanted.held_out_views, processes)
 
-    network = MaskRCNN(architecture(config.network))
-    if config.network.start_from:
-        network.load_state_dict(load_network(Path(config.network.start_from)).state_dict(), strict=False)
-    schedule = Schedule(**dict(config.schedule), seed=config.seed)
     device = str(torch_device(config.device, "device"))
     pictures = RoomPictures(rooms, 0, wanted.rooms)
     trainer = Trainer(network, pictures, schedule, folder, device)
@@ -83,6 +82,19 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
         path.write_text(json.dumps(_known(asdict(precision)), indent=1))
     log.info("mask AP50 %.3f, AP %.3f on %d other rooms", precision.ap50, precision.ap, wanted.held_out)
     return precision
+
+
+def _started(config: DictConfig) -> MaskRCNN:
+    """The network before the first step. Raises ConfigError when `start_from` is another one."""
+    network = MaskRCNN(architecture(config))
+    if config.start_from:
+        start = load_network(Path(config.start_from))
+        if start.architecture != network.architecture:
+            raise ConfigError(
+                f"network.start_from: {config.start_from} is not of the architecture that network asks for"
+            )
+        network.load_state_dict(start.state_dict())
+    return network
 
 
 def architecture(network: DictConfig) -> Architecture:

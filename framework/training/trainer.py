@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from framework.detection.mask_rcnn.network import MaskRCNN
 from framework.detection.masks import tight_boxes
-from framework.errors import DataError
+from framework.errors import DataError, in_one_line
 from framework.files.whole_files import written_whole
 from framework.parameters import require
 from framework.training.augmentation import augmented
@@ -168,11 +168,18 @@ class Trainer:
             draw_losses(self.history, path)
 
     def _resume(self) -> None:
-        state = torch.load(self.folder / CHECKPOINT, map_location=self.device, weights_only=True)
-        self.network.load_state_dict(state["network"])
-        self.averaged = state["averaged"]
-        self._optimizer.load_state_dict(state["optimizer"])
-        self.step, self.history = state["step"], state["history"]
+        path = self.folder / CHECKPOINT
+        try:
+            state = torch.load(path, map_location=self.device, weights_only=True)
+            self.network.load_state_dict(state["network"])
+            self.averaged = state["averaged"]
+            self._optimizer.load_state_dict(state["optimizer"])
+            self.step, self.history = state["step"], state["history"]
+        except Exception as error:  # a damaged file can raise almost anything
+            raise DataError(
+                f"{path} is damaged, or of another network than this one: {in_one_line(error)}; "
+                "remove it, or train in another folder"
+            ) from error
 
 
 def draw_losses(history: Sequence[dict[str, float]], path: Path) -> None:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -53,6 +56,43 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
     assert not mapper.add(room[2]).lost
 
 
+def test_several_threads_share_a_mapper(room: CornerRoom) -> None:
+    """Without the lock the kernels write over each other's buffers, and the process dies."""
+    mapper, alone, faults = Mapper(*STAGES), Mapper(*STAGES), []
+
+    def work(one: Callable[[], object]) -> None:
+        try:
+            for _ in range(10):
+                one()
+        except Exception as error:
+            faults.append(error)
+
+    def look() -> None:
+        with mapper.lock:
+            assert set(mapper.scene.mesh().instance_ids.tolist()) - {0} == set(mapper.instances())
+
+    frame = room[0]
+    tasks = [lambda: mapper.add(frame)] * 3 + [look, lambda: mapper.instances()]
+    threads = [threading.Thread(target=work, args=(task,)) for task in tasks]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert not faults
+    for _ in range(30):
+        alone.add(frame)
+    np.testing.assert_array_equal(mapper.scene.mesh().vertices, alone.scene.mesh().vertices)
+
+
+def test_a_mapper_is_pickled(room: CornerRoom) -> None:
+    mapper = Mapper(*STAGES)
+    mapper.add(room[0])
+    copied = pickle.loads(pickle.dumps(mapper))
+    for one in (mapper, copied):
+        one.add(room[1])
+    np.testing.assert_array_equal(copied.scene.mesh().vertices, mapper.scene.mesh().vertices)
+
+
 def test_what_is_no_frame_is_told() -> None:
     with pytest.raises(DataError, match=r"Mapper\.add takes an instancemap\.Frame, found NoneType"):
         Mapper(*STAGES).add(None)  # type: ignore[arg-type]
@@ -97,6 +137,12 @@ def test_any_map_is_read_back(fuser: str, room: CornerRoom, tmp_path: Path) -> N
     scene = load_map(tmp_path / "map.npz")
     assert type(scene) is type(made.scene)
     assert list(scene.instances()) == list(made.scene.instances())
+
+
+@pytest.mark.parametrize("place", [None, 7])
+def test_a_place_that_is_no_path_is_told(place: Any) -> None:
+    with pytest.raises(DataError, match=f"a map is saved to a path, found {place}"):
+        Mapper(*STAGES).scene.save(place)
 
 
 @pytest.mark.parametrize("content", [b"", b"PK", b"[]"])

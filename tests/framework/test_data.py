@@ -138,6 +138,7 @@ def test_sound_data_pass() -> None:
         (frame, {"T_world_camera": with_nan((4, 4), np.float64)}, "frame 7: T_world_camera holds values"),
         (frame, {"T_world_camera": 2 * np.eye(4)}, "not a rigid transform"),
         (frame, {"T_world_camera": np.diag([1.0, 1.0, -1.0, 1.0])}, "not a rigid transform"),
+        (frame, {"truth": "none"}, "frame 7: truth must be a FrameTruth, found str"),
         (frame, {"truth": FrameTruth(np.zeros((2, 2), np.int32), {})}, "truth.instance_ids must have shape"),
         (detections, {"masks": np.zeros((3, 3, 4), np.bool_)}, r"masks must have shape \(2, any, any\)"),
         (detections, {"scores": np.array([0.9, 1.2], np.float32)}, r"scores must be in \[0, 1\]"),

@@ -113,6 +113,23 @@ def test_true_masks_are_not_refined_and_made_up_pixels_end_the_run(room: CornerR
     assert pipeline(detector=Exact(), refiner=MadeUp()).run(room).frames_skipped == 0
 
 
+@pytest.mark.parametrize(
+    ("stage", "verb", "said"),
+    [
+        ("detector", "detect", "a detector must return Detections"),
+        ("tracker", "track", "a tracker must return a Pose"),
+        ("refiner", "refine", "a refiner must return PointClusters"),
+    ],
+)
+def test_a_stage_that_forgets_to_return_is_told(
+    room: CornerRoom, monkeypatch: pytest.MonkeyPatch, stage: str, verb: str, said: str
+) -> None:
+    stages = pipeline(ahead=0)
+    monkeypatch.setattr(getattr(stages, stage), verb, lambda *_: None)
+    with pytest.raises(DataError, match=f"frame 0: {said}, found NoneType"):
+        stages.run(room)
+
+
 def test_many_skipped_frames_do_not_flood_the_log(caplog: pytest.LogCaptureFixture) -> None:
     @dataclass
     class MostlyBroken(CornerRoom):

@@ -16,6 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 from framework.errors import DataError
+from framework.files.whole_files import check_regular
 
 FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), largest time, largest node
 FILE_MAGIC = b"NI10"
@@ -72,6 +73,7 @@ def read_contents(path: Path) -> Contents:
 
     Raises DataError when it is no recording, or has no image of depth or of colour.
     """
+    check_regular(path)
     try:
         with path.open("rb") as file:
             return _read_contents(path, file)

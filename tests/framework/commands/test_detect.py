@@ -68,6 +68,8 @@ def test_what_it_writes_is_what_cocos_evaluation_reads(tmp_path: Path) -> None:
     [
         ([], "out must be given: out=detections.json"),
         (["out=absent/found.json"], "there is no folder"),
+        (["out=2024"], "out must be a path; quote what looks like a number, found 2024"),
+        (["out=[a,b]"], "out must be a path; quote what looks like a number, found ['a', 'b']"),
     ],
 )
 def test_a_fault_is_one_line_and_a_status(tmp_path: Path, overrides: list[str], said: str) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 import pytest
 
 from framework.files.directory_lock import locked
-from framework.records.run_record import MAPPED
+from framework.records.stored_runs import MAPPED
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
@@ -223,6 +223,16 @@ def test_a_run_that_is_refused_changes_nothing(tmp_path: Path) -> None:
     assert f"error: {place} is in use by process {os.getpid()} on " in stderr
     assert {path: path.read_bytes() for path in before} == before
     assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
+
+
+def test_a_pipe_for_a_log_is_refused(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    place.mkdir()
+    os.mkfifo(place / "instancemap.log")
+    status, stderr = end(begin(tmp_path, f"hydra.run.dir={place}"))
+    assert status == 1
+    assert "instancemap.log" in stderr
+    assert "Traceback" not in stderr
 
 
 def test_a_place_that_nobody_chose_is_named_after_the_dataset(tmp_path: Path) -> None:

@@ -247,6 +247,18 @@ def test_two_files_of_one_frame(folder):
         RgbdFolder(folder)
 
 
+@pytest.mark.parametrize(
+    "names", [["9.95", "10.05", "10.1", "10.15"], ["1_8", "1_9", "2_0", "2_1"], ["1", "2", "3", "1 - Copy 4"]]
+)
+def test_names_with_more_than_one_number(folder, names):
+    """The last digits alone would put the frames into another order."""
+    for kind in ("color", "depth", "instance"):
+        for k, name in enumerate(names):
+            (folder / kind / f"{k:06d}.png").rename(folder / kind / f"{name}.png")
+    with pytest.raises(DataError, match=r"color: .* differ in more than one number"):
+        RgbdFolder(folder)
+
+
 def test_a_file_without_number(folder):
     shutil.copy(folder / "color/000001.png", folder / "color/cover.png")
     with pytest.raises(DataError, match="must end in the frame's number"):

@@ -191,6 +191,15 @@ def test_a_ground_truth_that_cannot_be_read_does_not_count_as_missing(folder: Pa
         TumRgbd(folder)
 
 
+def test_of_two_poses_of_one_time_the_first_counts(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    times = [f"{color_time(k):.6f}" for k in range(FRAMES)]
+    write_poses(folder, [f"{time} {x} 0 0 0 0 0 1" for time in times for x in (1, 9)])
+    pose = TumRgbd(folder)[1].T_world_camera
+    assert pose is not None
+    assert pose[0, 3] == 1
+    assert f"groundtruth.txt: {FRAMES} poses are left out, as one before has the same timestamp" in caplog.text
+
+
 def test_a_pose_that_is_none_is_the_fault_of_its_frame(folder: Path) -> None:
     lines = [f"{color_time(k):.6f} 0 0 0 0 0 0 1" for k in range(FRAMES)]
     lines[1] = f"{color_time(1):.6f} 0 0 0 0 0 0 0"

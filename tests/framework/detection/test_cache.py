@@ -295,6 +295,19 @@ def test_a_damaged_entry_is_a_miss_and_is_mended(
     assert detector.hits == 1
 
 
+@pytest.mark.parametrize("make", [os.mkfifo, Path.mkdir, lambda path: path.symlink_to("nothing")])
+def test_what_is_no_entry_is_named_and_the_run_goes_on(
+    room: CornerRoom, tmp_path: Path, caplog: pytest.LogCaptureFixture, make: Callable[[Path], None]
+) -> None:
+    expected = CachedDetector(Noise(), tmp_path).detect(room[0])
+    [entry] = tmp_path.rglob("*.detections")
+    entry.unlink()
+    make(entry)
+    assert_same(expected, CachedDetector(Noise(), tmp_path).detect(room[0]))
+    assert f"{entry}" in caplog.records[0].message
+    assert "detected again" in caplog.records[0].message
+
+
 def test_read_only_writes_nothing(room: CornerRoom, tmp_path: Path) -> None:
     absent = tmp_path / "absent"
     detector = CachedDetector(Noise(), absent, CacheMode.READ_ONLY)
@@ -395,6 +408,12 @@ def test_off_is_the_detector_itself(off: str) -> None:
     assert with_cache(detector, config(f"detection_cache={off}")) is detector
     assert with_cache(detector, config()) is detector
     assert cache_metrics(detector) == {}
+
+
+@pytest.mark.parametrize("chosen", ["7", "[a]", "''"])
+def test_a_folder_that_is_no_path_is_told(chosen: str) -> None:
+    with pytest.raises(ConfigError, match="detection_cache_dir must be a path; quote"):
+        with_cache(Noise(), config("detection_cache=read_write", f"detection_cache_dir={chosen}"))
 
 
 def test_a_misspelt_mode_is_told() -> None:

@@ -44,7 +44,7 @@ def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     mesh, poses = furnished(), walk()[:frames]
     write_mesh(directory / "mesh.ply", mesh)
-    entries = [{"id": k, "class": "chair", "confidence": 0.9, "vertices": 98} for k in (1, 2)]
+    entries = [{"id": k, "class": "chair", "confidence": 0.9, "vertices": 1538} for k in (1, 2)]
     (directory / "instances.json").write_text(json.dumps(entries))
     write_tum(directory / "trajectory.txt", np.arange(len(poses)) / 30, poses)
     times = [f"{k},{stage},{ms}" for k in range(frames) for stage, ms in (("track", 20), ("refine", 10), ("fuse", 30))]
@@ -131,6 +131,16 @@ def test_a_map_that_is_damaged_or_without_truth_is_left_out(maps: Path, caplog: 
     assert said[1].endswith("the scene is gone")
 
 
+@pytest.mark.parametrize("vertices", [[1538], [1538, 7]])
+def test_objects_of_another_run_are_not_drawn(
+    maps: Path, caplog: pytest.LogCaptureFixture, vertices: list[int]
+) -> None:
+    entries = [{"id": k, "class": "bed", "confidence": 0.9, "vertices": n} for k, n in enumerate(vertices, start=1)]
+    (maps / "dataset.scene=011,row=part,seed=0" / "instances.json").write_text(json.dumps(entries))
+    texts(maps)
+    assert "they are not of one run; run it again" in caplog.text
+
+
 def test_several_seeds_are_lines_of_their_own(tmp_path: Path) -> None:
     root = experiment(tmp_path / "figure4", kind="maps", sequences="seed")
     run(root, "whole", "011")
@@ -151,7 +161,9 @@ def test_several_seeds_are_lines_of_their_own(tmp_path: Path) -> None:
 def test_the_zoomed_line_is_below(tmp_path: Path) -> None:
     root = experiment(tmp_path / "figure5", kind="maps", zoom=True)
     directory = run(root, "part", "011")
-    (directory / "instances.json").write_text('[{"id": 1, "class": "chair", "confidence": 0.9, "vertices": 98}]')
+    (directory / "instances.json").write_text('[{"id": 1, "class": "chair", "confidence": 0.9, "vertices": 1538}]')
+    metrics = json.loads((directory / "metrics.json").read_text())
+    (directory / "metrics.json").write_text(json.dumps(metrics | {"instances.count": 1}))
     run(root, "whole", "011")
     pictured = Pictured.below(root)
     page = DRAWN["maps"](pictured)

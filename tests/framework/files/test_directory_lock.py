@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from framework.errors import DataError
-from framework.files.directory_lock import is_locked, locked, new_directory
+from framework.files.directory_lock import HOLDER, is_locked, locked, new_directory
 
 
 def test_the_second_is_told_who_has_it(tmp_path: Path) -> None:
@@ -85,6 +85,25 @@ def test_a_file_system_without_locks_gives_a_warning(
     with locked(tmp_path):
         pass
     assert "cannot be locked (No locks available)" in caplog.text
+
+
+def test_a_pipe_in_place_of_its_file_is_told(tmp_path: Path) -> None:
+    """Opening one waits for somebody who reads it."""
+    os.mkfifo(tmp_path / HOLDER)
+    with pytest.raises(DataError, match=rf"{HOLDER} is no file but a device, a pipe"), locked(tmp_path):
+        pytest.fail("nobody can be told who has it")
+
+
+def test_what_does_not_tell_the_holder_is_not_read(tmp_path: Path) -> None:
+    with locked(tmp_path):
+        for make in (os.mkfifo, Path.mkdir, lambda path: path.write_bytes(b"\xff\xfe")):
+            (tmp_path / HOLDER).unlink()
+            make(tmp_path / HOLDER)
+            with pytest.raises(DataError, match="is in use by another process"), locked(tmp_path):
+                pytest.fail("two are in one place")
+            if (tmp_path / HOLDER).is_dir():
+                (tmp_path / HOLDER).rmdir()
+                (tmp_path / HOLDER).touch()
 
 
 def test_who_asks_for_a_new_directory_at_the_same_moment_gets_one_of_his_own(tmp_path: Path) -> None:

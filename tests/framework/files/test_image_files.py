@@ -1,8 +1,11 @@
 """JPEG and PNG files: whole ones are read to the pixel, damaged ones are refused."""
 
+import io
+
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from framework.errors import FrameError
 from framework.files.image_files import decode_color, read_uint16
@@ -60,6 +63,14 @@ def test_a_jpeg_with_a_corrupt_block_is_damaged() -> None:
         except FrameError:
             seen += 1
     assert seen >= 36, "noise may be valid code by chance: a JPEG has no checksums"
+
+
+def test_an_animation_is_no_picture() -> None:
+    """OpenCV takes another of its pictures than Pillow does."""
+    pictures = [Image.new("RGB", (8, 6), color) for color in ("red", "lime", "blue")]
+    written = io.BytesIO()
+    pictures[0].save(written, "PNG", save_all=True, append_images=pictures[1:], default_image=True)
+    assert "is an animation of 3 pictures; a frame is one" in message(written.getvalue())
 
 
 def test_a_jpeg_is_no_depth(tmp_path) -> None:

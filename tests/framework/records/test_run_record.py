@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import shutil
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -24,7 +25,8 @@ from framework.records import provenance, run_record
 from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
 from framework.records.metrics import instance_metrics, run_metrics, trajectory_metrics
-from framework.records.run_record import MAPPED, RunRecord, headline
+from framework.records.run_record import RunRecord, headline
+from framework.records.stored_runs import MAPPED, read_record
 from tests import registered
 from tests.scenes.corner_room import (
     CLASSES,
@@ -148,6 +150,23 @@ def test_what_was_mapped_stays_where_the_truth_is_unusable(record: RunRecord, ro
     metrics = metrics_of(record, "metrics.partial.json")
     assert metrics["partial"] == "ground truth: a point lies far off"
     assert (metrics["frames"], metrics["instances.count"], "instances.ap50" in metrics) == (6, 2, False)
+
+
+@pytest.mark.parametrize("name", MAPPED)
+def test_a_folder_in_a_files_place_costs_that_file_alone(record: RunRecord, room: CornerRoom, name: str) -> None:
+    (record.directory / name).mkdir()
+    fault = record.write(room, mapped(room))
+    assert name in str(fault)
+    assert {path.name for path in record.directory.iterdir() if path.is_file()} >= {*MAPPED} - {name}
+    assert name in metrics_of(record, "metrics.partial.json")["partial"]
+
+
+def test_a_record_whose_directory_was_removed_meanwhile_is_whole(record: RunRecord, room: CornerRoom) -> None:
+    config = (record.directory / "config.yaml").read_bytes()
+    shutil.rmtree(record.directory)
+    assert record.write(room, mapped(room)) is None
+    assert (record.directory / "config.yaml").read_bytes() == config
+    assert read_record(record.directory).metrics["frames"] == 6
 
 
 def test_a_step_over_a_skipped_frame_is_no_step_of_one_frame(room: CornerRoom) -> None:

@@ -14,7 +14,7 @@ from framework.errors import DataError
 from framework.records import stored_runs
 from framework.records.inputs import inputs_sha256
 from framework.records.provenance import config_hash
-from framework.records.stored_runs import find_records, is_recorded, read_record
+from framework.records.stored_runs import MAPPED, find_records, is_recorded, read_record
 
 CONFIG = {"seed": 3, "fuser": {"voxel_size": 0.02, "far": 1e-9, "storage": "EXACT", "none": None}, "on": [1, "2", True]}
 
@@ -26,6 +26,8 @@ def directory(tmp_path: Path) -> Path:
     directory.mkdir()
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(CONFIG)))
     write(directory, config_hash=config_hash(CONFIG))
+    for name in MAPPED:
+        (directory / name).touch()
     return directory
 
 
@@ -125,6 +127,14 @@ def test_a_record_of_the_same_config_is_kept(directory: Path, caplog: pytest.Log
     caplog.set_level(logging.INFO)
     assert is_recorded(directory, OmegaConf.create(CONFIG | {"debug": True}))
     assert caplog.messages == [f"kept: the complete record in {directory}"]
+
+
+def test_what_a_record_has_lost_is_named(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Who needs the disk may have removed it, and the figures are still those of the run."""
+    (directory / "map.npz").unlink()
+    (directory / "mesh.ply").unlink()
+    assert is_recorded(directory, OmegaConf.create(CONFIG))
+    assert caplog.messages == [f"{directory} has lost mesh.ply, map.npz; resume=false would make it again"]
 
 
 def test_a_record_of_another_config_is_not(directory: Path, caplog: pytest.LogCaptureFixture) -> None:

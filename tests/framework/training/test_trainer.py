@@ -75,6 +75,18 @@ def test_a_stopped_run_goes_on_as_if_it_had_not_been(
     assert all(torch.equal(resumed.averaged[name], whole.averaged[name]) for name in whole.averaged)
 
 
+def test_a_checkpoint_that_is_damaged_or_of_another_network_is_told(pictures: RoomPictures, tmp_path: Path) -> None:
+    Trainer(network(), pictures, Schedule(steps=1, batch=1, budget=SHORT.budget), tmp_path, "cpu").run()
+    wider = MaskRCNN(Architecture(**{**vars(TINY), "fpn_channels": 16}))
+    with pytest.raises(DataError, match=r"checkpoint\.pt is damaged, or of another network"):
+        Trainer(wider, pictures, SHORT, tmp_path, "cpu")
+    whole = (tmp_path / CHECKPOINT).read_bytes()
+    for content in (b"", whole[: len(whole) // 2]):
+        (tmp_path / CHECKPOINT).write_bytes(content)
+        with pytest.raises(DataError, match=r"checkpoint\.pt is damaged"):
+            Trainer(network(), pictures, SHORT, tmp_path, "cpu")
+
+
 def test_another_seed_learns_otherwise(pictures: RoomPictures, tmp_path: Path) -> None:
     histories = []
     for seed in (0, 1):

@@ -16,6 +16,9 @@ from framework.training.train import HELD_OUT, NETWORK, PRECISION, architecture,
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY
 from tests.tiny_rooms import PICTURES, write_room
 
+CHECKOUT = Path(__file__).resolve().parents[3]
+ROOMS = CHECKOUT / "plugins" / "detectors" / "mask_rcnn_rooms.safetensors"
+
 
 def config(folder: Path, *overrides: str) -> DictConfig:
     with initialize_config_dir(str(CONF), version_base="1.3"):
@@ -46,6 +49,16 @@ def test_it_leaves_a_network_that_goes_on_and_is_told_what_it_is(tmp_path: Path)
     other = f"network.start_from={tmp_path / 'run' / NETWORK}"
     train(config(tmp_path / "rooms", "schedule.steps=1", "schedule.bfloat16=true", other), tmp_path / "tuned")
     assert describe_network(tmp_path / "tuned" / NETWORK).card["bfloat16"] is True
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [("schedule.steps=0", "steps must be at least 1"), (f"network.start_from={ROOMS}", "is not of the architecture")],
+)
+def test_what_is_wrong_is_told_before_rooms_are_rendered(tmp_path: Path, wrong: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        train(config(tmp_path / "rooms", wrong), tmp_path / "run")
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_backbone_that_there_is_not(tmp_path: Path) -> None:

@@ -201,6 +201,10 @@ def test_a_folder_of_masks(tmp_path: Path) -> None:
         ([{"id": 7, "class": "television", "score": 0.5}], "'television' is not one of the 80 labels"),
         ([{"id": 7, "class": "tv"}], "score must be a number"),
         ({"id": 7}, "must hold a list"),
+        (
+            [{"id": 7, "class": "tv", "score": 0.5}, {"id": 7, "class": "bed", "score": 1}],
+            "entry 1: id 7 is there twice",
+        ),
     ],
 )
 def test_a_folder_that_is_wrong_is_told(tmp_path: Path, listed: Any, said: str) -> None:
@@ -216,6 +220,12 @@ def test_a_folder_with_half_of_a_frame_is_told(tmp_path: Path) -> None:
     (tmp_path / "000003.png").rename(tmp_path / "000005.png")
     (tmp_path / "000005.json").write_text("[]")
     with pytest.raises(DataError, match=r"000004\.json has no image 000004\.png"):
+        Precomputed(tmp_path)
+
+
+def test_a_folder_with_two_images_of_a_frame_is_told(tmp_path: Path) -> None:
+    write_folder(write_folder(tmp_path), name="3")
+    with pytest.raises(DataError, match=r"3\.png and 000003\.png are both of frame 3"):
         Precomputed(tmp_path)
 
 
@@ -236,6 +246,7 @@ def test_an_image_of_another_form_is_told(tmp_path: Path, ids: np.ndarray, error
         ({"image_id": "left.png"}, "image_id must be the frame's number"),
         ({"image_id": -1}, "image_id"),
         ({"image_id": True}, "image_id"),
+        ({"image_id": "0.5"}, "image_id must be the frame's number"),
         ({"category_name": "chiar"}, "'chiar' is not one of the 80 labels"),
         ({"category_name": None, "category_id": 12}, "category_id 12 is not the id of a label"),
         ({"category_name": None}, "category_id None"),
@@ -279,6 +290,12 @@ def test_a_file_that_is_none_is_told(tmp_path: Path, content: str, said: str) ->
         Precomputed(tmp_path / "results.json")
     with pytest.raises(DataError, match=r"absent\.json could not be read"):
         Precomputed(tmp_path / "absent.json")
+
+
+def test_a_file_of_two_sequences_is_told(tmp_path: Path) -> None:
+    path = write(tmp_path, entry(image_id="kitchen/000002.png"), entry(image_id="hall/000002.png"))
+    with pytest.raises(DataError, match=r"entry 1: hall/000002\.png and another image in kitchen/ are both frame 2"):
+        Precomputed(path)
 
 
 def test_masks_of_another_size_than_the_frame_are_told(tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """What the records of an .oni say, also where it ends too early."""
 
+import os
 import struct
 from dataclasses import replace
 
@@ -116,6 +117,12 @@ def test_what_is_no_recording_is_refused_in_one_line(tmp_path, content, fault):
         read_contents(path)
     assert str(path) in str(caught.value)
     assert fault in str(caught.value)
+
+
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.oni")
+    with pytest.raises(DataError, match=r"a\.oni is no file but a device, a pipe"):
+        read_contents(tmp_path / "a.oni")
 
 
 @pytest.mark.parametrize(("kept", "missing"), [(0, "color"), (1, "depth")])
