@@ -1,4 +1,4 @@
-"""The contracts: four stages that plugins fill in, the map that they build, and the sequence that feeds them.
+"""The contracts: four stages that plugins fill in, the map that they build, and the video that feeds them.
 
     frame --> Detector --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
       '-----> PoseTracker ----'                                 |
@@ -15,7 +15,7 @@ in the stage's config group registers it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 
 from framework.data import (
@@ -33,17 +33,33 @@ from framework.data import (
     View,
 )
 
+FrameReader = Callable[[], Frame]
+"""Reads a frame that is there. Raises FrameError when it cannot be used."""
 
-class RGBDSequence(ABC):
-    """A recorded or rendered RGB-D video, read frame by frame.
 
-    Every dataset has the parameters `start`, `stop`, `stride` and `share`, which choose from the frames that there are.
-    """
+class RGBDVideo(ABC):
+    """Where frames come from: a recording (`RGBDSequence`), or a camera that runs (`LiveVideo`)."""
 
-    camera: Camera
     name: str  # for tables: the scene
     annotation: str = ""  # for tables: which release of the true instances; "" = there is but one
     domain: str = ""  # what its pictures are, as a detector may ask: "rendered rooms"; "" = photographs, or not known
+
+    def has_poses(self) -> bool:
+        """Whether any of the frames may have a true pose; some of them may lack it. Asked before any frame is read."""
+        return True
+
+    def scene_truth(self) -> SceneTruth | None:
+        """The true instances of the chosen frames' scene, None where nobody labelled it."""
+        return None
+
+
+class RGBDSequence(RGBDVideo):
+    """A recorded or rendered RGB-D video, read frame by frame.
+
+    Every one has the parameters `start`, `stop`, `stride` and `share`, which choose from the frames that there are.
+    """
+
+    camera: Camera
 
     @abstractmethod
     def __len__(self) -> int:
@@ -56,13 +72,22 @@ class RGBDSequence(ABC):
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
-    def has_poses(self) -> bool:
-        """Whether any of the frames may have a true pose; some of them may lack it. Asked before any frame is read."""
-        return True
 
-    def scene_truth(self) -> SceneTruth | None:
-        """The true instances of the chosen frames' scene, None where nobody labelled it."""
-        return None
+class LiveVideo(RGBDVideo):
+    """An RGB-D video that goes on while it is mapped. What comes while nobody has time for it is dropped."""
+
+    @abstractmethod
+    def frames(self) -> Generator[FrameReader | None]:
+        """The frames as they come, and None at least ten times a second while none does; ends with the video.
+
+        Frames have growing numbers, and for a timestamp the time when they were there, s since 1970 by this computer's
+        clock. Each is read once or not at all, in another thread, while the iterator waits for the next one. The device
+        or folder is opened when the first is asked for, and given back when the iterator is closed, which may happen
+        wherever it yields. Raises DataError when it cannot be opened, or fails.
+        """
+
+    def has_poses(self) -> bool:
+        return False
 
 
 class Detector(ABC):

@@ -46,18 +46,27 @@ class TrackedFrame:
 
 
 @dataclass(frozen=True)
+class LiveFigures:
+    """What only a live video has."""
+
+    frames_dropped: int  # came while another was in work, and a newer one followed
+    latencies: tuple[float, ...]  # s, from when a frame was there to when it was in the map, of each fused frame
+
+
+@dataclass(frozen=True)
 class RunResult:
-    """What a run over a sequence leaves in memory."""
+    """What a run over a video leaves in memory."""
 
     scene: SceneMap
-    frames: int  # taken from the sequence: mapped, lost and skipped ones
+    frames: int  # taken from the video: mapped, lost and skipped ones
     frames_skipped: int  # could not be used: unreadable, inconsistent, or without a pose where poses are given
     tracked: tuple[TrackedFrame, ...]  # in order, lost frames included
     timings: tuple[StageTime, ...]
     seconds: float  # wall clock of the whole loop
-    stopped_by: BaseException | None = None  # what ended it early; None = the sequence was mapped to its end
+    stopped_by: BaseException | None = None  # what ended it early; None = the video was mapped to its end
     intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
     pose_source: str = PoseTracker.pose_source
+    live: LiveFigures | None = None  # None = of a recording, which is mapped whole
 
     @property
     def frames_lost(self) -> int:
@@ -80,7 +89,7 @@ class Journal:
     """Keeps the record of a run while it goes on, and shows its progress where a terminal is watching."""
 
     scene: SceneMap
-    frames_expected: int
+    frames_expected: int | None  # None = of a live video, which goes on as long as it likes
     pose_source: str
     frames: int = 0
     frames_skipped: int = 0
@@ -92,6 +101,8 @@ class Journal:
     stopped_by: BaseException | None = None
     frames_began: list[float] = field(default_factory=list)  # s, when each frame was taken
     lost_for: int = 0  # frames up to the last one
+    frames_dropped: int = 0
+    latencies: list[float] = field(default_factory=list)  # s
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
@@ -115,6 +126,8 @@ class Journal:
             log.warning("%d of %d frames skipped, as no pose is given for them; the first: %s", *told)
         if self._faults > SKIPS_LOGGED:
             log.warning("%d frames skipped in all", self.frames_skipped)
+        if self.frames_dropped:
+            log.warning("%d frames dropped: they came while others were mapped", self.frames_dropped)
 
     @contextmanager
     def timed(self, frame: int, stage: str) -> Iterator[None]:
@@ -130,7 +143,10 @@ class Journal:
         now = time.perf_counter()
         self.frames_began.append(now)
         if not self._bar.disable and now - self._counted_at > COUNT_INTERVAL_S:
-            self._bar.set_postfix(instances=self.scene.instance_count, refresh=False)
+            counts = {"instances": self.scene.instance_count}
+            if self.frames_expected is None:
+                counts["dropped"] = self.frames_dropped
+            self._bar.set_postfix(counts, refresh=False)
             self._counted_at = time.perf_counter()
 
     def frame_skipped(self, error: FrameError) -> None:
@@ -161,6 +177,11 @@ class Journal:
             log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
             self.lost_for = 0
 
+    def frame_fused(self, frame: Frame) -> None:
+        """Keeps how old a frame of a live video is when the map has it."""
+        if self.frames_expected is None:
+            self.latencies.append(time.time() - frame.timestamp)
+
     def result(self) -> RunResult:
         """The run as it stands once the loop has ended."""
         return RunResult(
@@ -173,4 +194,5 @@ class Journal:
             stopped_by=self.stopped_by,
             intervals=tuple(np.diff(self.frames_began).tolist()),
             pose_source=self.pose_source,
+            live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
         )

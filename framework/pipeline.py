@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from functools import partial
+from itertools import repeat
 from typing import TypeVar, cast
 
 import numba
@@ -17,8 +17,9 @@ import numba
 from framework.data import Detections, Frame, Pose
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
+from framework.frame_stream import FrameStream, stream_of
 from framework.geometry import lift
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence, RGBDVideo
 from framework.interruption import Interruption, signals_deferred
 from framework.journal import Journal, RunResult, StageTime
 from framework.refinement.refine import refine
@@ -31,57 +32,66 @@ Outcome = TypeVar("Outcome")
 
 @dataclass
 class Pipeline:
-    """The four stages and the loop over them: `Pipeline(detector, tracker, refiner, fuser).run(sequence)`."""
+    """The four stages and the loop over them: `Pipeline(detector, tracker, refiner, fuser).run(video)`."""
 
     detector: Detector
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    ahead: int = 2  # frames that a worker thread reads and detects in front of the mapping; 0 = no thread
+    ahead: int = (
+        2  # frames that a worker thread reads and detects in front of the mapping, 1 of a live video; 0 = no thread
+    )
 
     def __post_init__(self) -> None:
         if self.ahead < 0:
             raise ConfigError(f"Pipeline: ahead must be 0 or more frames, found {self.ahead}")
 
-    def run(self, sequence: RGBDSequence) -> RunResult:
-        """Maps `sequence` frame by frame.
+    def run(self, video: RGBDVideo) -> RunResult:
+        """Maps `video` frame by frame.
 
         A frame that raises FrameError, as one without a pose where poses are given (NoPoseError), is skipped, a frame
         whose pose is lost is not fused; both are counted. Ctrl-C (once the frame in work is done) and a full map end
-        the loop early: the result holds what has been mapped so far, and `stopped_by` says why.
+        the loop early: the result holds what has been mapped so far, and `stopped_by` says why. A live video ends by
+        Ctrl-C, which is then no fault; its frames that nobody has time for are dropped and counted.
 
         Raises DataError when nothing could be mapped, and whatever else a stage raises.
         """
-        result = self.run_to_any_end(sequence)
+        result = self.run_to_any_end(video)
         if result.stopped_by is None or isinstance(result.stopped_by, KeyboardInterrupt | MapFullError):
             return result
         raise result.stopped_by
 
-    def run_to_any_end(self, sequence: RGBDSequence) -> RunResult:
-        """Maps `sequence` likewise; a stage's fault, too, is in `stopped_by` once a part of a frame is in the map."""
-        if len(sequence) == 0:
-            raise DataError(f"{sequence.name}: there are no frames to map: start, stop and stride leave none")
-        if self.tracker.pose_source == "ground_truth" and not sequence.has_poses():
-            raise DataError(f"{sequence.name}: none of the {len(sequence)} frames has a true pose; {WITHOUT_POSES}")
-        warn_outside_domain(self.detector, sequence)
-        journal = Journal(self.fuser.scene, len(sequence), self.tracker.pose_source)
+    def run_to_any_end(self, video: RGBDVideo) -> RunResult:
+        """Maps `video` likewise; a stage's fault, too, is in `stopped_by` once a part of a frame is in the map."""
+        frames_expected = len(video) if isinstance(video, RGBDSequence) else None
+        if frames_expected == 0:
+            raise DataError(f"{video.name}: there are no frames to map: start, stop and stride leave none")
+        if self.tracker.pose_source == "ground_truth" and not video.has_poses():
+            frames = "its frames" if frames_expected is None else f"the {frames_expected} frames"
+            raise DataError(f"{video.name}: none of {frames} has a true pose; {WITHOUT_POSES}")
+        warn_outside_domain(self.detector, video)
+        journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
         with journal, signals_deferred(signal.SIGINT) as interruption:
             try:
                 with interruption.second_ends_at_once("after this frame"):
-                    self.map_all(sequence, journal, interruption)
+                    self.map_all(video, journal, interruption)
             except BaseException as stop:
                 journal.stopped_by = stop
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
+            if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
+                journal.stopped_by = None  # that is how it ends; a second signal is another Interrupted
             return journal.result()
         if self.fuser.scene.voxel_count == 0:
-            raise DataError(f"{sequence.name}: {self.why_nothing(journal)}")
+            raise DataError(f"{video.name}: {self.why_nothing(journal)}")
         return journal.result()
 
     def why_nothing(self, journal: Journal) -> str:
         """What became of the frames of a run whose map is empty."""
         result = journal.result()
+        if result.frames == 0:
+            return "no frame came"
         if journal.without_pose == result.frames:
             first = journal.first_without_pose
             return f"no pose is given for any of the {result.frames} frames; the first: {first}; {WITHOUT_POSES}"
@@ -99,9 +109,9 @@ class Pipeline:
             f"{count} {what}" for count, what in parts if count
         )
 
-    def map_all(self, sequence: RGBDSequence, journal: Journal, interruption: Interruption) -> None:
+    def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""
-        with closing(self.detect_ahead(sequence, journal, interruption)) as detected:
+        with closing(self.detect_ahead(video, journal, interruption)) as detected:
             for frame, detections in detected:
                 try:
                     self.map_frame(frame, detections, journal)
@@ -110,16 +120,22 @@ class Pipeline:
                 interruption.check()
 
     def detect_ahead(
-        self, sequence: RGBDSequence, journal: Journal, interruption: Interruption
+        self, video: RGBDVideo, journal: Journal, interruption: Interruption
     ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
-        Frame k + 1 is read and detected while frame k is tracked and fused; the results do not depend on it.
+        Frame k + 1 is read and detected while frame k is tracked and fused; the results of a recording do not depend on
+        it. What comes of a live video meanwhile is dropped, but for the newest frame.
         """
-        read_and_detect = partial(self.read_and_detect, sequence)
-        with closing(map_ahead(read_and_detect, range(len(sequence)), self.ahead)) as outcomes:
+        stream = stream_of(video, lambda: interruption.asked is not None)
+        ahead = self.ahead if stream.most_ahead is None else min(self.ahead, stream.most_ahead)
+        # the stream ends first: the worker may be waiting for its next frame
+        with closing(map_ahead(self.read_and_detect, repeat(stream), ahead)) as outcomes, stream:
             for outcome in outcomes:
                 interruption.check()  # waiting for a frame may have taken long
+                journal.frames_dropped = stream.dropped
+                if outcome is None:
+                    return
                 journal.frame_begins()
                 if isinstance(outcome, FrameError):
                     journal.frame_skipped(outcome)
@@ -128,11 +144,14 @@ class Pipeline:
                 journal.timings += timings
                 yield frame, detections
 
-    def read_and_detect(self, sequence: RGBDSequence, k: int) -> tuple[Frame, Detections, list[StageTime]] | FrameError:
-        """Frame k, its detections and what they took; or why that frame cannot be used."""
+    def read_and_detect(self, stream: FrameStream) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
+        """The next frame, its detections and what they took; or why it cannot be used. None at the end."""
+        read_frame = stream.take()
+        if read_frame is None:
+            return None
         try:
             started = time.perf_counter()
-            frame = sequence[k]
+            frame = read_frame()
             read = time.perf_counter()
             detections = self.detector.detect(frame)
             detected = time.perf_counter()
@@ -163,6 +182,7 @@ class Pipeline:
         journal.frames_in_map += 1
         with journal.timed(frame.index, "fuse"):
             self.fuser.fuse(frame, pose, clusters)
+        journal.frame_fused(frame)
         return pose
 
 

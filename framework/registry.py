@@ -24,10 +24,10 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.configs import config_directory
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF, PROJECT_ROOT
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo
 
 STAGES: Mapping[str, type[Any]] = {
-    "dataset": RGBDSequence,
+    "dataset": RGBDVideo,
     "detector": Detector,
     "tracker": PoseTracker,
     "refiner": ClusterRefiner,
@@ -107,8 +107,8 @@ def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]
 
 
 def stage_of(interface: type) -> str:
-    """The config group whose options implement `interface`."""
-    return next(stage for stage, of in STAGES.items() if of is interface)
+    """The config group whose options implement `interface`, or one that it is a kind of."""
+    return next(stage for stage, of in STAGES.items() if issubclass(interface, of))
 
 
 def _refuse_unregistered(loader: Any, stage: str, target: str) -> None:

@@ -18,7 +18,7 @@ from framework.data import Camera, Float64, Frame
 from framework.datasets.reading import PoseReading
 from framework.datasets.recording import Recording
 from framework.errors import DataError, FrameError
-from framework.interfaces import RGBDSequence
+from framework.interfaces import RGBDSequence, RGBDVideo
 
 LOOKED_AT = 12  # frames, spread over the sequence
 GLANCED_AT, GLANCED_STEPS = (0.1, 0.35, 0.6, 0.85), (1, 4, 16)  # shares of the sequence; frames from there
@@ -88,9 +88,9 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     return RecordingCheck(tuple(findings), _summary(sequence, frames), tuple(frames), tuple(by_delay), judgement, shown)
 
 
-def warn_of_poses(sequence: RGBDSequence) -> None:
+def warn_of_poses(sequence: RGBDVideo) -> None:
     """The cheap part of it, at the start of a run: says in the log where the given poses do not fit a few frames."""
-    if not sequence.has_poses():
+    if not isinstance(sequence, RGBDSequence) or not sequence.has_poses():
         return
     starts = [int(share * len(sequence)) for share in GLANCED_AT]
     pairs = [pair for pair in Matcher(sequence).pairs(starts, GLANCED_STEPS) if _posed(pair)]

@@ -46,11 +46,12 @@ def job(config: DictConfig) -> None:
 
 
 def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) -> Interruption:
-    """Maps the config's sequence with its stages and leaves the run's record in `directory`.
+    """Maps the config's video with its stages and leaves the run's record in `directory`.
 
     `choices` are the options that were chosen, by config group. This is where it is decided how a run ends:
 
-    - completed: the record is whole. A signal that came while it was written is in the Interruption that this returns.
+    - completed: the record is whole. A signal that came while it was written is in the Interruption that this returns,
+      as is the one that ended a live video.
     - partial: there is a map, and a signal, a stage or the disk has ended the run. What was mapped is written as far as
       it goes, marked as partial; then Interrupted is raised, or PartialRunError from what ended it.
     - nothing to keep: raises what ended the run before anything was mapped.
@@ -60,22 +61,23 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.api import pipeline_of  # here: a misspelt name is answered before these load
     from framework.checking.recording_check import warn_of_poses
     from framework.detection.cache import cache_metrics
-    from framework.interfaces import RGBDSequence
+    from framework.interfaces import RGBDSequence, RGBDVideo
     from framework.records.run_record import RunRecord, reason
     from framework.registry import STAGES, build
     from framework.settings import Settings
 
     Settings.of(config).apply()
     pipeline = pipeline_of(config)
-    sequence = build(RGBDSequence, config.get("dataset"))  # after the stages: making up a room takes longest
+    video = build(RGBDVideo, config.get("dataset"))  # after the stages: making up a room takes longest
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
-    log.info("mapping %s: %d frames, %s", sequence.name, len(sequence), chosen)
-    warn_of_poses(sequence)
+    length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
+    log.info("mapping %s: %s, %s", video.name, length, chosen)
+    warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption:
-        result = pipeline.run_to_any_end(sequence)
+        result = pipeline.run_to_any_end(video)
         with interruption.second_ends_at_once("once the record is written"):
-            fault = record.write(sequence, result, cache_metrics(pipeline.detector))
+            fault = record.write(video, result, cache_metrics(pipeline.detector))
     if fault is None:
         return interruption
     if isinstance(fault, Exception):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from typing import Protocol, runtime_checkable
 
-from framework.interfaces import Detector, RGBDSequence
+from framework.interfaces import Detector, RGBDVideo
 
 log = logging.getLogger(__name__)
 
@@ -20,7 +20,7 @@ OF_PHOTOGRAPHS = "maskrcnn2go"
 class OfADomain(Protocol):
     """A detector that is good for pictures of some kind only."""
 
-    domain: str  # what `RGBDSequence.domain` must be; "" = whatever it is
+    domain: str  # what `RGBDVideo.domain` must be; "" = whatever it is
 
 
 def domain_of(detector: Detector) -> str:
@@ -28,12 +28,12 @@ def domain_of(detector: Detector) -> str:
     return detector.domain if isinstance(detector, OfADomain) else ""
 
 
-def warn_outside_domain(detector: Detector, sequence: RGBDSequence | None) -> None:
-    """Says so in the log, in one line, when a detector sees what it is not for. `sequence`: None = it is not known."""
+def warn_outside_domain(detector: Detector, video: RGBDVideo | None) -> None:
+    """Says so in the log, in one line, when a detector sees what it is not for. `video`: None = it is not known."""
     domain = domain_of(detector)
-    if domain in ("", sequence.domain if sequence else ""):
+    if domain in ("", video.domain if video else ""):
         return
-    pictures = f"the pictures of {sequence.name} are" if sequence else "your frames are"
+    pictures = f"the pictures of {video.name} are" if video else "your frames are"
     log.warning(
         "the detector was trained on %s alone, and nothing says that %s such: what it finds there may be nonsense, "
         "however sure it is; use detector=%s",

@@ -11,7 +11,7 @@ from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.evaluation import instances, trajectory
 from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.files.hashing import add_values
-from framework.interfaces import RGBDSequence
+from framework.interfaces import RGBDVideo
 from framework.journal import RunResult
 
 Metrics = dict[str, float | int | str | bool | None]
@@ -22,7 +22,7 @@ STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
 
 
 def run_metrics(result: RunResult) -> Metrics:
-    """Counts, speed, time by stage and the size of the map."""
+    """Counts, speed, time by stage and the size of the map; of a live video also what it dropped, and its latency."""
     metrics: Metrics = {
         "frames": result.frames,
         "frames_lost": result.frames_lost,
@@ -38,6 +38,11 @@ def run_metrics(result: RunResult) -> Metrics:
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
         metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
         metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
+    if result.live is not None:
+        latencies = 1e3 * np.array(result.live.latencies)
+        metrics["frames_dropped"] = result.live.frames_dropped
+        metrics["latency_ms"] = float(np.median(latencies)) if len(latencies) else None
+        metrics["latency_ms.p95"] = float(np.percentile(latencies, 95)) if len(latencies) else None
     return metrics
 
 
@@ -51,14 +56,14 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 
 def instance_metrics(
-    sequence: RGBDSequence, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
+    video: RGBDVideo, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
 ) -> Metrics:
     """How many instances were found and, where the true ones are known, how well."""
     count: Metrics = {"instances.count": len(found)}
-    truth = sequence.scene_truth()
+    truth = video.scene_truth()
     if truth is None:
         return count
-    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, sequence.annotation)
+    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, video.annotation)
 
 
 def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:

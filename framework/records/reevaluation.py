@@ -14,7 +14,7 @@ from framework.errors import DataError
 from framework.evaluation.instances import PredictedInstances
 from framework.files.directory_lock import locked
 from framework.files.json_file import write_json
-from framework.interfaces import RGBDSequence
+from framework.interfaces import RGBDVideo
 from framework.records.metrics import TRUTH, evaluation_metrics, is_evaluation
 from framework.records.provenance import code_version, leaves
 from framework.records.stored_map import read_objects
@@ -27,7 +27,7 @@ class Truth:
     """What a run's dataset knows about its scene."""
 
     scene: SceneTruth | None  # None = nobody labelled it
-    annotation: str  # RGBDSequence.annotation
+    annotation: str  # RGBDVideo.annotation
 
     @classmethod
     def of(cls, config: Mapping[str, Any]) -> Truth:
@@ -39,8 +39,8 @@ class Truth:
         for key, value in leaves({"dataset": config.get("dataset")}):
             if "${" in str(value):
                 raise DataError(f"a run's config is stored resolved, and this one is not: {key}={value}")
-        sequence = build(RGBDSequence, node)  # type: ignore[type-abstract]
-        return cls(sequence.scene_truth(), sequence.annotation)
+        video = build(RGBDVideo, node)
+        return cls(video.scene_truth(), video.annotation)
 
 
 @dataclass(frozen=True)

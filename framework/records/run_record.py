@@ -21,7 +21,7 @@ from framework.errors import InstanceMapError
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
 from framework.files.whole_files import remove_left_over, written_whole
-from framework.interfaces import RGBDSequence, SceneMap
+from framework.interfaces import RGBDVideo, SceneMap
 from framework.journal import RunResult
 from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.instances_file import write_instances
@@ -68,7 +68,7 @@ class RunRecord:
         return cls(directory, asked, choices, inputs, provenance)
 
     def write(
-        self, sequence: RGBDSequence, result: RunResult, counts: Mapping[str, int] | None = None
+        self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None
     ) -> BaseException | None:
         """Writes everything that the run found, and says the main figures in the log.
 
@@ -93,29 +93,29 @@ class RunRecord:
         if found is not None:
             attempt(write_instances, self.directory / "instances.json", *found, scene.classes)
             figures["instances.count"] = len(found[1])
-        attempt(self._write_partial, sequence, figures, attempt.fault)
+        attempt(self._write_partial, video, figures, attempt.fault)
         if found is not None:
             attempt(write_mesh, self.directory / "mesh.ply", found[0])
         attempt(scene.save, self.directory / "map.npz")
         if found is not None:
-            figures |= attempt(instance_metrics, sequence, *found, scene.classes) or {}
+            figures |= attempt(instance_metrics, video, *found, scene.classes) or {}
         figures |= attempt(trajectory_metrics, result) or {}
-        title = headline({"sequence": sequence.name, **figures})
+        title = headline({"sequence": video.name, **figures})
         if found is not None:
             labels = _labels(found[1], scene.classes)
             attempt(write_overview, self.directory / "overview.png", found[0], labels, poses, title)
         if attempt.fault is None:
-            attempt(write_json, self.directory / METRICS, self._metrics(sequence, figures))
+            attempt(write_json, self.directory / METRICS, self._metrics(video, figures))
         if attempt.fault is None:
             (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
         else:
-            attempt(self._write_partial, sequence, figures, attempt.fault)
+            attempt(self._write_partial, video, figures, attempt.fault)
         self._announce(title, labels if found is not None else {}, figures, attempt.fault)
         return attempt.fault
 
-    def _metrics(self, sequence: RGBDSequence, figures: Metrics) -> Metrics:
+    def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
         return {
-            "sequence": sequence.name,
+            "sequence": video.name,
             **{f"choice.{group}": self.choices.get(group) for group in STAGES},
             **figures,
             "peak_rss_bytes": peak_memory(),
@@ -125,10 +125,10 @@ class RunRecord:
             **self.provenance,
         }
 
-    def _write_partial(self, sequence: RGBDSequence, figures: Metrics, fault: BaseException | None) -> None:
+    def _write_partial(self, video: RGBDVideo, figures: Metrics, fault: BaseException | None) -> None:
         """Says what there is of a record that is not whole, and why; no fault = it is being written."""
         why = "its record was not finished" if fault is None else reason(fault)
-        write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(sequence, figures)})
+        write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
 
     def _announce(
         self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, fault: BaseException | None
@@ -182,7 +182,7 @@ def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict
     }
 
 
-_FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped"}
+_FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped", "frames_dropped": "dropped"}
 _QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
 
 
@@ -192,6 +192,8 @@ def headline(metrics: Mapping[str, Any]) -> str:
     if "frames" in metrics:
         parts += [f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
     parts += [f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics.get(key)]
+    if metrics.get("latency_ms") is not None:
+        parts.append(f"latency {metrics['latency_ms']:.0f} ms")
     if metrics.get("pose_source") == "ground_truth":
         parts.append("given poses")
     elif metrics.get("trajectory.ate_rmse_m") is not None:

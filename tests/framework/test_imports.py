@@ -15,6 +15,7 @@ LAYERS = [
     ["data", "interruption", "parameters", "settings"],
     ["geometry", "sensor_noise"],
     ["interfaces"],
+    ["frame_stream"],
     ["files"],
     ["configs", "label_spaces"],
     ["registry"],

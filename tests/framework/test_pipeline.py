@@ -235,7 +235,7 @@ def test_a_fault_before_anything_is_in_the_map_is_raised(room: CornerRoom, ahead
 
 
 @dataclass
-class _PressesCtrlC(GivenPose):
+class PressesCtrlC(GivenPose):
     times: int = 1
     at: int = 3
     noted: list[int] = field(default_factory=list)
@@ -256,7 +256,7 @@ def working_threads() -> int:
 @AHEAD
 def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, ahead: int) -> None:
     handler, threads = signal.getsignal(signal.SIGINT), working_threads()
-    result = pipeline(ahead, tracker=_PressesCtrlC()).run(room)
+    result = pipeline(ahead, tracker=PressesCtrlC()).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
     assert (result.frames, len(mapped(result).vertices)) == (4, 4)
     assert signal.getsignal(signal.SIGINT) is handler
@@ -264,7 +264,7 @@ def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, ahead: int) -> No
 
 
 def test_a_second_ctrl_c_ends_it_at_once(room: CornerRoom) -> None:
-    result = pipeline(tracker=_PressesCtrlC(times=2)).run(room)
+    result = pipeline(tracker=PressesCtrlC(times=2)).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
     assert len(mapped(result).vertices) == 3
 

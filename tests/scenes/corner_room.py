@@ -7,8 +7,9 @@ z forward, like the first camera.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,16 @@ from framework.data import (
 from framework.errors import DataError, FrameError, MapFullError
 from framework.files.whole_files import written_whole
 from framework.geometry import back_project, exp_se3, transform
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
+from framework.interfaces import (
+    ClusterRefiner,
+    Detector,
+    FrameReader,
+    LiveVideo,
+    MapFuser,
+    PoseTracker,
+    RGBDSequence,
+    SceneMap,
+)
 
 CLASSES = ("chair", "couch")
 CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
@@ -108,6 +118,44 @@ class CornerRoom(RGBDSequence):
         v, u = np.nonzero(depth > 0)
         points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])
         return SceneTruth(points, ids[v, u], dict(enumerate(CLASSES, start=1)))
+
+
+@dataclass
+class LiveRoom(LiveVideo):
+    """The room as a camera in it sends it, with true poses."""
+
+    frames_sent: int = 6  # then it ends
+    period_s: float = -1.0  # from frame to frame; -1 = each comes when the one before was read, so that none is dropped
+    unreadable: int = -1  # reading this frame raises FrameError; -1 = none
+    fails_after: int = -1  # it breaks down after so many frames; -1 = never
+
+    def __post_init__(self) -> None:
+        self.name = "live_room"
+        self.room = CornerRoom(frames=self.frames_sent, unreadable=self.unreadable)
+        self.sent = self.read = 0
+        self.closed = False
+
+    def has_poses(self) -> bool:
+        return True
+
+    def frames(self) -> Generator[FrameReader | None]:
+        try:
+            yield None
+            for k in range(self.frames_sent):
+                if k == self.fails_after:
+                    raise DataError("live_room: the cable is out")
+                due = time.monotonic() + self.period_s
+                while time.monotonic() < due or (self.period_s < 0 and self.read < k):
+                    time.sleep(0.001)
+                    yield None
+                self.sent += 1
+                yield partial(self._read, k, time.time())
+        finally:
+            self.closed = True
+
+    def _read(self, k: int, timestamp: float) -> Frame:
+        self.read += 1
+        return replace(self.room[k], timestamp=timestamp)
 
 
 @dataclass

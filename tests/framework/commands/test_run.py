@@ -187,6 +187,48 @@ def test_a_second_one_leaves_what_is_written_whole(tmp_path: Path) -> None:
     assert figures(place)["partial"] == "its record was not finished"
 
 
+LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "fuser.note=note")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_the_end_of_a_live_video(tmp_path: Path, number: signal.Signals) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *LIVE, f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    process.send_signal(number)
+    status, stderr = end(process)
+    assert status == 0, stderr
+    assert "mapping live_room: live until Ctrl-C" in stderr
+    assert "partial" not in stderr
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.json"}
+    assert not (place / "metrics.partial.json").exists()
+    left = figures(place, "metrics.json")
+    assert left["frames_dropped"] == 0
+    assert isinstance(left["latency_ms"], float)
+    assert left["frames"] == len((place / "trajectory.txt").read_text().splitlines()) > 0
+
+
+def test_a_second_signal_leaves_a_live_video_partial(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *LIVE, "fuser.slow_s=2", f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    time.sleep(0.5)  # in the middle of the second frame
+    for number in (signal.SIGTERM, signal.SIGTERM):
+        process.send_signal(number)
+        time.sleep(0.05)
+    status, stderr = end(process)
+    assert status == 143, stderr
+    assert figures(place)["partial"] == "ended by SIGTERM"
+
+
+def test_a_live_video_that_breaks_down_leaves_a_partial_record(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    status, stderr = end(begin(tmp_path, "dataset=live", "dataset.fails_after=3", f"hydra.run.dir={place}"))
+    assert status == 3
+    assert "the cable is out" in stderr.splitlines()[-1]
+    assert figures(place)["frames"] == 3
+
+
 def test_in_a_sweep_a_signal_while_a_record_is_written_ends_it_after_that(tmp_path: Path) -> None:
     sweep = (
         "hydra.mode=MULTIRUN",
