@@ -46,6 +46,12 @@ def _replica_nice_slam(root: Path) -> list[str]:
     return [f"dataset.root={root}", "dataset.scene=room0"]
 
 
+def _folder_watch(root: Path) -> list[str]:
+    _rgbd_folder(root)
+    (root / "end").touch()
+    return [f"dataset.root={root}"]
+
+
 def _rgbd_folder(root: Path) -> list[str]:
     _images(f"{root}/color/{{:06d}}.png", f"{root}/depth/{{:06d}}.png")
     camera = {"width": CAMERA.width, "height": CAMERA.height, "fx": 90.0, "fy": 90.0, "cx": 47.5, "cy": 35.5}
@@ -153,6 +159,7 @@ def _trajectory_file(folder: Path) -> list[str]:
 
 
 WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
+    ("dataset", "folder_watch"): _folder_watch,
     ("dataset", "replica_nice_slam"): _replica_nice_slam,
     ("dataset", "rgbd_folder"): _rgbd_folder,
     ("dataset", "scannet"): _scannet,

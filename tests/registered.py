@@ -9,14 +9,17 @@ from omegaconf import DictConfig
 
 from framework.commands.plugins import registered
 from framework.files.search_paths import CONF
-from framework.registry import STAGES, build
+from framework.registry import STAGES, build, find_class
 
 OPTIONS = [(stage, option.name) for stage in STAGES for option in registered(stage)]
 
 
-def names(stage: str) -> list[str]:
-    """The options of one stage."""
-    return [name for of, name in OPTIONS if of == stage]
+def names(stage: str, kind: type = object) -> list[str]:
+    """The options of one stage, or those of them whose class is of a kind."""
+    found = [name for of, name in OPTIONS if of == stage]
+    return [
+        name for name in found if issubclass(find_class(STAGES[stage], composed(stage, name)[stage]._target_), kind)
+    ]
 
 
 def composed(stage: str, name: str, *overrides: str) -> DictConfig:

@@ -13,6 +13,7 @@ from omegaconf import OmegaConf
 from framework.commands.plugins import registered as options_of
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
+from framework.interfaces import RGBDSequence
 from framework.registry import STAGES, find_class, parameter_fields, parameters, plugin_fields
 from framework.tables.comparison import TableChoice
 from framework.training.trainer import Schedule
@@ -96,8 +97,8 @@ def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> N
     assert set(table) == {field.name for field in dataclasses.fields(TableChoice)}
 
 
-@pytest.mark.parametrize("name", registered.names("dataset"))
-def test_every_dataset_can_be_cut(name: str) -> None:
+@pytest.mark.parametrize("name", registered.names("dataset", RGBDSequence))
+def test_every_recording_can_be_cut(name: str) -> None:
     assert {"start", "stop", "stride", "share"} <= set(registered.composed("dataset", name).dataset)
 
 

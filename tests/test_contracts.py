@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import is_dataclass, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +16,7 @@ import pytest
 from framework.data import Detections, Frame, FrameTruth, PointClusters, Pose
 from framework.errors import DataError
 from framework.geometry import lift
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence
 from tests import registered
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 from tests.thread_counts import by_one_thread_and_two
@@ -32,7 +35,7 @@ def same(a: object, b: object) -> bool:
 # Datasets
 
 
-@pytest.fixture(params=registered.names("dataset"), scope="module")
+@pytest.fixture(params=registered.names("dataset", RGBDSequence), scope="module")
 def sequence(request: pytest.FixtureRequest, ready: Ready) -> RGBDSequence:
     sequence: RGBDSequence = ready("dataset", request.param)
     return sequence
@@ -51,6 +54,44 @@ def test_dataset_gives_frames_of_its_camera(sequence: RGBDSequence) -> None:
 def test_dataset_is_in_order(sequence: RGBDSequence) -> None:
     first, last = sequence[0], sequence[len(sequence) - 1]
     assert len(sequence) == 1 or (last.index > first.index and last.timestamp > first.timestamp)
+
+
+@pytest.fixture(params=registered.names("dataset", LiveVideo))
+def video(request: pytest.FixtureRequest, ready: Ready) -> LiveVideo:
+    video: LiveVideo = ready("dataset", request.param)
+    return video
+
+
+def come(video: LiveVideo) -> Iterator[Frame]:
+    """The frames, which can be read; something is said while none comes."""
+    with closing(video.frames()) as readers:
+        said = time.monotonic()
+        for reader in readers:
+            assert time.monotonic() - said < 1, "ten times a second, but for a busy machine"
+            if reader is not None:
+                yield reader()
+            said = time.monotonic()
+
+
+def test_live_video_gives_frames_of_this_moment_in_order(video: LiveVideo) -> None:
+    began = time.time()
+    frames = list(islice(come(video), 2))
+    assert video.name
+    assert len(frames) == 2
+    assert all((frame.depth > 0).any() for frame in frames)
+    assert frames[0].camera == frames[1].camera
+    assert frames[0].index < frames[1].index
+    assert began <= frames[0].timestamp < frames[1].timestamp <= time.time()
+
+
+def test_live_video_is_given_back_and_can_be_opened_again(video: LiveVideo) -> None:
+    for _ in range(2):
+        assert len(list(islice(come(video), 1))) == 1
+
+
+def test_live_video_knows_no_truth(video: LiveVideo) -> None:
+    assert video.scene_truth() is None
+    assert not video.has_poses()
 
 
 # Detectors

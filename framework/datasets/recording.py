@@ -11,20 +11,18 @@ from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
-
 from framework.data import Camera, Float32, Frame, FrameTruth
+from framework.datasets.calibration import Calibration, check_max_depth
 from framework.datasets.frame_selection import TO_THE_END, check_selection, choose_frames
 from framework.datasets.reading import DepthReading, PoseReading
 from framework.datasets.stored_frames import RecordedFrame
-from framework.datasets.undistortion import Distortion, Undistortion
-from framework.errors import ConfigError, DataError, FrameError
+from framework.datasets.undistortion import Distortion
+from framework.errors import DataError, FrameError
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
 FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
 FRAME_RATE = 30.0  # Hz, of recordings without timestamps, or with some that cannot be
-NO_READING = 65535  # uint16 that several sensors write instead of 0
 
 log = logging.getLogger(__name__)
 
@@ -61,17 +59,18 @@ class Recording(RGBDSequence):
 
     def __post_init__(self) -> None:
         check_selection(self.start, self.stop, self.stride, self.share)
-        if not (math.isfinite(self.max_depth) and self.max_depth >= 0):
-            raise ConfigError(f"dataset.max_depth must be 0 (keep all) or positive metres, found {self.max_depth}")
+        check_max_depth(self.max_depth)
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
         if not self.folder.is_dir():
             project = "" if self.root.is_absolute() else ", neither here nor in a checkout of the project"
             raise DataError(f"dataset.root: the folder {self.folder} does not exist{project}")
         self.name = self.folder.resolve().name
-        self.contents = self._read(self.open())
-        self.camera = self.contents.camera
-        self.lens = Undistortion(self.camera, self.contents.distortion) if self.contents.distortion else None
+        self.contents = stored = self._read(self.open())
+        self.camera = stored.camera
+        self.calibration = Calibration(
+            self.camera, stored.camera_source, stored.depth_scale, self.max_depth, stored.distortion
+        )
         self.chosen = choose_frames(
             len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
         )
@@ -104,12 +103,10 @@ class Recording(RGBDSequence):
         recorded = self.contents.frames[index]
         if recorded.fault:
             raise FrameError(f"frame {index}: {recorded.fault}")
-        color = recorded.images.color()
-        self.check_size(recorded.images.color_name, color.shape)
         return Frame(
             index=index,
             timestamp=recorded.timestamp,
-            color=self.lens.smooth(color) if self.lens else color,
+            color=self.calibration.color(recorded.images.color(), recorded.images.color_name),
             depth=self.metric_depth(index),
             camera=self.camera,
             T_world_camera=recorded.T_world_camera,
@@ -119,23 +116,7 @@ class Recording(RGBDSequence):
     def metric_depth(self, index: int) -> Float32:
         """(H, W) m, 0 = no reading. Raises FrameError."""
         images = self.contents.frames[index].images
-        raw = images.depth()
-        self.check_size(images.depth_name, raw.shape)
-        depth = raw.astype(np.float32)
-        depth /= np.float32(self.contents.depth_scale)
-        depth[raw == NO_READING] = 0
-        if self.max_depth:
-            depth[depth > self.max_depth] = 0
-        return self.lens.exact(depth) if self.lens else depth
-
-    def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
-        """Raises FrameError unless an image has the camera's size."""
-        if shape[:2] != self.camera.shape:
-            raise FrameError(f"{name} is {_size(shape)}, but {self._expected_size()}")
-
-    def _expected_size(self) -> str:
-        source = self.contents.camera_source
-        return f"{source} says {_size(self.camera.shape)}; colour, depth and camera must agree"
+        return self.calibration.depth(images.depth(), images.depth_name)
 
     def _check_first_image(self) -> None:
         """A first image of the wrong size means that all are: better said at once than by skipping every frame."""
@@ -145,8 +126,8 @@ class Recording(RGBDSequence):
                 shape = read().shape
             except FrameError:
                 continue  # damaged or of a wrong type: counted when the frame is read
-            if shape[:2] != self.camera.shape:
-                raise DataError(f"{name} is {_size(shape)}, but {self._expected_size()}")
+            if fault := self.calibration.fault_of_size(name, shape):
+                raise DataError(fault)
 
 
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
@@ -180,13 +161,13 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
         raise DataError(f"the folder {folder} is missing")
     files: dict[int, Path] = {}
     for path in _images(folder, suffixes):
-        digits = path.stem[len(_before_number(path)) :]
-        if not digits:
+        number = number_of(path)
+        if number is None:
             raise DataError(f"{path}: the file name must end in the frame's number, like 000000{path.suffix}")
-        if int(digits) in files:
-            raise DataError(f"{path} and {files[int(digits)].name} have the same frame number {int(digits)}")
-        files[int(digits)] = path
-    _check_one_number(list(files.values()))
+        if number in files:
+            raise DataError(f"{path} and {files[number].name} have the same frame number {number}")
+        files[number] = path
+    check_one_number(list(files.values()))
     if not files:
         raise DataError(f"{folder} holds no image ({', '.join(suffixes)})")
     return dict(sorted(files.items()))
@@ -198,7 +179,14 @@ def _images(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
             yield path
 
 
-def _check_one_number(files: Sequence[Path]) -> None:
+def number_of(path: Path) -> int | None:
+    """The number in which the name of an image ends; None = there is none."""
+    digits = path.stem[len(_before_number(path)) :]
+    return int(digits) if digits else None
+
+
+def check_one_number(files: Sequence[Path]) -> None:
+    """Raises DataError when the names of images differ in more than the number in which they end."""
     for path in files:
         before, of_first = _before_number(path), _before_number(files[0])
         if before != of_first and re.search("[0-9]", before + of_first):
@@ -210,7 +198,3 @@ def _check_one_number(files: Sequence[Path]) -> None:
 
 def _before_number(path: Path) -> str:
     return path.stem.rstrip("0123456789")
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]}x{shape[0]}"

@@ -74,9 +74,7 @@ class RgbdFolder(Recording):
         if not self._instances:
             return None
         path = self._instances[index]
-        raw = read_uint16(path)
-        self.check_size(path, raw.shape)
-        ids: Int32 = (self.lens.exact(raw) if self.lens else raw).astype(np.int32)
+        ids: Int32 = self.calibration.labels(read_uint16(path), path).astype(np.int32)
         unknown = [int(i) for i in np.flatnonzero(np.bincount(ids.ravel())) if i and i not in self._class_names]
         if unknown:
             raise FrameError(f"{path}: instance {unknown[0]} is not in {self.folder / 'instances.json'}")
