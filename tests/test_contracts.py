@@ -89,11 +89,6 @@ def test_live_video_is_given_back_and_can_be_opened_again(video: LiveVideo) -> N
         assert len(list(islice(come(video), 1))) == 1
 
 
-def test_live_video_knows_no_truth(video: LiveVideo) -> None:
-    assert video.scene_truth() is None
-    assert not video.has_poses()
-
-
 # Detectors
 
 

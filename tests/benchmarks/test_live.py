@@ -1,0 +1,92 @@
+"""How old a frame is when the map has it, and what is dropped: `python -m pytest tests/benchmarks -k live`.
+
+Another process writes real frames into a folder at 15 Hz, and a run with the default stages at 1 cm maps them as they
+come. INSTANCEMAP_LIVE_FRAMES=2000 feeds it longer than the 300 frames that the video has: to and fro.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from framework.files.tum_trajectory import read_tum
+from tests.benchmarks.comparison import NOTHING, Table, mib
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+FRAMES = int(os.environ.get("INSTANCEMAP_LIVE_FRAMES", "300"))
+HZ = 15.0
+PATIENCE_S = 120.0
+WARM_S = 10.0  # after which kernels are loaded, and caches are warm
+
+
+def resident(process: subprocess.Popen[str]) -> int:
+    """Bytes."""
+    pages = Path(f"/proc/{process.pid}/statm").read_text().split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="asks Linux for the memory of a process")
+def test_live_folder(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, tables: list[Table]) -> None:
+    source, watched, place = shared / "data" / "redkitchen", tmp_path / "watched", tmp_path / "run"
+    if not source.is_dir():
+        pytest.skip(f"{source} is not there")
+    watched.mkdir()
+    memory: list[int] = []
+
+    def live() -> None:
+        chosen = ["dataset=folder_watch", f"dataset.root={watched}", "fuser.voxel_size=0.01", f"hydra.run.dir={place}"]
+        line = [sys.executable, "-m", "framework", *chosen, f"dataset.camera_timeout={PATIENCE_S}"]
+        run = subprocess.Popen(line, cwd=CHECKOUT, stderr=subprocess.DEVNULL, text=True)
+        deadline = time.monotonic() + PATIENCE_S
+        while not (place / "config.yaml").exists():  # it has loaded its network, and waits for the camera
+            assert run.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.1)
+        feeding = [sys.executable, "-m", "tests.benchmarks.feeder", str(source), str(watched), str(FRAMES), str(HZ)]
+        with subprocess.Popen(feeding, cwd=CHECKOUT) as feeder:
+            while feeder.poll() is None:
+                memory.append(resident(run))
+                time.sleep(1)
+        assert run.wait(PATIENCE_S) == 0
+
+    benchmark.pedantic(live, rounds=1)
+    metrics = json.loads((place / "metrics.json").read_text())
+    assert metrics["frames"] + metrics["frames_dropped"] == FRAMES
+    there = np.loadtxt(watched / "feeder.csv", delimiter=",")[:, 1]
+    noticed, _ = read_tum(place / "trajectory.txt")
+    unnoticed = 1e3 * float(np.median([at - there[there <= at].max() for at in noticed]))
+    late = there[there >= there[0] + WARM_S]
+    late_dropped = len(late) - int((noticed >= late[0]).sum()) - metrics["frames_lost"]
+    quarters = [float(np.mean(part)) for part in np.array_split(memory, 4)]
+    tables.append(
+        Table(
+            f"Live: redkitchen in a folder at {HZ:g} Hz, {FRAMES} frames, 1 cm voxels, {os.cpu_count()} cores",
+            ["", "measured", "target"],
+            [
+                ["latency, ms, median: from when a frame was noticed to when it was fused",
+                 f"{metrics['latency_ms']:.0f}", "< 200"],
+                ["the same, 95 %", f"{metrics['latency_ms.p95']:.0f}", NOTHING],
+                ["from when its files were there to when it was noticed, ms, median", f"{unnoticed:.1f}", NOTHING],
+                ["frames a second, median", f"{metrics['fps_median']:.1f}", NOTHING],
+                ["frames mapped", f"{metrics['frames']}", NOTHING],
+                ["frames dropped", f"{metrics['frames_dropped']}", NOTHING],
+                [f"of these after the first {WARM_S:g} s, of {len(late)} frames", f"{late_dropped}", NOTHING],
+                ["frames lost", f"{metrics['frames_lost']}", NOTHING],
+                ["detect, ms, median", f"{metrics['stage_ms.detect.median']:.0f}", NOTHING],
+                ["map, MiB", mib(metrics["map.bytes"]), NOTHING],
+                *([f"resident, MiB, quarter {k}", mib(size), NOTHING] for k, size in enumerate(quarters, start=1)),
+            ],
+            ["In the first seconds kernels are loaded, and what comes meanwhile is dropped."],
+        )
+    )  # fmt: skip
+    benchmark.extra_info.update(
+        latency_ms=metrics["latency_ms"], frames_dropped=metrics["frames_dropped"], resident=quarters
+    )
