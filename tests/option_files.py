@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from types import ModuleType
 
 import cv2
 import numpy as np
@@ -17,8 +18,15 @@ from framework.files.tum_trajectory import write_tum
 from tests.recordings import write_color, write_depth
 from tests.scannet_files import shots, write_sens
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector, pose_at
+from tests.scenes.fake_realsense import FakeRealSense
 
 FRAMES = 3
+
+
+def modules(stage: str, name: str) -> dict[str, ModuleType]:
+    """The libraries of devices that an option needs, with a device in each. Nothing for one that needs none."""
+    plugged_in = {("dataset", "realsense"): {"pyrealsense2": FakeRealSense().module()}}
+    return plugged_in.get((stage, name), {})
 
 
 def overrides(stage: str, name: str, folder: Path) -> list[str]:
@@ -50,6 +58,10 @@ def _folder_watch(root: Path) -> list[str]:
     _rgbd_folder(root)
     (root / "end").touch()
     return [f"dataset.root={root}"]
+
+
+def _realsense(_: Path) -> list[str]:
+    return [f"dataset.width={CAMERA.width}", f"dataset.height={CAMERA.height}"]
 
 
 def _rgbd_folder(root: Path) -> list[str]:
@@ -160,6 +172,7 @@ def _trajectory_file(folder: Path) -> list[str]:
 
 WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("dataset", "folder_watch"): _folder_watch,
+    ("dataset", "realsense"): _realsense,
     ("dataset", "replica_nice_slam"): _replica_nice_slam,
     ("dataset", "rgbd_folder"): _rgbd_folder,
     ("dataset", "scannet"): _scannet,

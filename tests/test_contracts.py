@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -17,7 +18,7 @@ from framework.data import Detections, Frame, FrameTruth, PointClusters, Pose
 from framework.errors import DataError
 from framework.geometry import lift
 from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence
-from tests import registered
+from tests import option_files, registered
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, GridMap, SphereDetector, pose_at
 from tests.thread_counts import by_one_thread_and_two
 
@@ -57,7 +58,9 @@ def test_dataset_is_in_order(sequence: RGBDSequence) -> None:
 
 
 @pytest.fixture(params=registered.names("dataset", LiveVideo))
-def video(request: pytest.FixtureRequest, ready: Ready) -> LiveVideo:
+def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.MonkeyPatch) -> LiveVideo:
+    for name, module in option_files.modules("dataset", request.param).items():
+        monkeypatch.setitem(sys.modules, name, module)
     video: LiveVideo = ready("dataset", request.param)
     return video
 
