@@ -14,7 +14,7 @@
         print(instance.id, mapper.scene.classes[likeliest], instance.obb.center, "m", instance.confidence)
     mapper.scene.save("map.npz")
 
-What else a map does, also one that a run left behind:
+`Mapper("map=outputs/demo")` goes on with the map of a run. What else a map does, also one that a run left behind:
 
     scene = load_map("outputs/demo/map.npz")
     mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex

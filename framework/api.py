@@ -16,9 +16,12 @@ from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
 from framework.journal import Journal
+from framework.parameters import checked_path
 from framework.pipeline import Pipeline
+from framework.records.stored_runs import MAP, PLACES
 from framework.registry import build
 from framework.settings import Settings
+from framework.tracking.places_file import read_places
 
 __all__ = [
     "Camera",
@@ -54,6 +57,19 @@ def pipeline_of(config: DictConfig) -> Pipeline:
     return Pipeline(detector, tracker, refiner, fuser, config.ahead)
 
 
+def go_on(pipeline: Pipeline, run: Path) -> None:
+    """Has a pipeline that has mapped nothing go on with the map of a stored run.
+
+    The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
+    that can be read, ConfigError where the stages cannot go on with it.
+    """
+    if not (run / MAP).is_file():
+        raise DataError(f"map: there is no {run / MAP}: expected the directory of a run")
+    scene = load_map(run / MAP)
+    pipeline.fuser.go_on(scene)
+    pipeline.tracker.recall(read_places(run / PLACES))
+
+
 class Mapper:
     """Maps frames as they come: `Mapper("detector=mask_rcnn", "fuser.voxel_size=0.02")`.
 
@@ -77,6 +93,8 @@ class Mapper:
         config = composed("~dataset", *overrides)
         Settings.of(config).apply()
         self.pipeline = pipeline_of(config)
+        if config.map is not None:
+            go_on(self.pipeline, checked_path("map", config.map))
         warn_outside_domain(self.pipeline.detector, None)
         self.scene = self.pipeline.fuser.scene
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)

@@ -19,6 +19,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from framework.data import (
+    Array,
     Camera,
     Detections,
     Float32,
@@ -32,6 +33,7 @@ from framework.data import (
     SurfaceView,
     View,
 )
+from framework.errors import ConfigError
 
 
 class RGBDSequence(ABC):
@@ -89,6 +91,18 @@ class PoseTracker(ABC):
         that has none: the frame is skipped.
         """
 
+    def places(self) -> Mapping[str, Array]:
+        """What it remembers of what it has seen from where, for `recall`; nothing where it remembers nothing."""
+        return {}
+
+    def recall(self, places: Mapping[str, Array]) -> None:
+        """Goes on with what another one remembers: it says that it is lost until it finds itself in a map from before.
+
+        `places` is empty where that one remembered nothing. Raises ConfigError where it cannot do with these, and
+        DataError where they are none.
+        """
+        raise ConfigError(f"{type(self).__name__} cannot find itself in a map from before")
+
 
 class ClusterRefiner(ABC):
     """Cleans, splits or merges this frame's point clusters."""
@@ -112,6 +126,10 @@ class MapFuser(ABC):
 
         Raises MapFullError when the map's block budget is reached.
         """
+
+    def go_on(self, scene: SceneMap) -> None:
+        """Takes a map from before in place of its own empty one. Raises ConfigError where it cannot write that one."""
+        raise ConfigError(f"{type(self).__name__} cannot go on with a map from before")
 
 
 class SceneMap(ABC):

@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TypeVar, cast
 
@@ -74,10 +74,13 @@ class Pipeline:
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
-            return journal.result()
-        if self.fuser.scene.voxel_count == 0:
+            return self.result(journal)
+        if journal.frames_in_map == 0 or self.fuser.scene.voxel_count == 0:
             raise DataError(f"{sequence.name}: {self.why_nothing(journal)}")
-        return journal.result()
+        return self.result(journal)
+
+    def result(self, journal: Journal) -> RunResult:
+        return replace(journal.result(), places=self.tracker.places())
 
     def why_nothing(self, journal: Journal) -> str:
         """What became of the frames of a run whose map is empty."""

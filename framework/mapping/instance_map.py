@@ -23,7 +23,7 @@ from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
 from framework.mapping.voxel_grid import BLOCK_VOXELS
 
-FORMAT = 5  # of the saved file; a change of meaning counts it up
+FORMAT = 6  # of the saved file; a change of meaning counts it up
 
 
 class InstanceMap(SceneMap):
