@@ -162,6 +162,10 @@ class SceneMap(ABC):
         """The number of objects found so far; asked often, for the progress bar: override it where it can be cheap."""
         return len(self.instances())
 
+    def instance_ids(self) -> frozenset[int]:
+        """Their ids; asked after each frame by who maps frames as they come: override it where it can be cheap."""
+        return frozenset(self.instances())
+
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """What `camera` would see of the map, by ray-casting. Raises DataError where T_world_camera is no pose."""
