@@ -1,29 +1,27 @@
 """InstanceMap: a map of object instances from RGB-D video, frame by frame.
 
-    from instancemap import Camera, Frame, Mapper
+    from instancemap import Camera, Mapper
 
     mapper = Mapper("fuser.voxel_size=0.02")  # what `instancemap ...` takes, with its defaults
     camera = Camera(width=640, height=480, fx=525.0, fy=525.0, cx=319.5, cy=239.5)
-    for k, (color, depth) in enumerate(video):  # uint8 (480, 640, 3) RGB; float32 (480, 640) m, 0 = no reading
-        pose = mapper.add(Frame(index=k, timestamp=k / 30, color=color, depth=depth, camera=camera))
-        if pose.lost:
-            print(f"frame {k} is not in the map: {pose.reason}")
+    for color, depth in video:  # uint8 (480, 640, 3) RGB; float32 (480, 640) m, 0 = no reading
+        added = mapper.add(color, depth, camera=camera)
+        if added.lost:
+            print(f"the frame is not in the map: {added.reason}")
 
     for instance in mapper.instances().values():
-        likeliest = instance.class_probabilities.argmax()
-        print(instance.id, mapper.scene.classes[likeliest], instance.obb.center, "m", instance.confidence)
-    mapper.scene.save("map.npz")
+        print(instance.id, mapper.name(instance), instance.obb.center, "m", instance.confidence)
+    mapper.save("map.npz")
 
-What else a map does, also one that a run left behind:
+`Mapper("map=outputs/demo")` goes on with the map of a run. What else a map does, also one that a run left behind:
 
     scene = load_map("outputs/demo/map.npz")
-    mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex
-    view = scene.render(camera, T_world_camera)  # depth, normals, colour and instances, as the camera would see them
+    chairs = scene.instances("chair")
+    it = scene.nearest((1.0, 0.0, 2.0))
+    mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex; scene.mesh(it) of one object
+    view = scene.view(camera, T_world_camera)  # depth, normals, colour and instances, as the camera would see them
 
-A viewer in another thread looks at the map between two frames:
-
-    with mapper.lock:
-        mesh = mapper.scene.mesh()
+Several threads may ask one Mapper, while it maps, too: questions wait for the frame in work.
 
 Metres, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;
 pixel centres at integers; instance 0 = none. Every fault that is yours to mend is an InstanceMapError of one line.

@@ -2,25 +2,42 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
 from framework.configs import composed
-from framework.data import Camera, Detections, Frame, Instance, InstanceMesh, PointClusters, Pose, View
+from framework.data import (
+    Camera,
+    Detections,
+    Float32,
+    Float64,
+    Frame,
+    Instance,
+    InstanceMesh,
+    PointClusters,
+    Pose,
+    UInt8,
+    View,
+)
+from framework.datasets.recording import FRAME_RATE
 from framework.detection.cache import with_cache
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
 from framework.journal import Journal
+from framework.object_queries import Map
+from framework.parameters import checked_path
 from framework.pipeline import Pipeline
+from framework.records.stored_runs import MAP, PLACES
 from framework.registry import build
 from framework.settings import Settings
+from framework.tracking.places_file import read_places
 
 __all__ = [
+    "Added",
     "Camera",
     "ClusterRefiner",
     "ConfigError",
@@ -32,6 +49,7 @@ __all__ = [
     "Instance",
     "InstanceMapError",
     "InstanceMesh",
+    "Map",
     "MapFullError",
     "MapFuser",
     "Mapper",
@@ -43,6 +61,7 @@ __all__ = [
     "SceneMap",
     "View",
     "load_map",
+    "open_dataset",
 ]
 
 
@@ -54,66 +73,148 @@ def pipeline_of(config: DictConfig) -> Pipeline:
     return Pipeline(detector, tracker, refiner, fuser, config.ahead)
 
 
-class Mapper:
-    """Maps frames as they come: `Mapper("detector=mask_rcnn", "fuser.voxel_size=0.02")`.
+def go_on(pipeline: Pipeline, run: Path) -> None:
+    """Has a pipeline that has mapped nothing go on with the map of a stored run.
 
-    The arguments are those of a run on the command line, with its defaults for what is recorded; `dataset` is left out,
-    since the frames are yours, and `ahead` and `resume` mean nothing here. Raises ConfigError for a name or a value
-    that there is not.
+    The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
+    that can be read, ConfigError where the stages cannot go on with it.
+    """
+    if not (run / MAP).is_file():
+        raise DataError(f"map: there is no {run / MAP}: expected the directory of a run")
+    scene = load_scene(run / MAP)
+    pipeline.fuser.go_on(scene)
+    pipeline.tracker.recall(read_places(run / PLACES))
 
-    Several threads may share one: `add` and `instances` wait for each other. Whoever reads `scene` while another thread
-    may be in `add` holds `lock` meanwhile, `with mapper.lock: mesh = mapper.scene.mesh()`: half a frame may be in it.
+
+@dataclass(frozen=True)
+class Added(Pose):
+    """What became of a frame: the camera's pose, or that it is lost, and which objects there are since."""
+
+    new: tuple[int, ...] = ()  # ids of objects that count from this frame on
+    gone: tuple[int, ...] = ()  # ids that count no more: merged with another object, or outvoted
+
+
+class Mapper(Map):
+    """Maps frames as they come: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
+
+    The arguments are those of a run on the command line, as words or by name, with its defaults for what is recorded;
+    `dataset` is left out, since the frames are yours, and `ahead` and `resume` mean nothing here. `map=DIR` goes on
+    with the map of the run in DIR. Raises ConfigError for a name or a value that there is not.
+
+    Several threads may share one: they wait for each other. Whoever reads `scene` itself while another thread may be in
+    `add` holds `lock` meanwhile, `with mapper.lock: mesh = mapper.scene.mesh()`: half a frame may be in it.
     """
 
-    scene: SceneMap  # the map: mesh(), render(), instances(), save()
-    lock: threading.RLock  # held while a frame is mapped
-
-    def __init__(self, *overrides: str) -> None:
-        for override in overrides:
+    def __init__(self, *overrides: str, **named: object) -> None:
+        words = [*overrides, *(_override(name, value) for name, value in named.items())]
+        for override in words:
             if not isinstance(override, str):
                 raise ConfigError(f"Mapper takes words such as 'fuser.voxel_size=0.02', found {override!r}")
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
                 raise ConfigError(f"Mapper: {override} is of a run on the command line; here the frames are yours")
-        config = composed("~dataset", *overrides)
+        config = composed("~dataset", *words)
         Settings.of(config).apply()
         self.pipeline = pipeline_of(config)
+        if config.map is not None:
+            go_on(self.pipeline, checked_path("map", config.map))
         warn_outside_domain(self.pipeline.detector, None)
-        self.scene = self.pipeline.fuser.scene
+        super().__init__(self.pipeline.fuser.scene)
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
-        self.lock = threading.RLock()
+        self._camera: Camera | None = None  # of the last frame
+        self._T_world_camera: Float64 | None = None  # of the last frame that was not lost
+        self._frames = 0  # that `add` was given
 
-    def add(self, frame: Frame) -> Pose:
+    def add(
+        self,
+        color: UInt8 | Frame,
+        depth: Float32 | None = None,
+        pose: Float64 | None = None,
+        camera: Camera | None = None,
+        timestamp: float | None = None,
+    ) -> Added:
         """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
 
-        Returns the camera's pose; one that is lost was not fused, and the next frames may be found again. Raises
-        FrameError when the frame cannot be used, as one without a pose where poses are given, which leaves the map as
-        it was, and MapFullError at the end of `fuser.max_blocks`.
+        `color` (H, W, 3) is uint8 RGB, `depth` (H, W) float32 m along z, 0 = no reading, `pose` (4, 4) T_world_camera
+        where it is known, `camera` that of the last frame where none is given, `timestamp` s, 30 frames a second where
+        none is given; or `color` is a Frame, with all of that.
+
+        A frame that is lost was not fused, and the next ones may be found again. Raises FrameError when the frame
+        cannot be used, as one without a pose where poses are given, which leaves the map as it was, DataError for
+        arrays that are no frame, and MapFullError at the end of `fuser.max_blocks`.
         """
-        if not isinstance(frame, Frame):
-            raise DataError(f"Mapper.add takes an instancemap.Frame, found {type(frame).__name__}")
         with self.lock:
+            frame = color if isinstance(color, Frame) else self._frame(color, depth, pose, camera, timestamp)
+            self._camera = frame.camera
+            self._frames += 1
             self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
             self._journal.tracked.clear()
-            return self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
+            before = self.scene.instance_ids()
+            found = self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
+            if found.lost:
+                return Added(found.T_world_camera, lost=True, reason=found.reason)
+            self._T_world_camera = found.T_world_camera
+            now = self.scene.instance_ids()
+        return Added(found.T_world_camera, new=tuple(sorted(now - before)), gone=tuple(sorted(before - now)))
 
-    def instances(self) -> Mapping[int, Instance]:
-        """The objects found so far, by id; `scene.classes` names their classes, `scene.mesh()` has their vertices."""
-        with self.lock:
-            return self.scene.instances()
+    def _frame(
+        self,
+        color: UInt8,
+        depth: Float32 | None,
+        pose: Float64 | None,
+        camera: Camera | None,
+        timestamp: float | None,
+    ) -> Frame:
+        camera = camera or self._camera
+        if depth is None:
+            raise DataError(f"Mapper.add takes a Frame, or colour and depth, found {type(color).__name__} alone")
+        if camera is None:
+            raise DataError("Mapper.add needs the camera once: camera=Camera(width, height, fx, fy, cx, cy)")
+        when = self._frames / FRAME_RATE if timestamp is None else timestamp
+        return Frame(self._frames, when, color, depth, camera, pose)
 
-    def __getstate__(self) -> dict[str, Any]:
-        with self.lock:
-            return {name: value for name, value in vars(self).items() if name != "lock"}
+    def at_pixel(
+        self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None
+    ) -> Instance | None:
+        """The object at pixel (u, v) of the last frame that was not lost, or of what `camera` would see from elsewhere.
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, lock=threading.RLock())
+        None where there is none. Raises DataError for a pixel outside the image, or before there is any frame.
+        """
+        camera = camera or self._camera
+        T_world_camera = self._T_world_camera if T_world_camera is None else T_world_camera
+        if camera is None or T_world_camera is None:
+            raise DataError("nothing is mapped yet, so that there is no last frame")
+        return super().at_pixel(u, v, camera, T_world_camera)
 
 
-def load_map(path: Path | str) -> SceneMap:
-    """The map that a run left behind as map.npz, or that `SceneMap.save` wrote, of whatever fuser.
+def _override(name: str, value: object) -> str:
+    """A keyword as a word of the command line."""
+    if value is None or isinstance(value, bool | int | float):
+        return f"{name}={'null' if value is None else value}"
+    if isinstance(value, str | Path):
+        return f"{name}={QuotedString(str(value), Quote.single).with_quotes()}"
+    raise ConfigError(f"Mapper: {name} must be a name, a number, true, false or None, found {value!r:.60}")
+
+
+def open_dataset(name: str, **parameters: object) -> RGBDSequence:
+    """A recording, to be gone through frame by frame: `open_dataset("rgbd_folder", root="DIR", stride=2)`.
+
+    The name and the parameters are those of `dataset=` on the command line. Raises ConfigError for what there is not,
+    DataError for a recording that cannot be read.
+    """
+    words = [_override("dataset", name), *(_override(f"dataset.{key}", value) for key, value in parameters.items())]
+    return build(RGBDSequence, composed(*words).dataset)
+
+
+def load_map(path: Path | str) -> Map:
+    """The map that a run left behind as map.npz, or that `save` wrote, of whatever fuser.
 
     Raises DataError when the file is none or was damaged.
     """
+    return Map(load_scene(path))
+
+
+def load_scene(path: Path | str) -> SceneMap:
+    """The same for who goes on with it."""
     from framework.mapping import instance_map
     from framework.mapping.map_file import read_format
     from framework.rivals import object_map, open3d_map, semantic_map

@@ -19,6 +19,7 @@ from collections.abc import Callable, Generator, Iterator, Mapping
 from pathlib import Path
 
 from framework.data import (
+    Array,
     Camera,
     Detections,
     Float32,
@@ -32,6 +33,7 @@ from framework.data import (
     SurfaceView,
     View,
 )
+from framework.errors import ConfigError
 
 FrameReader = Callable[[], Frame]
 """Reads a frame that is there. Raises FrameError when it cannot be used."""
@@ -114,6 +116,18 @@ class PoseTracker(ABC):
         that has none: the frame is skipped.
         """
 
+    def places(self) -> Mapping[str, Array]:
+        """What it remembers of what it has seen from where, for `recall`; nothing where it remembers nothing."""
+        return {}
+
+    def recall(self, places: Mapping[str, Array]) -> None:
+        """Goes on with what another one remembers: it says that it is lost until it finds itself in a map from before.
+
+        `places` is empty where that one remembered nothing. Raises ConfigError where it cannot do with these, and
+        DataError where they are none.
+        """
+        raise ConfigError(f"{type(self).__name__} cannot find itself in a map from before")
+
 
 class ClusterRefiner(ABC):
     """Cleans, splits or merges this frame's point clusters."""
@@ -137,6 +151,10 @@ class MapFuser(ABC):
 
         Raises MapFullError when the map's block budget is reached.
         """
+
+    def go_on(self, scene: SceneMap) -> None:
+        """Takes a map from before in place of its own empty one. Raises ConfigError where it cannot write that one."""
+        raise ConfigError(f"{type(self).__name__} cannot go on with a map from before")
 
 
 class SceneMap(ABC):
@@ -168,6 +186,10 @@ class SceneMap(ABC):
     def instance_count(self) -> int:
         """The number of objects found so far; asked often, for the progress bar: override it where it can be cheap."""
         return len(self.instances())
+
+    def instance_ids(self) -> frozenset[int]:
+        """Their ids; asked after each frame by who maps frames as they come: override it where it can be cheap."""
+        return frozenset(self.instances())
 
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:

@@ -105,6 +105,9 @@ def signals_deferred(*numbers: int) -> Iterator[Interruption]:
         yield Interruption()
         return
     if _deferring is not None:
+        for number in numbers:
+            if signal.getsignal(number) == _deferring.hear:
+                signal.signal(number, _deferring.hear)  # libraries set their own past Python, such as glog in pycolmap
         yield _deferring
         return
     interruption = _deferring = Interruption()

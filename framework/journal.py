@@ -6,7 +6,7 @@ import logging
 import os
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -15,7 +15,7 @@ import numpy as np
 from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
-from framework.data import Float64, Frame, Pose
+from framework.data import Array, Float64, Frame, Pose
 from framework.errors import FrameError, NoPoseError
 from framework.interfaces import PoseTracker, SceneMap
 
@@ -67,6 +67,7 @@ class RunResult:
     intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
     pose_source: str = PoseTracker.pose_source
     live: LiveFigures | None = None  # None = of a recording, which is mapped whole
+    places: Mapping[str, Array] = field(default_factory=dict)  # that the tracker remembers
 
     @property
     def frames_lost(self) -> int:

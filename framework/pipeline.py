@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import TypeVar, cast
 
@@ -82,10 +82,13 @@ class Pipeline:
                 raise journal.stopped_by
             if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
                 journal.stopped_by = None  # that is how it ends; a second signal is another Interrupted
-            return journal.result()
-        if self.fuser.scene.voxel_count == 0:
+            return self.result(journal)
+        if journal.frames_in_map == 0 or self.fuser.scene.voxel_count == 0:
             raise DataError(f"{video.name}: {self.why_nothing(journal)}")
-        return journal.result()
+        return self.result(journal)
+
+    def result(self, journal: Journal) -> RunResult:
+        return replace(journal.result(), places=self.tracker.places())
 
     def why_nothing(self, journal: Journal) -> str:
         """What became of the frames of a run whose map is empty."""

@@ -17,11 +17,11 @@ from hydra import compose, initialize_config_dir
 from omegaconf import OmegaConf
 
 from framework import configs
-from framework.api import load_map
+from framework.api import Map, load_map
 from framework.data import Camera, Frame
 from framework.files.search_paths import CONF
 from framework.geometry import lift
-from framework.interfaces import Detector, SceneMap
+from framework.interfaces import Detector
 from framework.pipeline import Pipeline
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
@@ -59,7 +59,7 @@ def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.Monke
     names: dict[str, object] = {"frames": CornerRoom()}
     exec(block("python", "mapper = Mapper"), names)
     scene = names["scene"]
-    assert isinstance(scene, SceneMap)
+    assert isinstance(scene, Map)
     assert len(scene.mesh().vertices) > 1000
 
 
@@ -213,7 +213,7 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
     assert metrics["trajectory.ate_rmse_m"] < 0.02
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
-    assert load_map(ran / "defaults" / "map.npz").voxel_count == metrics["map.voxels"] > 0
+    assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)

@@ -252,6 +252,7 @@ class Association:
         self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame_index: int
     ) -> Matches:
         """Matches each cluster with an instance that overlaps enough, or creates one where it is good enough."""
+        frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
         match = match_one_to_one(allowed, overlaps.over_union(self.create_points))

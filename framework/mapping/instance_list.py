@@ -48,6 +48,10 @@ class Confirmation:
             counts[record.id] = self.is_met(record)
         return counts
 
+    def ids(self, table: InstanceTable) -> frozenset[int]:
+        """Of those that count, whatever their area."""
+        return frozenset(np.flatnonzero(self.counts(table)).tolist())
+
     def count(self, table: InstanceTable) -> int:
         """How many count, whatever their area."""
         return int(self.counts(table).sum())

@@ -23,7 +23,7 @@ from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
 from framework.mapping.voxel_grid import BLOCK_VOXELS
 
-FORMAT = 5  # of the saved file; a change of meaning counts it up
+FORMAT = 6  # of the saved file; a change of meaning counts it up
 
 
 class InstanceMap(SceneMap):
@@ -66,6 +66,9 @@ class InstanceMap(SceneMap):
     def instance_count(self) -> int:
         """Without the condition on their area, which takes a mesh."""
         return self.confirmation.count(self.table)
+
+    def instance_ids(self) -> frozenset[int]:
+        return self.confirmation.ids(self.table)
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Takes the first frame's label space for the map's. Raises DataError for another one later."""

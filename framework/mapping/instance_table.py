@@ -83,6 +83,8 @@ class InstanceTable:
     def __init__(self, combine: Combine = Combine.SUM, logarithmic: bool = True) -> None:
         self.records: dict[int, InstanceRecord] = {}
         self.last_id = 0
+        self._last_before = -1  # frame of the recordings before this one
+        self._counted_on = 0  # frames, that this recording's numbers are moved by
         self.combine = combine
         self.logarithmic = logarithmic
 
@@ -92,6 +94,18 @@ class InstanceTable:
         record = InstanceRecord(self.last_id, np.zeros(classes), first_frame=frame_index, last_frame=frame_index)
         self.records[self.last_id] = record
         return record
+
+    def begin_recording(self) -> None:
+        """What comes now is of another recording, whose frames may have numbers that have been before."""
+        spans = [span[1] for record in self.records.values() for span in record.in_view.spans[-1:]]
+        self._last_before = max([*spans, *(record.last_frame for record in self.records.values())], default=-1)
+        self._counted_on = 0
+
+    def number_of(self, frame_index: int) -> int:
+        """A frame's number in this map: its own, or where a recording before had that or a later one, counted on."""
+        if frame_index + self._counted_on <= self._last_before:
+            self._counted_on = self._last_before + 1
+        return frame_index + self._counted_on
 
     def observe(self, instance_id: int, class_evidence: Float64, score: float, frame_index: int) -> None:
         """Counts one detection with the evidence (C,) for its classes."""

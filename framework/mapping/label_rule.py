@@ -8,13 +8,17 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Bool, Float32, Float64, PointClusters
+from framework.errors import ConfigError
+from framework.interfaces import SceneMap
 from framework.mapping.association import Matches, class_agreement
 from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.pixel_lists import PixelLists, keep_on_top, leave_to_others
+from framework.mapping.sensor import Sensor
 from framework.mapping.tsdf import VoxelHashing
+from framework.mapping.tsdf_volume import NO_BLOCKS
 from framework.parameters import check_bounds
 
 OTHER_CLASS = 0.3  # Bhattacharyya coefficient of two distributions below which they are of different things
@@ -54,6 +58,12 @@ def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidenc
     return DetectionEvidence(weights, classes)
 
 
+def check_same(name: str, was: object, now: object) -> None:
+    """Raises ConfigError unless a map from before was made with the parameter that it is to be gone on with."""
+    if was != now:
+        raise ConfigError(f"the map was made with {name} {was}, and cannot be gone on with by {now}")
+
+
 @dataclass
 class LabeledVoxels:
     """Our own voxels, with labels as evidence."""
@@ -70,6 +80,23 @@ class LabeledVoxels:
     def new_map(self, rule: LabelRule) -> InstanceMap:
         """An empty one for labels by this rule."""
         return InstanceMap(self.hashing.new_volume(), self.confirmation, rule.combine, rule.logarithmic, self.storage)
+
+    def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
+        """A map from before, to be written with these parameters. Raises ConfigError unless it was made with them."""
+        if not isinstance(scene, InstanceMap):
+            raise ConfigError(f"a {type(scene).__name__} cannot be gone on with; the map is of another kind of fuser")
+        own = self.new_map(rule)
+        check_same("fuser.voxel_size", f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}")
+        for name, was, now in zip(Sensor._fields, scene.volume.sensor, own.volume.sensor, strict=True):
+            check_same(f"fuser.{name}", f"{was:g}", f"{now:g}")
+        check_same("fuser.storage", scene.labels.storage.name, self.storage.name)
+        kept = scene.table.combine.name, scene.table.logarithmic
+        check_same("a fuser that keeps labels as", kept, (rule.combine.name, rule.logarithmic))
+        scene.confirmation = self.confirmation
+        scene.volume.voxels.max_blocks = self.hashing.max_blocks
+        scene.volume.changed(NO_BLOCKS)
+        scene.table.begin_recording()
+        return scene
 
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule

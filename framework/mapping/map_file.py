@@ -29,6 +29,7 @@ HEADER = "header"
 LARGEST_HEADER = 2**28  # bytes, of an hour with thousands of instances some 10 MB
 LARGEST_ID = 2**24  # of an instance
 MOST_EVIDENCE = 1e12  # for a class
+MOST_ARRAYS = 100  # of a file that says itself which it has
 SHARE_OF_MEMORY = 0.5  # of the machine, that a map may take when it is loaded
 
 
@@ -61,6 +62,13 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
         if damaged is not None:
             raise DataError(f"the checksum of {damaged} does not hold; the file is damaged")
         return header, {name: _array(archive, name) for name in names}
+
+
+def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
+    """All that is in a file besides its header, which lists their `names`. Raises DataError, likewise."""
+    with faults_of(path), _opened(path) as archive:
+        names = _header(archive).items("names")
+    return read_map(path, expected_format, [str(name) for name in names[:MOST_ARRAYS]])[1]
 
 
 def read_format(path: Path | str) -> str:

@@ -83,6 +83,7 @@ class TsdfVolume:
             "voxel_size": self.voxel_size,
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
             "max_blocks": self.voxels.max_blocks,
+            "frames": self.integrator.frames,
         }
         return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
 
@@ -94,6 +95,7 @@ class TsdfVolume:
         volume = cls(
             header.number("voxel_size", BOUNDS["voxel_size"]), sensor, header.whole("max_blocks", 1, MOST_BLOCKS)
         )
+        volume.integrator.frames = header.whole("frames")  # rounding goes on from there
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
         check_rows(arrays["label_row"], rows)
         volume.fill(arrays)

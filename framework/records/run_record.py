@@ -28,9 +28,10 @@ from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
 from framework.records.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, MAPPED, METRICS, PARTIAL_METRICS
+from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
+from framework.tracking.places_file import write_places
 
 log = logging.getLogger(__name__)
 
@@ -80,7 +81,7 @@ class RunRecord:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
-        for name in MAPPED:  # of an earlier run into the same directory
+        for name in (*MAPPED, PLACES):  # of an earlier run into the same directory
             attempt((self.directory / name).unlink, missing_ok=True)
         if not (self.directory / CONFIG).exists():  # the directory was removed meanwhile
             attempt(_write_config, self.directory / CONFIG, self.config)
@@ -96,7 +97,9 @@ class RunRecord:
         attempt(self._write_partial, video, figures, attempt.fault)
         if found is not None:
             attempt(write_mesh, self.directory / "mesh.ply", found[0])
-        attempt(scene.save, self.directory / "map.npz")
+        attempt(scene.save, self.directory / MAP)
+        if result.places:
+            attempt(write_places, self.directory / PLACES, result.places)
         if found is not None:
             figures |= attempt(instance_metrics, video, *found, scene.classes) or {}
         figures |= attempt(trajectory_metrics, result) or {}

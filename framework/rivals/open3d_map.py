@@ -51,6 +51,9 @@ class Open3DMap(SceneMap):
         """Without the condition on their area, which takes a mesh."""
         return self.confirmation.count(self.table)
 
+    def instance_ids(self) -> frozenset[int]:
+        return self.confirmation.ids(self.table)
+
     def begin(self, classes: tuple[str, ...]) -> None:
         """Takes the first frame's label space for the map's. Raises DataError for another one later."""
         self.classes = agreed_classes(self.classes, classes)

@@ -6,17 +6,26 @@ the few keyframes that may show the same place; matched features with depth and 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Float32, Float64, Frame, UInt8
+from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, check_rigid
+from framework.errors import DataError
 from framework.geometry import back_project, transform
 from framework.parameters import check_bounds
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
-from framework.tracking.features import FeatureExtractor, Features, match
+from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
 from framework.tracking.visual_words import VisualWords, similarity
+
+SAVED: Mapping[str, tuple[tuple[int | None, ...], type]] = {
+    "poses": ((None, 4, 4), np.float64),  # T_world_camera
+    "counts": ((None,), np.int32),  # of points, of each
+    "points_world": ((None, 3), np.float32),  # m, of one after the other
+    "descriptors": ((None, DESCRIPTOR_LENGTH), np.uint8),
+}
+"""The arrays that keyframes are saved as: shapes and types."""
 
 BARREN_SEPARATION = 0.25  # of that between keyframes: what has too few features is worth another look from here on
 
@@ -86,6 +95,40 @@ class Keyframes:
     def byte_count(self) -> int:
         """Bytes that the keyframes take."""
         return sum(keyframe.bytes for keyframe in self._keyframes)
+
+    def saved(self) -> dict[str, Array]:
+        """What `restore` makes them of again; nothing where there is none."""
+        if not self._keyframes:
+            return {}
+        return {
+            "poses": self._poses,
+            "counts": np.array([len(keyframe.points_world) for keyframe in self._keyframes], np.int32),
+            "points_world": np.concatenate([keyframe.points_world for keyframe in self._keyframes]),
+            "descriptors": np.concatenate([keyframe.descriptors for keyframe in self._keyframes]),
+        }
+
+    def restore(self, arrays: Mapping[str, Array]) -> None:
+        """Takes over the keyframes that another one has `saved`. Raises DataError where they are none."""
+        if set(arrays) != set(SAVED):
+            raise DataError(f"keyframes are {', '.join(SAVED)}, found {', '.join(arrays) or 'nothing'}")
+        for name, (shape, kind) in SAVED.items():
+            check_array(name, arrays[name], shape, kind)
+        counts = np.asarray(arrays["counts"], np.int64)
+        poses, points, descriptors = (arrays[name] for name in ("poses", "points_world", "descriptors"))
+        if (
+            len(counts) != len(poses)
+            or counts.min(initial=0) < 0
+            or not counts.sum() == len(points) == len(descriptors)
+        ):
+            raise DataError(f"keyframes' counts {counts.tolist()!s:.60} are not those of their poses and points")
+        ends = np.cumsum(counts)
+        for k, T_world_camera in enumerate(np.asarray(poses, np.float64)):
+            check_rigid(f"keyframe {k}", T_world_camera)
+            of_this = slice(ends[k] - counts[k], ends[k])
+            found = np.ascontiguousarray(descriptors[of_this], np.uint8)
+            points_world = np.ascontiguousarray(points[of_this], np.float32)
+            self._keyframes.append(Keyframe(T_world_camera, points_world, found, self._words.bag(found)))
+        self._poses = np.concatenate([self._poses, np.asarray(poses, np.float64)])
 
     def add(self, frame: Frame, T_world_camera: Float64) -> bool:
         """Makes `frame` a keyframe if no other one is near; True when it has become one."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from framework.data import Frame, PointClusters, Pose
-from framework.interfaces import MapFuser
+from framework.interfaces import MapFuser, SceneMap
 from framework.mapping.association import Association
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_map import InstanceMap
@@ -26,6 +26,9 @@ class MaxConfidence(MapFuser):
 
     def __post_init__(self) -> None:
         self.scene: InstanceMap = self.voxels.new_map(RULE)
+
+    def go_on(self, scene: SceneMap) -> None:
+        self.scene = self.voxels.continued(scene, RULE)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self.scene.begin(clusters.classes)

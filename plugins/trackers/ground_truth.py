@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
-from framework.data import Frame, Pose
+from framework.data import Array, Frame, Pose
 from framework.errors import NoPoseError
 from framework.interfaces import PoseTracker, SceneMap
 
@@ -20,3 +21,6 @@ class GroundTruth(PoseTracker):
         if frame.T_world_camera is None:
             raise NoPoseError(f"frame {frame.index} has no true pose at {frame.timestamp:.3f} s")
         return Pose(frame.T_world_camera)
+
+    def recall(self, places: Mapping[str, Array]) -> None:
+        """The true poses are of the map's world; there is nothing to be found again."""

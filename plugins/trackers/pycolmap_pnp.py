@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Float64, Frame, Pose
+from framework.data import Array, Float64, Frame, Pose
+from framework.errors import ConfigError
 from framework.interfaces import PoseTracker, SceneMap
 from framework.tracking.features import Features
 from framework.tracking.keyframes import Keyframes
@@ -50,17 +52,27 @@ class PycolmapPnp(PoseTracker):
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         features = self._keyframes.extractor.extract(frame)
-        if self._T_world_last is None:
+        if self._T_world_last is None and len(self._keyframes) == 0:
             return self._begin(frame, features)
-        found = self._keyframes.locate(frame, features, self._keyframes.nearest(self._T_world_last))
+        near = [] if self._T_world_last is None else self._keyframes.nearest(self._T_world_last)
+        found = self._keyframes.locate(frame, features, near)
         if found is None:
             found = self._keyframes.locate(frame, features, self._keyframes.alike(features))
         if found is None:
+            T_world_last = np.eye(4) if self._T_world_last is None else self._T_world_last
             reason = f"no keyframe explains {self.min_inliers} of the frame's {len(features)} features"
-            return Pose(self._T_world_last, lost=True, reason=reason)
+            return Pose(T_world_last, lost=True, reason=reason)
         self._T_world_last = found.T_world_camera
         self._keyframes.add_with(frame, features, found.T_world_camera)
         return Pose(found.T_world_camera)
+
+    def places(self) -> Mapping[str, Array]:
+        return self._keyframes.saved()
+
+    def recall(self, places: Mapping[str, Array]) -> None:
+        if not places:
+            raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
+        self._keyframes.restore(places)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
         """The first frame with enough features is where the world begins."""

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
 import numpy as np
 
-from framework.data import Float64, Frame, Pose
+from framework.data import Array, Float64, Frame, Pose
 from framework.errors import DataError, NoPoseError
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import inverse
@@ -62,3 +63,6 @@ class TrajectoryFile(PoseTracker):
             T_world_first = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
             self._T_world_file = T_world_first @ inverse(T_file_camera)
         return Pose(self._T_world_file @ T_file_camera)
+
+    def recall(self, places: Mapping[str, Array]) -> None:
+        """The poses are of the map's world, as they are given; there is nothing to be found again."""

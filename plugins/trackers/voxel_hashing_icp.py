@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Float64, Frame, Pose
-from framework.errors import DataError
+from framework.data import Array, Float64, Frame, Pose
+from framework.errors import ConfigError, DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
@@ -133,10 +134,13 @@ class VoxelHashingIcp(PoseTracker):
         self._visited: deque[Float64] = deque(maxlen=VISITED)
         self._T_world_doubted: Float64 | None = None  # the last frame's, where it was lost only by doubt
         self._last: FrameFeatures | None = None  # of the last frame that was trusted
+        self._recalled = False  # keyframes of a map from before
         self._coarse_depth = False  # too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         seen = FrameFeatures(frame, self._keyframes.extractor)
+        if self._T_world_last is None and self._recalled:
+            return self._entered(seen, scene)
         if self._T_world_last is None or scene.voxel_count == 0:
             return self._first(seen, scene)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
@@ -158,6 +162,28 @@ class VoxelHashingIcp(PoseTracker):
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
+        return self._trusted(seen, alignment.T_world_camera)
+
+    def places(self) -> Mapping[str, Array]:
+        return self._keyframes.saved()
+
+    def recall(self, places: Mapping[str, Array]) -> None:
+        if not places:
+            raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
+        self._keyframes.restore(places)
+        self._recalled = True
+
+    def _entered(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
+        """Finds the camera in a map from before: features of its keyframes lead to where alignment with it stays."""
+        unknown = Alignment(np.eye(4), 0, 0, 0, 0, "it has not been found in the map from before", "")
+        found = self._keyframes.relocalize(seen.frame)
+        alignment = unknown
+        if found is not None:
+            levels = build_pyramid(seen.frame.camera, seen.frame.depth, seen.frame.color, self.finest, LEVELS)
+            self._coarse_depth = is_coarse(seen.frame.depth, otherwise=self._coarse_depth)
+            alignment = self._checked(unknown, found.T_world_camera, levels, scene)
+        if not alignment.trusted:
+            return Pose(np.eye(4), lost=True, reason=alignment.reason)
         return self._trusted(seen, alignment.T_world_camera)
 
     def _continued(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:

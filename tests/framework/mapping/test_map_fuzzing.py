@@ -15,7 +15,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from framework.api import load_map
+from framework.api import load_scene
 from framework.data import Camera
 from framework.errors import DataError
 from framework.interfaces import MapFuser, SceneMap
@@ -48,7 +48,7 @@ def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3)
     path = tmp_path_factory.mktemp(name) / "map.npz"
     fuser.scene.save(path)
-    use(load_map(path))  # compiles what it takes
+    use(load_scene(path))  # compiles what it takes
     with np.load(path) as file:
         return Saved(path.with_name("changed.npz"), dict(file))
 
@@ -74,7 +74,7 @@ def load_and_use(path: Path, content: bytes) -> str:
     path.write_bytes(content)
     began = time.process_time()
     try:
-        scene = load_map(path)
+        scene = load_scene(path)
     except DataError as error:
         line = str(error)
     else:
