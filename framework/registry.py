@@ -170,6 +170,9 @@ def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
     if found is None:
         fitting = [name for name, value in vars(module).items() if _implements(value, interface)]
         raise ConfigError(f"{where}: module {module_name} has no {class_name}{_did_you_mean(class_name, fitting)}")
+    if _implements(found, STAGES[stage_of(interface)]) and not _implements(found, interface):
+        what = (inspect.getdoc(interface) or "").partition("\n")[0].removesuffix(".")
+        raise ConfigError(f"{where}: here it must be of the kind {interface.__name__} ({what})")
     if not _implements(found, interface):
         kind = "a class that does not" if isinstance(found, type) else f"a {type(found).__name__}"
         raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, found {kind}")

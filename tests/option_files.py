@@ -18,14 +18,17 @@ from framework.files.tum_trajectory import write_tum
 from tests.recordings import write_color, write_depth
 from tests.scannet_files import shots, write_sens
 from tests.scenes.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector, pose_at
-from tests.scenes.fake_realsense import FakeRealSense
+from tests.scenes.fake_cameras import FakeCamera, orbbec_module, realsense_module
 
 FRAMES = 3
 
 
 def modules(stage: str, name: str) -> dict[str, ModuleType]:
     """The libraries of devices that an option needs, with a device in each. Nothing for one that needs none."""
-    plugged_in = {("dataset", "realsense"): {"pyrealsense2": FakeRealSense().module()}}
+    plugged_in = {
+        ("dataset", "orbbec"): {"pyorbbecsdk": orbbec_module(FakeCamera())},
+        ("dataset", "realsense"): {"pyrealsense2": realsense_module(FakeCamera())},
+    }
     return plugged_in.get((stage, name), {})
 
 
@@ -60,7 +63,7 @@ def _folder_watch(root: Path) -> list[str]:
     return [f"dataset.root={root}"]
 
 
-def _realsense(_: Path) -> list[str]:
+def _camera(_: Path) -> list[str]:
     return [f"dataset.width={CAMERA.width}", f"dataset.height={CAMERA.height}"]
 
 
@@ -172,7 +175,8 @@ def _trajectory_file(folder: Path) -> list[str]:
 
 WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("dataset", "folder_watch"): _folder_watch,
-    ("dataset", "realsense"): _realsense,
+    ("dataset", "orbbec"): _camera,
+    ("dataset", "realsense"): _camera,
     ("dataset", "replica_nice_slam"): _replica_nice_slam,
     ("dataset", "rgbd_folder"): _rgbd_folder,
     ("dataset", "scannet"): _scannet,

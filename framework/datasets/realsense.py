@@ -17,13 +17,11 @@ import numpy as np
 
 from framework.data import Camera, Frame
 from framework.datasets.calibration import Calibration, check_max_depth
+from framework.datasets.device_frames import WAIT_MS, images_of
 from framework.datasets.undistortion import Distortion
 from framework.errors import ConfigError, DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
 from framework.parameters import check_bounds
-
-WAIT_MS = 100  # for a frame, before something is said
-LONGEST_SILENCE = 5.0  # s; a camera that runs and sends nothing for so long is broken, or its cable is
 
 log = logging.getLogger(__name__)
 
@@ -67,22 +65,12 @@ class RealSense(LiveVideo):
 
     def _sent(self, rs: Any, pipeline: Any, profile: Any) -> Generator[FrameReader | None]:
         calibration = self._calibration(rs, profile)
-        align = rs.align(rs.stream.color)
-        number, heard = count(), time.monotonic()
-        while True:
-            try:
-                there, images = pipeline.try_wait_for_frames(WAIT_MS)
-            except RuntimeError as error:
-                raise DataError(f"RealSense: {in_one_line(error)}") from error
-            if there:
-                heard = time.monotonic()
+        align, number = rs.align(rs.stream.color), count()
+        for images in images_of("RealSense", partial(_wait, pipeline)):
+            if images is None:
+                yield None
+            else:
                 yield partial(_read, align, images, next(number), time.time(), calibration)
-                continue
-            if time.monotonic() - heard > LONGEST_SILENCE:
-                raise DataError(
-                    f"RealSense: no frame has come for {LONGEST_SILENCE:g} s; is the camera still connected?"
-                )
-            yield None
 
     def _calibration(self, rs: Any, profile: Any) -> Calibration:
         found = profile.get_stream(rs.stream.color).as_video_stream_profile().get_intrinsics()
@@ -95,6 +83,15 @@ class RealSense(LiveVideo):
             )
             distortion = None
         return Calibration(camera, self.name, 1 / metres, self.max_depth, distortion)
+
+
+def _wait(pipeline: Any) -> Any:
+    """Both images, not registered yet; None = they have not come."""
+    try:
+        there, images = pipeline.try_wait_for_frames(WAIT_MS)
+    except RuntimeError as error:
+        raise DataError(f"RealSense: {in_one_line(error)}") from error
+    return images if there else None
 
 
 def _read(align: Any, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:

@@ -37,7 +37,7 @@ LAYERS = [
 
 LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 
-OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "pyrealsense2"}
+OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "pyorbbecsdk", "pyrealsense2"}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
 
 

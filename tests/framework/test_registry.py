@@ -19,7 +19,7 @@ from framework import configs
 from framework.configs import add_config_dir, config_directory
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
-from framework.interfaces import Detector, PoseTracker
+from framework.interfaces import Detector, PoseTracker, RGBDSequence, RGBDVideo
 from framework.parameters import check_bounds
 from framework.registry import STAGES, assemble, build, find_class, parameter_fields
 
@@ -265,3 +265,11 @@ def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
 
 def test_every_stage_has_its_interface() -> None:
     assert list(STAGES) == ["dataset", "detector", "tracker", "refiner", "fuser"]
+
+
+def test_a_video_of_the_wrong_kind_is_named() -> None:
+    """`check` and `detect` want frames in any order; a run takes a live video as well."""
+    live = "tests.scenes.corner_room.LiveRoom"
+    assert find_class(RGBDVideo, live).__name__ == "LiveRoom"  # type: ignore[type-abstract]
+    with pytest.raises(ConfigError, match=r"LiveRoom: here it must be of the kind RGBDSequence \(A recorded or"):
+        find_class(RGBDSequence, live)  # type: ignore[type-abstract]
