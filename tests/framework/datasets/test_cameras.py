@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from dataclasses import dataclass
 from itertools import islice
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
@@ -145,6 +145,18 @@ def test_a_cable_that_is_pulled_out_ends_it(brand: Brand, device: FakeCamera, mo
     with pytest.raises(DataError, match=r"no frame has come for 0\.3 s"):
         list(sent(brand.video(), 9))
     assert not device.running
+
+
+def test_a_camera_may_be_silent_for_a_while_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(device_frames, "time", clock)
+    said: list[str | None] = []
+    coming = iter(["first", None, "second", None, "third", None, None])
+    with pytest.raises(DataError, match="it: no frame has come for 5 s"):  # noqa: PT012
+        for images in device_frames.images_of("it", lambda: next(coming)):
+            said.append(images)
+            clock.now += 3.0
+    assert said == ["first", None, "second", None, "third", None]
 
 
 def test_it_says_something_while_nothing_comes(brand: Brand, device: FakeCamera) -> None:
