@@ -84,7 +84,7 @@ def test_live_folder(benchmark: BenchmarkFixture, shared: Path, tmp_path: Path, 
                 ["map, MiB", mib(metrics["map.bytes"]), NOTHING],
                 *([f"resident, MiB, quarter {k}", mib(size), NOTHING] for k, size in enumerate(quarters, start=1)),
             ],
-            ["In the first seconds kernels are loaded, and what comes meanwhile is dropped."],
+            ["In the first second kernels are loaded. Dropped is what comes while another one waits."],
         )
     )  # fmt: skip
     benchmark.extra_info.update(
