@@ -181,6 +181,10 @@ class SceneMap(ABC):
     def mesh(self) -> InstanceMesh:
         """The surface, with colour, instance and class for each vertex."""
 
+    def up(self) -> Float64 | None:
+        """The unit vector (3,) against gravity in the world, None where the map does not tell."""
+        return None
+
     @abstractmethod
     def instances(self) -> Mapping[int, Instance]:
         """The objects found so far, by id. Vertex indices refer to `mesh()` of the same map."""

@@ -26,7 +26,14 @@ from framework.journal import RunResult
 from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
-from framework.records.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
+from framework.records.metrics import (
+    Metrics,
+    class_name,
+    instance_metrics,
+    room_metrics,
+    run_metrics,
+    trajectory_metrics,
+)
 from framework.records.provenance import code_version, config_hash, environment
 from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES
 from framework.registry import STAGES
@@ -94,6 +101,7 @@ class RunRecord:
         if found is not None:
             attempt(write_instances, self.directory / "instances.json", *found, scene.classes)
             figures["instances.count"] = len(found[1])
+            figures |= attempt(room_metrics, scene, found[0]) or {}
         attempt(self._write_partial, sequence, figures, attempt.fault)
         if found is not None:
             attempt(write_mesh, self.directory / "mesh.ply", found[0])
