@@ -35,7 +35,7 @@ from framework.records.metrics import (
     trajectory_metrics,
 )
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES
+from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES, TRAJECTORY
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.tracking.places_file import write_places
@@ -94,7 +94,7 @@ class RunRecord:
             attempt(_write_config, self.directory / CONFIG, self.config)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
-        attempt(write_tum, self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
+        attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
         found = attempt(_found, scene)
