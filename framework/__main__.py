@@ -15,6 +15,7 @@ COMMANDS = {
     "ranks": "whether the rows of an experiment rank alike in several places: Spearman's rho",
     "figures": "run records below a folder become the paper's figures",
     "check": "looks whether a recording will map, and says what to set where it will not",
+    "diff": "lists what appeared, vanished or moved between two visits of a place",
     "evaluate": "evaluates stored runs anew, without running them again",
     "detect": "writes a video's detections as a COCO result file",
     "show-refinement": "draws one frame's masks before and after refinement",
@@ -30,6 +31,7 @@ PRINTING = (
     "tables",
     "ranks",
     "figures",
+    "diff",
     "evaluate",
     "plugins",
 )  # what others may be reading: `| head` ends them without a word

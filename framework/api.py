@@ -79,11 +79,33 @@ def go_on(pipeline: Pipeline, run: Path) -> None:
     The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
     that can be read, ConfigError where the stages cannot go on with it.
     """
-    if not (run / MAP).is_file():
-        raise DataError(f"map: there is no {run / MAP}: expected the directory of a run")
-    scene = load_scene(run / MAP)
+    scene = _scene_of("map", run)
     pipeline.fuser.go_on(scene)
-    pipeline.tracker.recall(read_places(run / PLACES))
+    pipeline.tracker.recall(read_places(run / PLACES), scene)
+
+
+def begin_in(pipeline: Pipeline, run: Path) -> None:
+    """Has a pipeline make a map of its own in the world of a stored run, in whose map the tracker first finds itself.
+
+    Raises likewise.
+    """
+    pipeline.tracker.recall(read_places(run / PLACES), _scene_of("world", run))
+
+
+def begin(config: DictConfig, pipeline: Pipeline) -> None:
+    """What the keys `map` and `world` ask for."""
+    if config.map is not None and config.world is not None:
+        raise ConfigError("map and world exclude each other: one goes on with a map, the other begins one in its world")
+    if config.map is not None:
+        go_on(pipeline, checked_path("map", config.map))
+    if config.world is not None:
+        begin_in(pipeline, checked_path("world", config.world))
+
+
+def _scene_of(key: str, run: Path) -> SceneMap:
+    if not (run / MAP).is_file():
+        raise DataError(f"{key}: there is no {run / MAP}: expected the directory of a run")
+    return load_scene(run / MAP)
 
 
 @dataclass(frozen=True)
@@ -115,8 +137,7 @@ class Mapper(Map):
         config = composed("~dataset", *words)
         Settings.of(config).apply()
         self.pipeline = pipeline_of(config)
-        if config.map is not None:
-            go_on(self.pipeline, checked_path("map", config.map))
+        begin(config, self.pipeline)
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)

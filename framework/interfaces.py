@@ -120,8 +120,9 @@ class PoseTracker(ABC):
         """What it remembers of what it has seen from where, for `recall`; nothing where it remembers nothing."""
         return {}
 
-    def recall(self, places: Mapping[str, Array]) -> None:
-        """Goes on with what another one remembers: it says that it is lost until it finds itself in a map from before.
+    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
+        """Goes on with what another one remembers: it says that it is lost until it finds itself in `scene`, which was
+        mapped then.
 
         `places` is empty where that one remembered nothing. Raises ConfigError where it cannot do with these, and
         DataError where they are none.
@@ -205,6 +206,10 @@ class SceneMap(ABC):
     @abstractmethod
     def mesh(self) -> InstanceMesh:
         """The surface, with colour, instance and class for each vertex."""
+
+    def up(self) -> Float64 | None:
+        """The unit vector (3,) against gravity in the world, None where the map does not tell."""
+        return None
 
     @abstractmethod
     def instances(self) -> Mapping[int, Instance]:

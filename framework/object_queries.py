@@ -14,6 +14,7 @@ import numpy as np
 from framework.data import Camera, Float64, Instance, InstanceMesh, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
+from framework.mapping.gravity import floor_height
 
 
 class Map:
@@ -94,6 +95,19 @@ class Map:
         with self.lock:
             seen = int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)])
             return self.scene.instances().get(seen)
+
+    def up(self) -> Float64 | None:
+        """The unit vector (3,) against gravity in the world, by floor, walls and how the camera was held; boxes (`obb`)
+        stand along it. None where the map does not tell.
+        """
+        with self.lock:
+            return self.scene.up()
+
+    def floor(self) -> float | None:
+        """m along `up`, how high the floor is: a point is `point @ up - floor` above it. None where it was not seen."""
+        with self.lock:
+            up, mesh = self.scene.up(), self.scene.mesh()
+            return None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
 
     def mesh(self, instance: Instance | int | None = None) -> InstanceMesh:
         """The surface of the whole map, or of one object. Raises DataError for one that there is not."""

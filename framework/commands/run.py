@@ -21,7 +21,6 @@ from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
 from framework.interruption import ENDING, Interruption, heard_from_sweep, raise_on_signals, signals_deferred
-from framework.parameters import checked_path
 from framework.records.stored_runs import is_recorded
 
 log = logging.getLogger(__name__)
@@ -59,7 +58,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     The first signal ends it after the frame, or the record, that is in work, the second one at once.
     """
-    from framework.api import go_on, pipeline_of  # here: a misspelt name is answered before these load
+    from framework.api import begin, pipeline_of  # here: a misspelt name is answered before these load
     from framework.checking.recording_check import warn_of_poses
     from framework.detection.cache import cache_metrics
     from framework.interfaces import RGBDSequence, RGBDVideo
@@ -69,8 +68,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     Settings.of(config).apply()
     pipeline = pipeline_of(config)
-    if config.map is not None:
-        go_on(pipeline, checked_path("map", config.map))
+    begin(config, pipeline)
     video = build(RGBDVideo, config.get("dataset"))  # after the stages: making up a room takes longest
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")

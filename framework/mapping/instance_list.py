@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import open3d as o3d
 
-from framework.data import Bool, Box, Float32, Instance, InstanceMesh, Int32
+from framework.data import Bool, Box, Float32, Float64, Instance, InstanceMesh, Int32
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
 from framework.mapping.map_header import MapHeader
 from framework.parameters import check_bounds
@@ -74,10 +75,10 @@ def vertices_of_area(area: float, voxel_size: float) -> int:
     return max(LEAST_VERTICES, round(area / voxel_size**2))
 
 
-def list_instances(mesh: InstanceMesh, table: InstanceTable) -> Mapping[int, Instance]:
-    """The instances that have vertices, by id, ascending."""
+def list_instances(mesh: InstanceMesh, table: InstanceTable, up: Float64 | None) -> Mapping[int, Instance]:
+    """The instances that have vertices, by id, ascending; `up` (3,) is where their boxes stand upright."""
     return {
-        k: _instance(table, table.records[k], vertices, mesh.vertices[vertices])
+        k: _instance(table, table.records[k], vertices, mesh.vertices[vertices], up)
         for k, vertices in vertices_by_id(mesh.instance_ids).items()
     }
 
@@ -90,7 +91,9 @@ def vertices_by_id(instance_ids: Int32) -> dict[int, Int32]:
     return {int(k): order[start:end] for k, start, end in zip(ids, starts, ends, strict=False) if k > 0}
 
 
-def _instance(table: InstanceTable, record: InstanceRecord, vertices: Int32, points: Float32) -> Instance:
+def _instance(
+    table: InstanceTable, record: InstanceRecord, vertices: Int32, points: Float32, up: Float64 | None
+) -> Instance:
     return Instance(
         id=record.id,
         class_probabilities=table.class_probabilities(record),
@@ -100,7 +103,7 @@ def _instance(table: InstanceTable, record: InstanceRecord, vertices: Int32, poi
         last_frame=record.last_frame,
         vertices=vertices,
         aabb=aligned_box(points),
-        obb=oriented_box(points),
+        obb=box_around(points, up),
     )
 
 
@@ -108,6 +111,25 @@ def aligned_box(points: Float32) -> Box:
     """The box along the world's axes around points (M, 3) m."""
     low, high = points.min(axis=0).astype(np.float64), points.max(axis=0).astype(np.float64)
     return Box((low + high) / 2, high - low, np.eye(3))
+
+
+def box_around(points: Float32, up: Float64 | None) -> Box:
+    """The smallest upright box around points (M, 3) m; where nobody knows what is up, the one along their own axes."""
+    return oriented_box(points) if up is None else upright_box(points, up)
+
+
+def upright_box(points: Float32, up: Float64) -> Box:
+    """The box with its third axis along `up`, and the smallest rectangle on the ground, around points (M, 3) m."""
+    across = np.linalg.svd(up[None])[2][1:]  # (2, 3) two axes of the ground
+    center = points.mean(axis=0, dtype=np.float64)
+    ground, heights = (points - center) @ across.T, (points - center) @ up
+    (u, v), (width, depth), turn = cv2.minAreaRect(ground.astype(np.float32))
+    cosine, sine = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+    first = cosine * across[0] + sine * across[1]
+    rotation = np.stack([first, np.cross(up, first), up], axis=1)
+    low, high = float(heights.min()), float(heights.max())
+    middle = center + u * across[0] + v * across[1] + (low + high) / 2 * up
+    return Box(middle, np.array([width, depth, high - low], np.float64), rotation)
 
 
 def oriented_box(points: Float32) -> Box:

@@ -108,7 +108,10 @@ class InstanceMap(SceneMap):
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def instances(self) -> Mapping[int, Instance]:
-        return list_instances(self.mesh(), self.table)
+        return list_instances(self.mesh(), self.table, self.up())
+
+    def up(self) -> Float64 | None:
+        return self.volume.up()
 
     def save(self, path: Path | str) -> None:
         voxels, arrays = self.volume.saved()

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
+from framework.mapping.gravity import Gravity
 from framework.mapping.integration import Integrator, SeenBlocks
 from framework.mapping.map_file import check_blocks, check_like, check_rows
 from framework.mapping.map_header import MapHeader
@@ -29,6 +30,8 @@ class TsdfVolume:
         self.integrator = Integrator(self.voxels, sensor)
         self._nets: SurfaceNets | None = None  # made when a mesh is first asked for: who never asks pays nothing
         self._mesh: InstanceMesh | None = None
+        self._up: Float64 | None = None
+        self.gravity = Gravity()
 
     @property
     def voxel_size(self) -> float:
@@ -45,6 +48,7 @@ class TsdfVolume:
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
         seen = self.integrator.integrate(frame, T_world_camera, near)
+        self.gravity.held(T_world_camera)
         self.changed(seen.blocks)
         return seen
 
@@ -53,7 +57,7 @@ class TsdfVolume:
 
         `blocks` (A,) are the numbers of those whose voxels were written; None = perhaps all.
         """
-        self._mesh = None
+        self._mesh = self._up = None
         if blocks is None:
             self._nets = None
         elif self._nets is not None:
@@ -63,6 +67,13 @@ class TsdfVolume:
         """As it is now, without labels."""
         self._nets = self._nets or SurfaceNets(self.voxels)
         return self._nets.extract()
+
+    def up(self) -> Float64 | None:
+        """See SceneMap; kept until the map changes."""
+        if self._up is None:
+            surface = self.surface()
+            self._up = self.gravity.up(surface.vertices, surface.triangles)
+        return self._up
 
     def mesh(self, label: Callable[[Surface], InstanceMesh]) -> InstanceMesh:
         """The surface as it is now, with the labels that `label` gives it; kept until the map changes."""
@@ -84,6 +95,7 @@ class TsdfVolume:
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
             "max_blocks": self.voxels.max_blocks,
             "frames": self.integrator.frames,
+            "camera_up": self.gravity.camera_up.tolist(),
         }
         return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
 
@@ -96,6 +108,7 @@ class TsdfVolume:
             header.number("voxel_size", BOUNDS["voxel_size"]), sensor, header.whole("max_blocks", 1, MOST_BLOCKS)
         )
         volume.integrator.frames = header.whole("frames")  # rounding goes on from there
+        volume.gravity = Gravity.of(header.items("camera_up"))
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
         check_rows(arrays["label_row"], rows)
         volume.fill(arrays)

@@ -11,8 +11,9 @@ from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
 from framework.evaluation import instances, trajectory
 from framework.evaluation.instances import PredictedInstances, Transfer
 from framework.files.hashing import add_values
-from framework.interfaces import RGBDVideo
+from framework.interfaces import RGBDVideo, SceneMap
 from framework.journal import RunResult
+from framework.mapping.gravity import floor_height
 
 Metrics = dict[str, float | int | str | bool | None]
 
@@ -53,6 +54,15 @@ def trajectory_metrics(result: RunResult) -> Metrics:
     for frame in result.tracked:
         reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
     return dict(trajectory.evaluate(reference, estimated).metrics())
+
+
+def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
+    """Which way is up in the world, and how high the floor is along that; nothing where the map does not tell."""
+    up = scene.up()
+    if up is None:
+        return {}
+    figures: Metrics = {f"map.up.{axis}": float(value) for axis, value in zip("xyz", up, strict=True)}
+    return figures | {"map.floor_m": floor_height(mesh.vertices, mesh.triangles, up)}
 
 
 def instance_metrics(

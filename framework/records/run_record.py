@@ -26,9 +26,16 @@ from framework.journal import RunResult
 from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.instances_file import write_instances
 from framework.records.mesh_file import write_mesh
-from framework.records.metrics import Metrics, class_name, instance_metrics, run_metrics, trajectory_metrics
+from framework.records.metrics import (
+    Metrics,
+    class_name,
+    instance_metrics,
+    room_metrics,
+    run_metrics,
+    trajectory_metrics,
+)
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES
+from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES, TRAJECTORY
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.tracking.places_file import write_places
@@ -87,13 +94,14 @@ class RunRecord:
             attempt(_write_config, self.directory / CONFIG, self.config)
         trusted = [frame for frame in result.tracked if not frame.pose.lost]
         poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
-        attempt(write_tum, self.directory / "trajectory.txt", np.array([frame.timestamp for frame in trusted]), poses)
+        attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
         attempt(write_timings, self.directory / "timings.csv", result)
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
         found = attempt(_found, scene)
         if found is not None:
             attempt(write_instances, self.directory / "instances.json", *found, scene.classes)
             figures["instances.count"] = len(found[1])
+            figures |= attempt(room_metrics, scene, found[0]) or {}
         attempt(self._write_partial, video, figures, attempt.fault)
         if found is not None:
             attempt(write_mesh, self.directory / "mesh.ply", found[0])

@@ -13,7 +13,7 @@ from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
 from framework.files.tum_trajectory import read_tum
 from framework.records.instances_file import StoredInstance, read_instances
 from framework.records.mesh_file import read_mesh
-from framework.records.stored_runs import METRICS, Record
+from framework.records.stored_runs import METRICS, TRAJECTORY, Record
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class StoredMap:
     def of(cls, record: Record) -> StoredMap:
         """Raises DataError, naming the file, when one cannot be read or is of another run, or nothing was mapped."""
         mesh, instances = read_objects(record)
-        _, poses = read_tum(record.directory / "trajectory.txt")
+        _, poses = read_tum(record.directory / TRAJECTORY)
         if not len(mesh.triangles) or not len(poses):
             raise DataError(f"{record.directory}: nothing was mapped")
         names = {instance.id: instance.class_name for instance in instances}

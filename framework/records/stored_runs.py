@@ -26,8 +26,9 @@ METRICS = "metrics.json"  # there exactly when the run completed
 PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
 LOG = "instancemap.log"
 MAP = "map.npz"
+TRAJECTORY = "trajectory.txt"
 PLACES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
-MAPPED = ("trajectory.txt", "timings.csv", "instances.json", "mesh.ply", MAP, "overview.png")
+MAPPED = (TRAJECTORY, "timings.csv", "instances.json", "mesh.ply", MAP, "overview.png")
 """What is written of a map, in this order: on a disk that is full the small ones still find a place."""
 
 EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run

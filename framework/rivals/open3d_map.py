@@ -13,12 +13,13 @@ from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMe
 from framework.geometry import back_project, transform
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes
+from framework.mapping.gravity import Gravity
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.map_file import check_known, faults_of, plain_table, read_map, table_of, write_map
 from framework.rivals.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
 
-FORMAT = "open3d_vbg 3"  # of the saved file; a change of meaning counts it up
+FORMAT = "open3d_vbg 4"  # of the saved file; a change of meaning counts it up
 
 
 class Open3DMap(SceneMap):
@@ -33,6 +34,7 @@ class Open3DMap(SceneMap):
         self.table = InstanceTable()
         self.confirmation = confirmation
         self.grid = BlockGrid(settings)
+        self.gravity = Gravity()
 
     @property
     def voxel_count(self) -> int:
@@ -61,6 +63,7 @@ class Open3DMap(SceneMap):
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
         """Adds the depth and the colour of `frame`. Raises MapFullError, and adds nothing, at the end of the budget."""
         self.grid.integrate(frame, T_world_camera)
+        self.gravity.held(T_world_camera)
         self.changed()
 
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
@@ -127,7 +130,11 @@ class Open3DMap(SceneMap):
         return InstanceMesh(vertices, triangles, colors, ids, self.table.class_ids()[ids], self.classes)
 
     def instances(self) -> Mapping[int, Instance]:
-        return list_instances(self.mesh(), self.table)
+        return list_instances(self.mesh(), self.table, self.up())
+
+    def up(self) -> Float64 | None:
+        mesh = self.mesh()
+        return self.gravity.up(mesh.vertices, mesh.triangles)
 
     def save(self, path: Path | str) -> None:
         header = {
@@ -136,6 +143,7 @@ class Open3DMap(SceneMap):
             "confirmation": asdict(self.confirmation),
             "classes": self.classes,
             "frames": self.grid.frames,
+            "camera_up": self.gravity.camera_up.tolist(),
             "table": plain_table(self.table),
         }
         write_map(path, header, self.grid.arrays())
@@ -149,6 +157,7 @@ class Open3DMap(SceneMap):
             scene.classes = header.classes()
             scene.table = table_of(header.part("table"), len(scene.classes))
             scene.grid.frames = header.whole("frames")
+            scene.gravity = Gravity.of(header.items("camera_up"))
             scene.grid.fill(arrays)
             check_known("instance", arrays["instance"], [0, *scene.table.records])
         return scene

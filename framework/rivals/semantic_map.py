@@ -11,7 +11,7 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, SurfaceView, View
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes
-from framework.mapping.instance_list import aligned_box, oriented_box, vertices_by_id, vertices_of_area
+from framework.mapping.instance_list import aligned_box, box_around, vertices_by_id, vertices_of_area
 from framework.mapping.map_file import faults_of, read_map, write_map
 from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import voxel_seen
@@ -21,7 +21,7 @@ from framework.rivals.class_evidence import ClassEvidence, ClassRows, best_class
 from framework.rivals.connected_components import component_statistics, connected_components, vertex_classes
 
 MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of what a map is made with; m^2
-FORMAT = "semantic 1"  # of the saved file; a change of meaning counts it up
+FORMAT = "semantic 2"  # of the saved file; a change of meaning counts it up
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -121,7 +121,7 @@ class SemanticMap(SceneMap):
             mesh.instance_ids,
             len(self.classes),
         )
-        instances = {}
+        instances, up = {}, self.up()
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
             sums, points = statistics.probability_sums[k], mesh.vertices[vertices]
             instances[k] = Instance(
@@ -133,9 +133,12 @@ class SemanticMap(SceneMap):
                 last_frame=int(statistics.last_frame[k]),
                 vertices=vertices,
                 aabb=aligned_box(points),
-                obb=oriented_box(points),
+                obb=box_around(points, up),
             )
         return instances
+
+    def up(self) -> Float64 | None:
+        return self.volume.up()
 
     def save(self, path: Path | str) -> None:
         header, arrays = self.volume.saved()

@@ -69,7 +69,7 @@ class PycolmapPnp(PoseTracker):
     def places(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
 
-    def recall(self, places: Mapping[str, Array]) -> None:
+    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
         if not places:
             raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
         self._keyframes.restore(places)

@@ -134,13 +134,13 @@ class VoxelHashingIcp(PoseTracker):
         self._visited: deque[Float64] = deque(maxlen=VISITED)
         self._T_world_doubted: Float64 | None = None  # the last frame's, where it was lost only by doubt
         self._last: FrameFeatures | None = None  # of the last frame that was trusted
-        self._recalled = False  # keyframes of a map from before
+        self._before: SceneMap | None = None  # a map from before, until the camera is found in it
         self._coarse_depth = False  # too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         seen = FrameFeatures(frame, self._keyframes.extractor)
-        if self._T_world_last is None and self._recalled:
-            return self._entered(seen, scene)
+        if self._before is not None:
+            return self._entered(seen, self._before)
         if self._T_world_last is None or scene.voxel_count == 0:
             return self._first(seen, scene)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
@@ -167,13 +167,13 @@ class VoxelHashingIcp(PoseTracker):
     def places(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
 
-    def recall(self, places: Mapping[str, Array]) -> None:
+    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
         if not places:
             raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
         self._keyframes.restore(places)
-        self._recalled = True
+        self._before = scene
 
-    def _entered(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
+    def _entered(self, seen: FrameFeatures, before: SceneMap) -> Pose:
         """Finds the camera in a map from before: features of its keyframes lead to where alignment with it stays."""
         unknown = Alignment(np.eye(4), 0, 0, 0, 0, "it has not been found in the map from before", "")
         found = self._keyframes.relocalize(seen.frame)
@@ -181,9 +181,10 @@ class VoxelHashingIcp(PoseTracker):
         if found is not None:
             levels = build_pyramid(seen.frame.camera, seen.frame.depth, seen.frame.color, self.finest, LEVELS)
             self._coarse_depth = is_coarse(seen.frame.depth, otherwise=self._coarse_depth)
-            alignment = self._checked(unknown, found.T_world_camera, levels, scene)
+            alignment = self._checked(unknown, found.T_world_camera, levels, before)
         if not alignment.trusted:
             return Pose(np.eye(4), lost=True, reason=alignment.reason)
+        self._before = None
         return self._trusted(seen, alignment.T_world_camera)
 
     def _continued(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:

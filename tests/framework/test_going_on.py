@@ -16,6 +16,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError
 from framework.evaluation.trajectory import evaluate
+from framework.geometry import inverse, rotation_angle
 from framework.tracking.places_file import read_places, write_places
 from tests.scenes.corner_room import CornerRoom
 
@@ -144,7 +145,7 @@ def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> Non
         np.testing.assert_array_equal(back[name], array)
         assert back[name].dtype == array.dtype
     again = Mapper(*TRACKED).pipeline.tracker
-    again.recall(back)
+    again.recall(back, desk.scene)
     for name, array in again.places().items():
         np.testing.assert_array_equal(array, places[name])
     scaled = np.array(places["poses"]) * 2
@@ -156,9 +157,9 @@ def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> Non
         {"descriptors": np.asarray(places["descriptors"]).astype(np.int32)},
     ):
         with pytest.raises(DataError):
-            Mapper(*TRACKED).pipeline.tracker.recall({**places, **damage})
+            Mapper(*TRACKED).pipeline.tracker.recall({**places, **damage}, desk.scene)
     with pytest.raises(DataError, match="keyframes are"):
-        Mapper(*TRACKED).pipeline.tracker.recall({"poses": places["poses"]})
+        Mapper(*TRACKED).pipeline.tracker.recall({"poses": places["poses"]}, desk.scene)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"keyframes\.npz"):
         read_places(path)
@@ -169,3 +170,21 @@ def test_a_map_with_views_of_two_recordings_is_stored_and_read(tmp_path: Path, r
     again, _ = mapped(room, *GIVEN, f"map={put_away(first, tmp_path / 'first')}")
     again.scene.save(tmp_path / "again.npz")
     assert list(load_map(tmp_path / "again.npz").instances()) == list(again.instances())
+
+
+def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
+    """Without true poses: those of the second recording are of the first one's world all the same."""
+    unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
+    first, poses = mapped(unposed[:25], *TRACKED)
+    own, in_its_world = mapped(unposed[20:], *TRACKED, f"world={put_away(first, tmp_path / 'first')}")
+    assert not any(pose.lost for pose in in_its_world)
+    for k in range(5):
+        apart = inverse(poses[20 + k].T_world_camera) @ in_its_world[k].T_world_camera
+        assert np.linalg.norm(apart[:3, 3]) < 0.01
+        assert rotation_angle(apart[:3, :3]) < 0.01
+    alone, _ = mapped(unposed[20:], *TRACKED)
+    assert own.scene.voxel_count == pytest.approx(alone.scene.voxel_count, rel=0.05)
+    with pytest.raises(ConfigError, match="map and world exclude each other"):
+        Mapper(*TRACKED, f"world={tmp_path / 'first'}", f"map={tmp_path / 'first'}")
+    with pytest.raises(DataError, match="world: there is no"):
+        Mapper(*TRACKED, f"world={tmp_path}")

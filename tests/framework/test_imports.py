@@ -23,7 +23,7 @@ LAYERS = [
     ["detection", "mapping", "refinement", "tracking"],
     ["rivals", "datasets"],
     ["checking", "synthetic"],
-    ["journal", "object_queries"],
+    ["journal", "object_changes", "object_queries"],
     ["pipeline"],
     ["evaluation"],
     ["records", "training"],

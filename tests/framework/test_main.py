@@ -161,6 +161,7 @@ FAULTY = {
     "ranks": ["nowhere", "elsewhere"],
     "figures": ["nowhere"],
     "check": ["out=check.jpg"],
+    "diff": ["old", "old"],
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],

@@ -6,13 +6,16 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 
+from framework.api import Mapper
 from framework.data import Instance
 from framework.errors import DataError
 from framework.evaluation.instances import PredictedInstances
 from framework.pipeline import Pipeline
+from framework.records import instances_file
 from framework.records.instances_file import StoredInstance, read_instances, write_instances
 from tests.scenes.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
 
@@ -96,3 +99,38 @@ def test_anything_else_is_refused_in_one_line(tmp_path: Path, content: object, s
 def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:
     write_instances(tmp_path / "instances.json", GridMap().mesh(), {}, CLASSES)
     assert read_instances(tmp_path / "instances.json") == []
+
+
+SCHEMA = json.loads((Path(instances_file.__file__).parent / "instances.schema.json").read_text())
+
+
+def test_the_schema_describes_what_is_written(tmp_path: Path, room: CornerRoom) -> None:
+    """Of a map with objects, whose boxes stand upright, and of one that knows no classes."""
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    mapper = Mapper("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
+    for frame in room:
+        mapper.add(frame)
+    up = mapper.up()
+    assert up is not None
+    write_instances(tmp_path / "instances.json", mapper.mesh(), mapper.instances(), mapper.classes)
+    written = json.loads((tmp_path / "instances.json").read_text())
+    jsonschema.validate(written, SCHEMA)
+    assert written
+    for entry in written:
+        np.testing.assert_allclose(np.array(entry["obb"]["rotation"])[:, 2], up, atol=1e-9)
+    scene = mapped()
+    write_instances(tmp_path / "others.json", scene.mesh(), dict(scene.instances()), CLASSES)
+    jsonschema.validate(json.loads((tmp_path / "others.json").read_text()), SCHEMA)
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [{"id": 0}, {"confidence": 2}, {"centroid": [1, 2]}, {"obb": {}}, {"more": 1}, {"class_probabilities": {"a": 2}}],
+)
+def test_the_schema_refuses_what_is_never_written(tmp_path: Path, damage: dict[str, object]) -> None:
+    scene = mapped()
+    write_instances(tmp_path / "instances.json", scene.mesh(), dict(scene.instances()), CLASSES)
+    [entry, *_] = json.loads((tmp_path / "instances.json").read_text())
+    jsonschema.validate([entry], SCHEMA)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate([entry | damage], SCHEMA)

@@ -1,0 +1,139 @@
+"""Which way is up: exact in rooms that are known, within a degree or so in real ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Float32, Float64, Int32
+from framework.errors import DataError
+from framework.mapping.gravity import Gravity, faces, floor_height, half_sphere
+from framework.mapping.instance_list import box_around, upright_box
+
+
+def rectangle(origin: Float64, a: Float64, b: Float64, cells: int = 12) -> tuple[Float32, Int32]:
+    """A wall or a floor from `origin` along a and b, its normal along a x b."""
+    s, t = np.meshgrid(np.linspace(0, 1, cells + 1), np.linspace(0, 1, cells + 1), indexing="ij")
+    vertices = origin + s.reshape(-1, 1) * a + t.reshape(-1, 1) * b
+    corner = (np.arange(cells)[:, None] * (cells + 1) + np.arange(cells)).ravel()
+    quads = np.stack([corner, corner + cells + 1, corner + cells + 2, corner + 1], axis=1)
+    triangles = np.concatenate([quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]])
+    return vertices.astype(np.float32), triangles.astype(np.int32)
+
+
+def joined(*parts: tuple[Float32, Int32]) -> tuple[Float32, Int32]:
+    firsts = np.cumsum([0, *(len(vertices) for vertices, _ in parts)])
+    triangles = [part[1] + np.int32(first) for part, first in zip(parts, firsts, strict=False)]
+    return np.concatenate([vertices for vertices, _ in parts]), np.concatenate(triangles)
+
+
+X, Y, Z = np.eye(3)
+
+
+def room() -> tuple[Float32, Int32]:
+    """Floor at z = 0, a table, and two large walls, which have more surface."""
+    return joined(
+        rectangle(np.zeros(3), 3 * X, 4 * Y),
+        rectangle(np.array([1.0, 1, 0.7]), X, Y),
+        rectangle(np.zeros(3), 4 * Y, 5 * Z),
+        rectangle(np.array([0.0, 0, 0]), 5 * Z, 3 * X),
+    )
+
+
+def held(turned: Float64, downwards: float = 0.5) -> Gravity:
+    """By who walks through the room, turned as the world is, and looks downwards, rad."""
+    gravity = Gravity()
+    for k in range(8):
+        heading = Rotation.from_euler("z", k / 8 * 3)
+        # camera axes: x right, y down, z forward; without a turn forward is the world's y
+        looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -downwards)
+        T = np.eye(4)
+        T[:3, :3] = turned @ (heading * looking).as_matrix()
+        gravity.held(T)
+    return gravity
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_up_is_found_however_the_world_lies(seed: int) -> None:
+    turned = Rotation.random(random_state=seed).as_matrix()
+    vertices, triangles = room()
+    up = held(turned).up((vertices @ turned.T).astype(np.float32), triangles)
+    assert up is not None
+    assert np.degrees(np.arccos(min(up @ turned @ Z, 1.0))) < 0.05
+    floor = floor_height((vertices @ turned.T).astype(np.float32), triangles, up)
+    assert floor == pytest.approx(0, abs=0.005)
+
+
+def test_noise_and_clutter_leave_it_where_it_is() -> None:
+    chosen = np.random.default_rng(0)
+    vertices, triangles = room()
+    heap = [rectangle(chosen.normal(size=3), chosen.normal(size=3), chosen.normal(size=3), 3) for _ in range(20)]
+    vertices, triangles = joined((vertices, triangles), *heap)
+    noisy = vertices + chosen.normal(scale=0.005, size=vertices.shape).astype(np.float32)
+    up = held(np.eye(3)).up(noisy, triangles)
+    assert up is not None
+    assert np.degrees(np.arccos(up @ Z)) < 2
+
+
+def test_where_nothing_tells_nobody_knows() -> None:
+    vertices, triangles = room()
+    assert Gravity().up(vertices, triangles) is None
+    assert held(np.eye(3)).up(vertices, triangles[:0]) is None
+    directions = half_sphere(500) * np.where(np.arange(500) % 2, 1, -1)[:, None]
+    pebbles = [rectangle(8 * n, *np.linalg.svd(n[None])[2][1:], 1) for n in directions]  # each has another slope
+    assert held(np.eye(3)).up(*joined(*pebbles)) is None
+
+
+def test_a_floor_that_was_not_seen_is_not_made_up() -> None:
+    """Only a table, with its legs and what lies below."""
+    table = rectangle(np.array([0, 0, 0.7]), X, Y)
+    legs = [rectangle(np.array([0.1 * k, 0, 0.0]), 0.3 * Y, 0.6 * Z, 4) for k in range(5)]
+    vertices, triangles = joined(table, *legs)
+    assert floor_height(vertices, triangles, Z) is None
+    assert floor_height(*rectangle(np.zeros(3), Y, Z), Z) is None
+
+
+def test_faces_are_those_of_the_triangles() -> None:
+    vertices = np.float32([[0, 0, 0], [2, 0, 0], [0, 3, 0], [0, 0, 0]])
+    normals, areas, centers = faces(vertices, np.int32([[0, 1, 2], [0, 3, 1]]))  # the second has no area
+    np.testing.assert_allclose(normals, [[0, 0, 1]])
+    np.testing.assert_allclose(areas, [3])
+    np.testing.assert_allclose(centers, [[2 / 3, 1, 0]])
+
+
+def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
+    gravity = held(np.eye(3))
+    np.testing.assert_array_equal(Gravity.of(gravity.camera_up.tolist()).camera_up, gravity.camera_up)
+    for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0]):
+        with pytest.raises(DataError, match="camera_up"):
+            Gravity.of(wrong)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_an_upright_box_is_the_box_that_was_turned(seed: int) -> None:
+    chosen = np.random.default_rng(seed)
+    size, center, turn = np.sort(chosen.uniform(0.2, 2, 3)), chosen.normal(size=3), chosen.uniform(0, np.pi)
+    world = Rotation.random(random_state=seed)
+    standing = world * Rotation.from_euler("z", turn)
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+    inside = chosen.uniform(-0.5, 0.5, (200, 3)) * size
+    points = (standing.apply(np.concatenate([corners, inside])) + center).astype(np.float32)
+    up = world.apply(Z)
+    box = upright_box(points, up)
+    np.testing.assert_allclose(box.center, center, atol=1e-4)
+    np.testing.assert_allclose(np.sort(box.extent[:2]), np.sort(size[:2]), atol=1e-4)
+    assert box.extent[2] == pytest.approx(size[2], abs=1e-4)
+    np.testing.assert_allclose(box.rotation[:, 2], up, atol=1e-9)
+    np.testing.assert_allclose(box.rotation @ box.rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(box.rotation) == pytest.approx(1)
+    within = np.abs((points - box.center) @ box.rotation)
+    assert (within <= box.extent / 2 + 1e-4).all()
+
+
+def test_a_box_around_little_is_a_box() -> None:
+    for points in (np.zeros((1, 3)), np.array([[0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 0], [0, 0, 2]])):
+        box = box_around(points.astype(np.float32), Z)
+        assert np.isfinite(box.center).all()
+        assert np.linalg.det(box.rotation) == pytest.approx(1)
+        assert box.extent.max() == pytest.approx(np.ptp(points, axis=0).max(), abs=1e-5)
