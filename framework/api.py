@@ -26,7 +26,7 @@ from framework.datasets.recording import FRAME_RATE
 from framework.detection.cache import with_cache
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence, SceneMap
+from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence, SceneMap
 from framework.journal import Journal
 from framework.object_queries import Map
 from framework.parameters import checked_path
@@ -49,6 +49,7 @@ __all__ = [
     "Instance",
     "InstanceMapError",
     "InstanceMesh",
+    "LiveVideo",
     "Map",
     "MapFullError",
     "MapFuser",
@@ -94,12 +95,13 @@ def begin_in(pipeline: Pipeline, run: Path) -> None:
 
 def begin(config: DictConfig, pipeline: Pipeline) -> None:
     """What the keys `map` and `world` ask for."""
-    if config.map is not None and config.world is not None:
+    map_, world = config.get("map"), config.get("world")
+    if map_ is not None and world is not None:
         raise ConfigError("map and world exclude each other: one goes on with a map, the other begins one in its world")
-    if config.map is not None:
-        go_on(pipeline, checked_path("map", config.map))
-    if config.world is not None:
-        begin_in(pipeline, checked_path("world", config.world))
+    if map_ is not None:
+        go_on(pipeline, checked_path("map", map_))
+    if world is not None:
+        begin_in(pipeline, checked_path("world", world))
 
 
 def _scene_of(key: str, run: Path) -> SceneMap:
