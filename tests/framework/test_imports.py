@@ -21,7 +21,7 @@ LAYERS = [
     ["rendering"],
     ["detection", "mapping", "refinement", "tracking"],
     ["rivals", "datasets"],
-    ["checking", "synthetic"],
+    ["checking", "importing", "synthetic"],
     ["journal"],
     ["pipeline"],
     ["evaluation"],
@@ -36,7 +36,7 @@ LAYERS = [
 
 LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 
-OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas"}
+OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "OpenEXR", "liblzfse", "rosbags"}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
 
 

@@ -1,0 +1,140 @@
+"""Recordings as the apps of phones export them, written from frames that are known, for tests of the importers."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Camera, Float64, Frame, UInt8, UInt16
+from framework.datasets.rgbd_folder import RgbdFolder
+from tests.scenes.corner_room import look, pose_at
+
+LIDAR = (192, 256)  # (h, w) px of ARKit's depth
+ARKIT_AXES = np.diag([1.0, -1.0, -1.0, 1.0])  # its camera has y up and z backward
+
+
+@dataclass(frozen=True)
+class PhoneFrame:
+    """What a phone sees at one moment."""
+
+    timestamp: float  # s
+    camera: Camera  # of colour
+    color: UInt8  # (H, W, 3) RGB
+    depth_mm: UInt16  # (h, w)
+    confidence: UInt8  # (h, w), 0 to 2
+    T_world_camera: Float64  # (4, 4), in our axes
+
+    @property
+    def T_world_arkit(self) -> Float64:
+        return self.T_world_camera @ ARKIT_AXES
+
+
+def seen_by_phone(frames: Sequence[Frame], shape: tuple[int, int] = LIDAR) -> Iterator[PhoneFrame]:
+    """Frames with depth thinned to a phone's, and low confidence beside steps in it."""
+    for frame in frames:
+        assert frame.T_world_camera is not None
+        v, u = (
+            np.rint((np.arange(n) + 0.5) * m / n - 0.5).astype(int)
+            for n, m in zip(shape, frame.depth.shape, strict=True)
+        )
+        depth = frame.depth[v][:, u]
+        kernel = np.ones((3, 3))
+        beside_step = cv2.dilate(depth, kernel) > 1.05 * cv2.erode(np.where(depth > 0, depth, 100), kernel)
+        yield PhoneFrame(
+            timestamp=248630.5 + frame.timestamp,
+            camera=frame.camera,
+            color=frame.color,
+            depth_mm=np.rint(depth * 1000).astype(np.uint16),
+            confidence=np.where(depth == 0, 0, np.where(beside_step, 1, 2)).astype(np.uint8),
+            T_world_camera=frame.T_world_camera,
+        )
+
+
+def numbered(values: np.ndarray | Sequence[float]) -> str:
+    return ", ".join(repr(float(value)) for value in np.ravel(values))
+
+
+def write_png(path: Path, image: np.ndarray) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), image)
+
+
+def write_jpeg(path: Path, color: UInt8) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    assert cv2.imwrite(str(path), color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+
+
+def write_video(path: Path, colors: Sequence[UInt8]) -> None:
+    height, width = colors[0].shape[:2]
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter_fourcc(*"mp4v"), 30, (width, height))
+    assert video.isOpened()
+    video.set(cv2.VIDEOWRITER_PROP_QUALITY, 95)
+    for color in colors:
+        video.write(np.ascontiguousarray(color[..., ::-1]))
+    video.release()
+
+
+def write_stray_scanner(folder: Path, frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> None:
+    """As docs/format.md of StrayRobots/scanner says, and its OdometryEncoder writes."""
+    folder.mkdir(parents=True)
+    K = frames[0].camera.K
+    (folder / "camera_matrix.csv").write_text("\n".join(numbered(row) for row in K))
+    intrinsics = ", fx, fy, cx, cy, distortion_center_x, distortion_center_y" if own_intrinsics else ""
+    lines = [f"timestamp, frame, x, y, z, qx, qy, qz, qw{intrinsics}"]
+    for k, frame in enumerate(frames):
+        write_png(folder / f"depth/{k:06d}.png", frame.depth_mm)
+        write_png(folder / f"confidence/{k:06d}.png", frame.confidence)
+        T = frame.T_world_arkit @ ARKIT_AXES  # q_WA * q_AC of the app
+        pose = numbered([*T[:3, 3], *Rotation.from_matrix(T[:3, :3]).as_quat()])
+        c = frame.camera
+        own = f", {numbered([c.fx, c.fy, c.cx, c.cy])}, , " if own_intrinsics else ""
+        lines.append(f"{frame.timestamp!r}, {k:06d}, {pose}{own}")
+    (folder / "odometry.csv").write_text("\n".join(lines) + "\n")
+    write_video(folder / "rgb.mp4", [frame.color for frame in frames])
+
+
+ROOM = Camera(320, 240, 300.0, 301.0, 157.0, 118.0)
+
+
+def room_frames(count: int = 4) -> list[PhoneFrame]:
+    """A walk in a small room, seen by a camera that focuses anew from frame to frame; depth is exact."""
+    frames = []
+    for k in range(count):
+        camera = replace(ROOM, fx=ROOM.fx + 2 * k, fy=ROOM.fy + 2 * k)
+        T_world_camera = pose_at(k)
+        color = look(camera, T_world_camera)[2]
+        depth = look(camera.scaled(0.25), T_world_camera)[0]
+        depth_mm = np.rint(1000 * depth).astype(np.uint16)
+        confidence = np.full(depth.shape, 2, np.uint8)
+        confidence[:10], confidence[10:20] = 0, 1
+        frames.append(PhoneFrame(100.5 + k / 30, camera, color, depth_mm, confidence, T_world_camera))
+    return frames
+
+
+def check_imported(folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1) -> None:
+    """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, colour and depth."""
+    sequence = RgbdFolder(folder)
+    fx, fy = np.median([(frame.camera.fx, frame.camera.fy) for frame in frames], axis=0).tolist()
+    assert sequence.camera == replace(ROOM, fx=fx, fy=fy).scaled(scale)
+    assert len(sequence) == len(frames)
+    for frame, seen in zip(frames, sequence, strict=True):
+        assert seen.timestamp == pytest.approx(frame.timestamp, abs=1e-6)
+        np.testing.assert_allclose(seen.T_world_camera, frame.T_world_camera, atol=1e-6)
+        depth, _, color, ids = look(sequence.camera, frame.T_world_camera)
+        rows = 240 * scale * np.array([0, 10, 20]) / 60
+        unsure = np.zeros(depth.shape, bool)
+        unsure[: max(0, int(rows[least]) - 4)] = True
+        assert (seen.depth[unsure] == 0).all()
+        sure = ~unsure
+        sure[: int(rows[least]) + 4] = False
+        assert (seen.depth[sure] > 0).mean() > 0.97  # where it focuses nearer, it sees less than is written
+        error = np.abs(seen.depth - depth)[sure & (ids == 0) & (seen.depth > 0)]
+        assert np.median(error) < 1e-3
+        assert (error > 0.02).mean() < 0.05
+        assert np.abs(seen.color.astype(int) - color).mean() < 12
