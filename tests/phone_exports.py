@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -138,3 +140,48 @@ def check_imported(folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.
         assert np.median(error) < 1e-3
         assert (error > 0.02).mean() < 0.05
         assert np.abs(seen.color.astype(int) - color).mean() < 12
+
+
+def record3d_metadata(frames: Sequence[PhoneFrame], own_intrinsics: bool = True) -> dict[str, object]:
+    """As in metadata.json of a real export; newer versions have the intrinsics of each frame."""
+    (dh, dw), camera = frames[0].depth_mm.shape, frames[0].camera
+    poses = [[*Rotation.from_matrix(T[:3, :3]).as_quat(), *T[:3, 3]] for T in (frame.T_world_arkit for frame in frames)]
+    metadata = {
+        "dh": dh,
+        "dw": dw,
+        "h": camera.height,
+        "w": camera.width,
+        "fps": 30,
+        "cameraType": 1,
+        "K": camera.K.T.ravel().tolist(),
+        "initPose": [0, 0, 0, 1, 0, 0, 0],
+        "poses": poses,
+        "frameTimestamps": [frame.timestamp for frame in frames],
+    }
+    own = [[frame.camera.fx, frame.camera.fy, frame.camera.cx, frame.camera.cy] for frame in frames]
+    return metadata | ({"perFrameIntrinsicCoeffs": own} if own_intrinsics else {})
+
+
+def write_record3d_exr(folder: Path, frames: Sequence[PhoneFrame]) -> None:
+    import OpenEXR
+
+    (folder / "depth").mkdir(parents=True)
+    (folder / "metadata.json").write_text(json.dumps(record3d_metadata(frames)))
+    for k, frame in enumerate(frames):
+        write_jpeg(folder / f"rgb/{k}.jpg", frame.color)
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        depth = (frame.depth_mm / 1000).astype(np.float16)
+        OpenEXR.File(header, {"R": depth}).write(str(folder / f"depth/{k}.exr"))
+
+
+def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) -> None:
+    import liblzfse
+
+    with zipfile.ZipFile(path, "w") as file:
+        file.writestr("metadata", json.dumps(record3d_metadata(frames)))
+        for k, frame in enumerate(frames):
+            _, data = cv2.imencode(".jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+            file.writestr(f"rgbd/{k}.jpg", data.tobytes())
+            file.writestr(f"rgbd/{k}.depth", liblzfse.compress((frame.depth_mm / 1000).astype("<f4").tobytes()))
+            if confident:
+                file.writestr(f"rgbd/{k}.conf", liblzfse.compress(frame.confidence.tobytes()))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from framework.errors import DataError
-from framework.importing import stray_scanner
+from framework.importing import record3d, stray_scanner
 from framework.importing.source import Source
 
 
@@ -27,6 +27,18 @@ FORMATS = (
         "a folder with odometry.csv, camera_matrix.csv, rgb.mp4 and depth/",
         stray_scanner.recognised,
         stray_scanner.open_source,
+    ),
+    Format(
+        "record3d",
+        "an .r3d file of Record3D",
+        record3d.file_recognised,
+        record3d.open_file,
+    ),
+    Format(
+        "record3d_exr",
+        "a folder with metadata.json, rgb/ and depth/, Record3D's EXR + RGB export",
+        record3d.folder_recognised,
+        record3d.open_folder,
     ),
 )
 
