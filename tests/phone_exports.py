@@ -108,7 +108,7 @@ def room_frames(count: int = 4) -> list[PhoneFrame]:
     """A walk in a small room, seen by a camera that focuses anew from frame to frame; depth is exact."""
     frames = []
     for k in range(count):
-        camera = replace(ROOM, fx=ROOM.fx + 2 * k, fy=ROOM.fy + 2 * k)
+        camera = replace(ROOM, fx=ROOM.fx - 2 * k, fy=ROOM.fy - 2 * k)
         T_world_camera = pose_at(k)
         color = look(camera, T_world_camera)[2]
         depth = look(camera.scaled(0.25), T_world_camera)[0]
@@ -122,8 +122,7 @@ def room_frames(count: int = 4) -> list[PhoneFrame]:
 def check_imported(folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1) -> None:
     """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, colour and depth."""
     sequence = RgbdFolder(folder)
-    fx, fy = np.median([(frame.camera.fx, frame.camera.fy) for frame in frames], axis=0).tolist()
-    assert sequence.camera == replace(ROOM, fx=fx, fy=fy).scaled(scale)
+    assert sequence.camera == frames[0].camera.scaled(scale)
     assert len(sequence) == len(frames)
     for frame, seen in zip(frames, sequence, strict=True):
         assert seen.timestamp == pytest.approx(frame.timestamp, abs=1e-6)
@@ -135,7 +134,7 @@ def check_imported(folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.
         assert (seen.depth[unsure] == 0).all()
         sure = ~unsure
         sure[: int(rows[least]) + 4] = False
-        assert (seen.depth[sure] > 0).mean() > 0.97  # where it focuses nearer, it sees less than is written
+        assert (seen.depth[sure] > 0).all()
         error = np.abs(seen.depth - depth)[sure & (ids == 0) & (seen.depth > 0)]
         assert np.median(error) < 1e-3
         assert (error > 0.02).mean() < 0.05
@@ -185,3 +184,41 @@ def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) 
             file.writestr(f"rgbd/{k}.depth", liblzfse.compress((frame.depth_mm / 1000).astype("<f4").tobytes()))
             if confident:
                 file.writestr(f"rgbd/{k}.conf", liblzfse.compress(frame.confidence.tobytes()))
+
+
+def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:
+    """As "All Data" of a low resolution scan: every frame has depth and a pose, colour is kept of some."""
+    for k, frame in enumerate(frames):
+        write_png(folder / f"depth_{k:05d}.png", frame.depth_mm)
+        write_png(folder / f"conf_{k:05d}.png", frame.confidence)
+        write_jpeg(folder / f"frame_{k:05d}.jpg", frame.color)
+        content = {
+            "averageAngularVelocity": 0.1,
+            "averageVelocity": 0.2,
+            "cameraPoseARFrame": frame.T_world_arkit.ravel().tolist(),
+            "exposureDuration": 0.016,
+            "frame_index": k,
+            "intrinsics": frame.camera.K.ravel().tolist(),
+            "motionQuality": 0.9,
+            "projectionMatrix": np.eye(4).ravel().tolist(),
+            "time": frame.timestamp,
+        }
+        (folder / f"frame_{k:05d}.json").write_text(json.dumps(content))
+    (folder / "info.json").write_text("{}")
+
+
+def write_polycam(folder: Path, frames: Sequence[PhoneFrame], prefix: str = "") -> None:
+    """As the raw data of polyform's README; with the prefix corrected_, what the app has optimised."""
+    keyframes = folder / "keyframes"
+    (keyframes / f"{prefix}cameras").mkdir(parents=True)
+    for frame in frames:
+        stem = str(round(frame.timestamp * 1e6))
+        write_jpeg(keyframes / f"{prefix}images/{stem}.jpg", frame.color)
+        camera, T = frame.camera, frame.T_world_arkit
+        content = {name: getattr(camera, name) for name in ("fx", "fy", "cx", "cy", "width", "height")}
+        content |= {f"t_{row}{column}": float(T[row, column]) for row in range(3) for column in range(4)}
+        content |= {"blur_score": 123.4, "timestamp": int(stem)}
+        (keyframes / f"{prefix}cameras/{stem}.json").write_text(json.dumps(content))
+        if not prefix:
+            write_png(keyframes / f"depth/{stem}.png", frame.depth_mm)
+            write_png(keyframes / f"confidence/{stem}.png", np.array([0, 54, 255], np.uint8)[frame.confidence])

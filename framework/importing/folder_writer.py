@@ -73,10 +73,11 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     disk does not take a file.
     """
     check_new(directory)
-    camera = writing.camera(source.camera)
     written = Written()
+    camera = None  # phones focus anew from frame to frame: all frames are brought to the first one's
     for number, frame in _frames(source, writing.stride, written):
-        if not written.timestamps:
+        if camera is None:
+            camera = writing.camera(frame.camera)
             for name in ("color", "depth"):
                 (directory / name).mkdir(parents=True, exist_ok=True)
         color = ColorRegistration(frame.camera, camera).apply(frame.color)
@@ -87,7 +88,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         written.timestamps.append(frame.timestamp)
         if frame.T_world_camera is not None:
             written.poses.append(frame.T_world_camera)
-    if not written.timestamps:
+    if camera is None:
         raise DataError(f"no frame can be used; the first: {written.faults[0] if written.faults else 'there is none'}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)

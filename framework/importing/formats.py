@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from framework.errors import DataError
-from framework.importing import record3d, stray_scanner
+from framework.importing import polycam, record3d, scanner_app, stray_scanner
 from framework.importing.source import Source
 
 
@@ -39,6 +39,18 @@ FORMATS = (
         "a folder with metadata.json, rgb/ and depth/, Record3D's EXR + RGB export",
         record3d.folder_recognised,
         record3d.open_folder,
+    ),
+    Format(
+        "polycam",
+        "a folder with keyframes/, Polycam's raw data",
+        polycam.recognised,
+        polycam.open_source,
+    ),
+    Format(
+        "scanner_app",
+        'a folder with frame_00000.json, "All Data" of 3D Scanner App',
+        scanner_app.recognised,
+        scanner_app.open_source,
     ),
 )
 

@@ -32,7 +32,7 @@ from framework.files.json_file import parse_json
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
 from framework.files.whole_files import MOST_TEXT, read_bytes
 from framework.importing import json_numbers
-from framework.importing.source import DeviceFrame, Source, arkit_pose, middle_camera, readings
+from framework.importing.source import DeviceFrame, Source, arkit_pose, readings
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
@@ -174,7 +174,7 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
         partial(_read, files, k, times[k], camera, shape, f"{where}: pose {k}", poses[k])
         for k, camera in enumerate(cameras)
     ]
-    return Source("Record3D", middle_camera(cameras), frames, len(frames), posed=True)
+    return Source("Record3D", frames, len(frames), posed=True)
 
 
 def _read(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -53,7 +53,6 @@ class Source:
     """A recording that can be imported. Its frames are to be read in their order, and may be left out."""
 
     format: str  # for the person
-    camera: Camera  # of all colour images that are written, at the size of the stored ones
     frames: Iterable[StoredFrame]  # in order of time
     count: int  # of the frames
     posed: bool  # whether poses come with it; a frame without one is then left out
@@ -65,19 +64,6 @@ def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
     except DataError as error:
         raise DataError(f"{where}: {error}") from error
-
-
-def middle_camera(cameras: Sequence[Camera]) -> Camera:
-    """The median of the intrinsics of cameras: phones focus anew and say so from frame to frame.
-
-    Raises DataError when there is none, or images differ in size.
-    """
-    sizes = {(camera.width, camera.height) for camera in cameras}
-    if len(sizes) != 1:
-        raise DataError(f"colour images must have one size, found {sorted(sizes)}" if sizes else "there is no frame")
-    [(width, height)] = sizes
-    fx, fy, cx, cy = np.median([(c.fx, c.fy, c.cx, c.cy) for c in cameras], axis=0).tolist()
-    return Camera(width, height, fx, fy, cx, cy)
 
 
 def metres(raw: np.typing.NDArray[np.uint16]) -> Float32:

@@ -23,7 +23,7 @@ from framework.errors import DataError
 from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
-from framework.importing.source import DeviceFrame, Source, metres, middle_camera
+from framework.importing.source import DeviceFrame, Source, metres
 from framework.importing.video import Video
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
@@ -49,10 +49,9 @@ def open_source(path: Path) -> Source:
     """The recording in a folder. Raises DataError, naming the file, when it is none that can be read."""
     video = Video(path / "rgb.mp4")
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
-    cameras = [row.camera for row in rows if isinstance(row, OdometryRow)]
     confident = (path / "confidence").is_dir()
     frames = [partial(_read, path, row, video, confident) for row in rows]
-    return Source("Stray Scanner", middle_camera(cameras), frames, len(frames), posed=True)
+    return Source("Stray Scanner", frames, len(frames), posed=True)
 
 
 def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: bool) -> DeviceFrame:

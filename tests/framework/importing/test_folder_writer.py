@@ -13,7 +13,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError, FrameError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
-from framework.importing.source import DeviceFrame, Source, middle_camera
+from framework.importing.source import DeviceFrame, Source
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
@@ -33,7 +33,7 @@ def source(*frames: DeviceFrame | DataError, posed: bool = True) -> Source:
 
         return read
 
-    return Source("a test", CAMERA, map(reading, frames), len(frames), posed)
+    return Source("a test", map(reading, frames), len(frames), posed)
 
 
 def test_frames_that_cannot_be_used_are_counted_and_the_rest_is_written(tmp_path: Path) -> None:
@@ -72,7 +72,7 @@ def test_what_was_interrupted_has_no_camera(tmp_path: Path) -> None:
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_folder(Source("a test", CAMERA, frames(), 2, posed=True), tmp_path / "out", Writing())
+        write_folder(Source("a test", frames(), 2, posed=True), tmp_path / "out", Writing())
     assert (tmp_path / "out/color/000000.jpg").exists()
     with pytest.raises(DataError, match=r"camera\.json is missing"):
         RgbdFolder(tmp_path / "out")
@@ -114,9 +114,14 @@ def test_the_longer_side_gets_640_and_nothing_is_enlarged() -> None:
     assert Writing().camera(CAMERA) == CAMERA
 
 
-def test_images_of_two_sizes_are_no_recording() -> None:
-    with pytest.raises(DataError, match="must have one size"):
-        middle_camera([CAMERA, CAMERA.scaled(0.5)])
+def test_images_of_another_camera_are_brought_to_the_first(tmp_path: Path) -> None:
+    """A later frame with images twice as large shows the same."""
+    stripes = np.kron(np.arange(8) % 2, np.full(8, 200))[None, :, None].repeat(48, axis=0).repeat(3, axis=2)
+    other = frame(1, camera=CAMERA.scaled(2), color=stripes.astype(np.uint8).repeat(2, axis=0).repeat(2, axis=1))
+    write_folder(source(frame(0, color=stripes.astype(np.uint8)), other), tmp_path / "out", Writing())
+    first, second = RgbdFolder(tmp_path / "out")
+    assert np.abs(first.color.astype(int) - second.color).max() < 5
+    np.testing.assert_array_equal(first.depth, second.depth)
 
 
 def test_what_is_of_no_format_is_told_which_there_are(tmp_path: Path) -> None:

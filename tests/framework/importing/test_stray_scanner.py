@@ -108,7 +108,7 @@ def test_a_video_that_ends_early_leaves_its_frames(folder: Path, tmp_path: Path)
         ("rgb.mp4", b"\0\0\0\x18ftypmp42" + bytes(200), r"rgb\.mp4 could not be decoded"),
         ("odometry.csv", b"", r"odometry\.csv must begin with the line timestamp, frame"),
         ("odometry.csv", b"1, 2, 3, 4\n", r"odometry\.csv must begin with the line"),
-        ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "there is no frame"),
+        ("odometry.csv", b"timestamp, frame, x, y, z, qx, qy, qz, qw\n", "there is none"),
         ("camera_matrix.csv", b"1, 0, 2\n0, 1, 2\n", r"camera_matrix\.csv must hold 3 lines"),
         ("camera_matrix.csv", b"1, 0, 2\n0, x, 2\n0, 0, 1\n", r"camera_matrix\.csv, line 2: .* found ' x'"),
     ],
