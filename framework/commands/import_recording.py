@@ -8,6 +8,7 @@ from pathlib import Path
 from framework.commands.command_line import arguments, one_line_errors
 from framework.importing.folder_writer import LONGER_SIDE, Writing, check_new, write_folder
 from framework.importing.formats import FORMATS, open_source
+from framework.importing.ros_topics import Topics
 
 
 def main() -> None:
@@ -33,11 +34,17 @@ def main() -> None:
         default=default.confidence,
         help="0 low, 1 medium, 2 high: depth of which a phone is less sure is left out, default: 1",
     )
+    bag = parser.add_argument_group("of a ROS bag, where types and names do not say which")
+    bag.add_argument("--color", metavar="TOPIC", default="", help="colour images")
+    bag.add_argument("--depth", metavar="TOPIC", default="", help="depth images")
+    bag.add_argument("--camera-info", metavar="TOPIC", default="", help="the colour camera's intrinsics")
+    bag.add_argument("--poses", metavar="TOPIC", default="", help="nav_msgs/Odometry or geometry_msgs/PoseStamped")
     asked = arguments(parser)
     with one_line_errors():
         writing = Writing(asked.width, asked.stride, asked.confidence)
         check_new(asked.directory)
-        source = open_source(asked.source)
+        topics = Topics(asked.color, asked.depth, asked.camera_info, asked.poses)
+        source = open_source(asked.source, topics)
         written = write_folder(source, asked.directory, writing)
         root = asked.directory.resolve()
         print(f"{root}: from {source.format}, {written}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import asdict, astuple, dataclass, field
 from itertools import islice
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from framework.data import MOST_PIXELS, Array, Camera, Float32, Float64, UInt16
+from framework.datasets.camera_json import DISTORTION
 from framework.datasets.color_registration import ColorRegistration
 from framework.errors import DataError
 from framework.files.json_file import write_json
@@ -92,8 +93,8 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         raise DataError(f"no frame can be used; the first: {written.faults[0] if written.faults else 'there is none'}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
-    intrinsics = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
-    write_json(directory / "camera.json", intrinsics | {"depth_scale": DEPTH_SCALE})
+    lens = {DISTORTION: list(astuple(source.distortion))} if source.distortion else {}
+    write_json(directory / "camera.json", asdict(camera) | {"depth_scale": DEPTH_SCALE} | lens)
     return written
 
 

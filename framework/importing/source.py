@@ -10,6 +10,7 @@ import numpy as np
 
 from framework.data import Camera, Float32, Float64, UInt8
 from framework.datasets.reading import CameraAxes, PoseReading
+from framework.datasets.undistortion import Distortion
 from framework.errors import DataError, FrameError
 from framework.geometry import nearest_rigid
 
@@ -56,6 +57,7 @@ class Source:
     frames: Iterable[StoredFrame]  # in order of time
     count: int  # of the frames
     posed: bool  # whether poses come with it; a frame without one is then left out
+    distortion: Distortion | None = None  # of the lens, in colour and depth alike; None = a pinhole
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
