@@ -63,10 +63,10 @@ def open_source(path: Path, given: Topics) -> Source:
     device = Device(bag, topics, camera, _registration(bag, topics, camera), _depth_unit(bag, topics))
     pairs = _pairs(bag, topics)
     trajectory, axes = _trajectory(bag, topics.poses)
-    log.info("colour %s, depth %s, poses %s", topics.color, topics.depth, topics.poses or "none")
     frames = _frames(device, pairs, trajectory, PoseReading(camera_axes=axes))
     lens = _distortion(topics, info)
-    return Source("a ROS bag", frames, len(pairs), posed=bool(topics.poses), distortion=lens)
+    name = f"a ROS bag (colour {topics.color}, depth {topics.depth}, poses {topics.poses or 'none'})"
+    return Source(name, frames, len(pairs), posed=bool(topics.poses), distortion=lens)
 
 
 @dataclass(frozen=True)
