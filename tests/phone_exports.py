@@ -169,7 +169,7 @@ def write_record3d_exr(folder: Path, frames: Sequence[PhoneFrame]) -> None:
     for k, frame in enumerate(frames):
         write_jpeg(folder / f"rgb/{k}.jpg", frame.color)
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        depth = (frame.depth_mm / 1000).astype(np.float16)
+        depth = np.ascontiguousarray(frame.depth_mm / 1000, np.float16)  # OpenEXR writes memory as it lies
         OpenEXR.File(header, {"R": depth}).write(str(folder / f"depth/{k}.exr"))
 
 
