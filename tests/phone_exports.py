@@ -102,6 +102,9 @@ def write_stray_scanner(folder: Path, frames: Sequence[PhoneFrame], own_intrinsi
 
 
 ROOM = Camera(320, 240, 300.0, 301.0, 157.0, 118.0)
+T_COLOR_DEPTH = np.eye(4)  # as of a RealSense D435i
+T_COLOR_DEPTH[:3, :3] = Rotation.from_quat([0.001509, 0.001900, 0.006073, 0.999979]).as_matrix()
+T_COLOR_DEPTH[:3, 3] = 0.015014, 0.000251, 0.000425
 
 
 def room_frames(count: int = 4) -> list[PhoneFrame]:

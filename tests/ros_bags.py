@@ -18,15 +18,12 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float64
 from framework.geometry import inverse
-from tests.phone_exports import ROOM
+from tests.phone_exports import ROOM, T_COLOR_DEPTH
 from tests.scenes.corner_room import look, pose_at
 
 START = 1_600_000_000  # s
 COUNT = 4
 DEPTH_LATE = 0.004  # s, of each depth image after its colour image
-T_COLOR_DEPTH = np.eye(4)  # as of a RealSense D435i
-T_COLOR_DEPTH[:3, :3] = Rotation.from_quat([0.001509, 0.001900, 0.006073, 0.999979]).as_matrix()
-T_COLOR_DEPTH[:3, 3] = 0.015014, 0.000251, 0.000425
 
 
 @dataclass
