@@ -11,6 +11,8 @@ from framework.importing import polycam, record3d, ros_bag, scanner_app, stray_s
 from framework.importing.ros_topics import Topics
 from framework.importing.source import Source
 
+ZIP = ".zip"
+
 
 @dataclass(frozen=True)
 class Format:
@@ -80,8 +82,17 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
     """
     if not path.exists():
         raise DataError(f"{path} does not exist")
-    for kind in FORMATS:
-        if kind.recognised(path):
-            return kind.open(path, topics or Topics())
+    if path.suffix.lower() == ZIP:
+        raise DataError(f"{path} must be unpacked first; then name the folder")
+    for place in (path, *_only_folder(path)):  # what was zipped often has a folder around it
+        for kind in FORMATS:
+            if kind.recognised(place):
+                return kind.open(place, topics or Topics())
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
     raise DataError(f"{path} is of no format that can be imported. These are: {known}")
+
+
+def _only_folder(path: Path) -> list[Path]:
+    """The folder in a folder that holds one only."""
+    folders = [entry for entry in path.iterdir() if entry.is_dir()] if path.is_dir() else []
+    return folders if len(folders) == 1 else []

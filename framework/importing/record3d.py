@@ -29,6 +29,7 @@ from framework.datasets.camera_json import read_json_object
 from framework.errors import ConfigError, DataError, FrameError, in_one_line
 from framework.files.image_files import LARGEST_FILE, decode_color, read_color
 from framework.files.json_file import parse_json
+from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
 from framework.files.whole_files import MOST_TEXT, read_bytes
 from framework.importing import json_numbers
@@ -114,7 +115,7 @@ class R3dFile:
         try:
             self._zip = zipfile.ZipFile(path)
         except (OSError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path} could not be read: {in_one_line(error)}") from error
+            raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
         self._members = set(self._zip.namelist())
 
     def color(self, number: int) -> UInt8:
@@ -143,7 +144,7 @@ class R3dFile:
         except KeyError as error:
             raise FrameError(f"{self.path} has no {name}") from error
         except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, ValueError, RuntimeError) as error:
-            raise FrameError(f"{self.path}: {name} is damaged: {in_one_line(error)}") from error
+            raise FrameError(f"{self.path}: {name} is damaged: {in_one_line(error)[:SHOWN]}") from error
         except NotImplementedError as error:
             raise FrameError(f"{self.path}: {name} is compressed in a way that is not known: {error}") from error
 
@@ -239,7 +240,7 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
         found = tuple(int(n) for n in (high - low + 1)[::-1])
         names = [channel.name for channel in header["channels"]]
     except Exception as error:  # of many kinds
-        raise FrameError(f"{path} is damaged: {in_one_line(error)}") from error
+        raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
     if found != shape or names != [CHANNEL] or math.prod(shape) > MOST_PIXELS:
         raise FrameError(
             f"{path} has {found[1]}x{found[0]} px of {', '.join(names)[:60]}, "
@@ -248,7 +249,7 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
     try:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[CHANNEL].pixels
     except Exception as error:
-        raise FrameError(f"{path} is damaged: {in_one_line(error)}") from error
+        raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
     if image.shape != shape or image.dtype not in (np.float16, np.float32):
         raise FrameError(f"{path} must hold floats, found {image.dtype}")
     return np.asarray(image, np.float32)

@@ -17,6 +17,7 @@ import numpy as np
 from framework.data import Array, Float32, UInt8
 from framework.errors import ConfigError, DataError, FrameError, in_one_line
 from framework.files.image_files import decode_color, decode_uint16
+from framework.files.number_lines import SHOWN
 from framework.importing.source import readings
 
 NANOSECONDS = 1e-9  # s
@@ -62,7 +63,7 @@ class RosBag:
             self._reader.open()
             self.kinds: dict[str, str] = {found.topic: found.msgtype for found in self._reader.connections}
         except Exception as error:  # of many kinds
-            raise DataError(f"{path} could not be read: {in_one_line(error)}") from error
+            raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
 
     def topics(self, *kinds: str) -> list[str]:
         """The topics with messages of these types."""
@@ -77,7 +78,7 @@ class RosBag:
             for connection, stored_at, raw in self._reader.messages(chosen):
                 yield Message(connection.topic, connection.msgtype, stored_at, bytes(raw))
         except Exception as error:  # of many kinds
-            raise DataError(f"{self.path} is damaged: {in_one_line(error)}") from error
+            raise DataError(f"{self.path} is damaged: {in_one_line(error)[:SHOWN]}") from error
 
     def first(self, topic: str) -> Any:
         """The first message of a topic, decoded; None where there is none. Raises DataError."""
@@ -90,7 +91,9 @@ class RosBag:
         try:
             return decode(message.raw, message.kind)
         except Exception as error:  # of many kinds
-            raise FrameError(f"{self.path}: a message of {message.topic} is damaged: {in_one_line(error)}") from error
+            raise FrameError(
+                f"{self.path}: a message of {message.topic} is damaged: {in_one_line(error)[:SHOWN]}"
+            ) from error
 
     def sensed_at(self, message: Message) -> int:
         """ns, by the message's header, which is its first field: when the device saw what it says."""

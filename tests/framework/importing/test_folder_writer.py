@@ -14,6 +14,7 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
 from framework.importing.source import DeviceFrame, Source
+from tests.phone_exports import room_frames, write_scanner_app
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
@@ -129,3 +130,17 @@ def test_what_is_of_no_format_is_told_which_there_are(tmp_path: Path) -> None:
         open_source(tmp_path)
     with pytest.raises(DataError, match="does not exist"):
         open_source(tmp_path / "nowhere")
+
+
+def test_what_was_zipped_with_its_folder_is_found_in_it(tmp_path: Path) -> None:
+    write_scanner_app(tmp_path / "outer/2026_11_23", room_frames(1))
+    assert open_source(tmp_path / "outer").format == "3D Scanner App"
+    (tmp_path / "outer/other").mkdir()
+    with pytest.raises(DataError, match="is of no format"):
+        open_source(tmp_path / "outer")
+
+
+def test_what_is_zipped_is_to_be_unpacked(tmp_path: Path) -> None:
+    (tmp_path / "scan.zip").touch()
+    with pytest.raises(DataError, match=r"scan\.zip must be unpacked first; then name the folder"):
+        open_source(tmp_path / "scan.zip")
