@@ -177,16 +177,16 @@ def write_record3d_exr(folder: Path, frames: Sequence[PhoneFrame]) -> None:
 
 
 def write_r3d(path: Path, frames: Sequence[PhoneFrame], confident: bool = True) -> None:
-    import liblzfse
+    import lzfse
 
     with zipfile.ZipFile(path, "w") as file:
         file.writestr("metadata", json.dumps(record3d_metadata(frames)))
         for k, frame in enumerate(frames):
             _, data = cv2.imencode(".jpg", frame.color[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
             file.writestr(f"rgbd/{k}.jpg", data.tobytes())
-            file.writestr(f"rgbd/{k}.depth", liblzfse.compress((frame.depth_mm / 1000).astype("<f4").tobytes()))
+            file.writestr(f"rgbd/{k}.depth", lzfse.compress((frame.depth_mm / 1000).astype("<f4").tobytes()))
             if confident:
-                file.writestr(f"rgbd/{k}.conf", liblzfse.compress(frame.confidence.tobytes()))
+                file.writestr(f"rgbd/{k}.conf", lzfse.compress(frame.confidence.tobytes()))
 
 
 def write_scanner_app(folder: Path, frames: Sequence[PhoneFrame]) -> None:

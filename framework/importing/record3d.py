@@ -153,10 +153,10 @@ class R3dFile:
         packed = self.read(name, 2 * size + 1000)
         if packed.count(LZFSE_BLOCK) > MOST_BLOCKS + size // BYTES_A_BLOCK:
             raise FrameError(f"{self.path}: {name} has more blocks than {size} bytes have when they are packed")
-        liblzfse = _load_lzfse()
+        lzfse = _load_lzfse()
         try:
-            raw = liblzfse.decompress(packed)
-        except (liblzfse.error, MemoryError) as error:
+            raw = lzfse.decompress(packed)
+        except (lzfse.error, MemoryError) as error:
             raise FrameError(f"{self.path}: {name} could not be unpacked: it is damaged") from error
         if len(raw) != size:
             raise FrameError(f"{self.path}: {name} has {len(raw)} bytes, expected {size} for {shape[1]}x{shape[0]} px")
@@ -265,7 +265,7 @@ def _load_openexr() -> Any:
 
 def _load_lzfse() -> Any:
     try:
-        import liblzfse
+        import lzfse
     except ImportError as error:
-        raise ConfigError(_MISSING.format("pyliblzfse, which unpacks Record3D's .r3d files,")) from error
-    return liblzfse
+        raise ConfigError(_MISSING.format("lzfse, which unpacks Record3D's .r3d files,")) from error
+    return lzfse

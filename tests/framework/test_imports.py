@@ -36,7 +36,7 @@ LAYERS = [
 
 LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 
-OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "OpenEXR", "liblzfse", "rosbags"}
+OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "OpenEXR", "lzfse", "rosbags"}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
 
 

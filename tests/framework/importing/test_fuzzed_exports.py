@@ -30,7 +30,7 @@ TOKENS = (b", nan", b"null", b"\0", b"1e999", b"[", b"}", b"-1")
 WRITERS: dict[str, tuple[str, Callable[..., None]]] = {
     "stray": ("", write_stray_scanner),
     "exr": ("OpenEXR", write_record3d_exr),
-    "room.r3d": ("liblzfse", write_r3d),
+    "room.r3d": ("lzfse", write_r3d),
     "app": ("", write_scanner_app),
     "polycam": ("", write_polycam),
 }

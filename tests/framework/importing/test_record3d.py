@@ -32,7 +32,7 @@ def export(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def r3d(tmp_path: Path) -> Path:
-    pytest.importorskip("liblzfse")
+    pytest.importorskip("lzfse")
     write_r3d(tmp_path / "room.r3d", FRAMES)
     return tmp_path / "room.r3d"
 
@@ -49,7 +49,7 @@ def test_the_file_shows_the_room_where_it_is(r3d: Path, tmp_path: Path, least: i
 
 
 def test_a_file_without_confidence_keeps_all_depth(tmp_path: Path) -> None:
-    pytest.importorskip("liblzfse")
+    pytest.importorskip("lzfse")
     write_r3d(tmp_path / "room.r3d", FRAMES, confident=False)
     write_folder(open_source(tmp_path / "room.r3d"), tmp_path / "out", Writing(confidence=2))
     check_imported(tmp_path / "out", FRAMES, least=0)
@@ -155,21 +155,21 @@ def test_a_damaged_member_of_the_file_is_one_frame(
 
 
 def test_what_unpacks_to_much_is_not_unpacked(r3d: Path, tmp_path: Path) -> None:
-    liblzfse = pytest.importorskip("liblzfse")
-    bomb = liblzfse.compress(bytes(10**8))
+    lzfse = pytest.importorskip("lzfse")
+    bomb = lzfse.compress(bytes(10**8))
     written = write_folder(open_source(rewritten(r3d, "rgbd/1.depth", bomb)), tmp_path / "out", Writing())
     assert re.search("more than the .* that it can have|more blocks", written.faults[0])
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip at all" * 100])
 def test_what_is_no_zip_is_said(tmp_path: Path, content: bytes) -> None:
-    pytest.importorskip("liblzfse")
+    pytest.importorskip("lzfse")
     (tmp_path / "room.r3d").write_bytes(content)
     with pytest.raises(DataError, match=r"room\.r3d could not be read: File is not a zip file"):
         open_source(tmp_path / "room.r3d")
 
 
-@pytest.mark.parametrize(("module", "source"), [("OpenEXR", "export"), ("liblzfse", "r3d")])
+@pytest.mark.parametrize(("module", "source"), [("OpenEXR", "export"), ("lzfse", "r3d")])
 def test_a_missing_package_names_the_extra(
     module: str, source: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> None:
