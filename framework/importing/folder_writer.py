@@ -20,6 +20,7 @@ from framework.files.tum_trajectory import write_tum
 from framework.files.whole_files import written_whole
 from framework.importing.depth_upsampling import upsampled
 from framework.importing.source import SURE, UNSURE, DeviceFrame, Source, StoredFrame
+from framework.importing.turning import QUARTER, Turn
 from framework.parameters import require
 
 DEPTH_SCALE = 1000.0  # units a metre
@@ -31,17 +32,24 @@ JPEG_QUALITY = 95  # in percent
 class Writing:
     """How much of a source is written."""
 
-    width: int = 0  # px, of the images, at most as stored; 0 = the longer side gets LONGER_SIDE
+    width: int = 0  # px, of the images before they are turned, at most as stored; 0 = the longer side gets LONGER_SIDE
     stride: int = 1  # every so many-th frame
     confidence: int = 1  # 0, 1 or 2: depth of a lower one is left out, where the source tells it
+    turn: int = 0  # degrees clockwise, 0, 90, 180 or 270, of the images that are written
 
     def __post_init__(self) -> None:
         require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"0 or positive and at most {MOST_PIXELS} px")
         require(self.stride >= 1, "--stride", self.stride, "at least 1")
+        require(self.turn in range(0, 360, QUARTER), "--turn", self.turn, "0, 90, 180 or 270 degrees")
         require(UNSURE <= self.confidence <= SURE, "--confidence", self.confidence, "0, 1 or 2")
 
+    @property
+    def turned(self) -> Turn:
+        """How the images are turned."""
+        return Turn(self.turn // QUARTER)
+
     def camera(self, stored: Camera) -> Camera:
-        """That of the images which are written."""
+        """That of the images which are written, before they are turned."""
         factor = self.width / stored.width if self.width else LONGER_SIDE / max(stored.width, stored.height)
         return stored.scaled(min(1.0, factor))
 
@@ -53,6 +61,7 @@ class Written:
     timestamps: list[float] = field(default_factory=list)  # s, of the frames that were written
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of them, none without poses
     faults: list[str] = field(default_factory=list)  # of each frame that was left out
+    ups: list[Float64] = field(default_factory=list)  # (3,) the world's up in the camera as it was stored, where known
 
     def __str__(self) -> str:
         said = f"{len(self.timestamps)} frames"
@@ -75,6 +84,7 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
     """
     check_new(directory)
     written = Written()
+    turn = writing.turned
     camera = None  # phones focus anew from frame to frame: all frames are brought to the first one's
     for number, frame in _frames(source, writing.stride, written):
         if camera is None:
@@ -83,18 +93,20 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
                 (directory / name).mkdir(parents=True, exist_ok=True)
         color = ColorRegistration(frame.camera, camera).apply(frame.color)
         depth = upsampled(_sure(frame, writing.confidence), frame.color, frame.camera, camera, color)
-        bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
+        bgr = cv2.cvtColor(turn.image(color), cv2.COLOR_RGB2BGR)
         _write_image(directory / f"color/{number:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        _write_image(directory / f"depth/{number:06d}.png", _stored(depth), cv2.IMWRITE_PNG_COMPRESSION, 1)
+        _write_image(directory / f"depth/{number:06d}.png", _stored(turn.image(depth)), cv2.IMWRITE_PNG_COMPRESSION, 1)
         written.timestamps.append(frame.timestamp)
         if frame.T_world_camera is not None:
-            written.poses.append(frame.T_world_camera)
+            written.poses.append(turn.pose(frame.T_world_camera))
+            if source.up_world is not None:
+                written.ups.append(frame.T_world_camera[:3, :3].T @ source.up_world)
     if camera is None:
         raise DataError(f"no frame can be used; the first: {written.faults[0] if written.faults else 'there is none'}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
-    lens = {DISTORTION: list(astuple(source.distortion))} if source.distortion else {}
-    write_json(directory / "camera.json", asdict(camera) | {"depth_scale": DEPTH_SCALE} | lens)
+    lens = {DISTORTION: list(astuple(turn.lens(source.distortion)))} if source.distortion else {}
+    write_json(directory / "camera.json", asdict(turn.camera(camera)) | {"depth_scale": DEPTH_SCALE} | lens)
     return written
 
 

@@ -23,6 +23,7 @@ from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing import json_numbers
 from framework.importing.source import (
+    ARKIT_UP,
     FAIRLY_SURE,
     SURE,
     UNSURE,
@@ -55,7 +56,7 @@ def open_source(path: Path) -> Source:
     if not (folder / "depth").is_dir() or not stems:
         raise DataError(f"{path} has no depth/ or no cameras: Polycam keeps them with a LiDAR and in developer mode")
     frames = [partial(_read, folder, stem) for stem in stems]
-    return Source("Polycam", frames, len(frames), posed=True)
+    return Source("Polycam", frames, len(frames), posed=True, up_world=ARKIT_UP)
 
 
 def _read(folder: Path, stem: str) -> DeviceFrame:

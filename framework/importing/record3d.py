@@ -33,7 +33,7 @@ from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
 from framework.files.whole_files import MOST_TEXT, read_bytes
 from framework.importing import json_numbers
-from framework.importing.source import DeviceFrame, Source, arkit_pose, readings
+from framework.importing.source import ARKIT_UP, DeviceFrame, Source, arkit_pose, readings
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
@@ -175,7 +175,7 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
         partial(_read, files, k, times[k], camera, shape, f"{where}: pose {k}", poses[k])
         for k, camera in enumerate(cameras)
     ]
-    return Source("Record3D", frames, len(frames), posed=True)
+    return Source("Record3D", frames, len(frames), posed=True, up_world=ARKIT_UP)
 
 
 def _read(

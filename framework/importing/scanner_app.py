@@ -20,7 +20,7 @@ from framework.datasets.recording import FRAME_RATE
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing import json_numbers
-from framework.importing.source import DeviceFrame, Source, arkit_pose, metres
+from framework.importing.source import ARKIT_UP, DeviceFrame, Source, arkit_pose, metres
 
 _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
 
@@ -41,7 +41,7 @@ def open_source(path: Path) -> Source:
             'scan, which keeps depth, and export "All Data"'
         )
     frames = [partial(_read, path, number) for number in whole]
-    return Source("3D Scanner App", frames, len(frames), posed=True)
+    return Source("3D Scanner App", frames, len(frames), posed=True, up_world=ARKIT_UP)
 
 
 def _read(folder: Path, number: str) -> DeviceFrame:

@@ -17,6 +17,7 @@ from framework.geometry import nearest_rigid
 SMALLEST_SIDE = 2  # px, of a depth image that can be brought to another size
 UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # confidence, as ARKit's low, medium and high
 
+ARKIT_UP = (0.0, 1.0, 0.0)  # in its world
 _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
 
 
@@ -58,6 +59,7 @@ class Source:
     count: int  # of the frames
     posed: bool  # whether poses come with it; a frame without one is then left out
     distortion: Distortion | None = None  # of the lens, in colour and depth alike; None = a pinhole
+    up_world: tuple[float, float, float] | None = None  # where up is in the world of the poses; None = not known
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:

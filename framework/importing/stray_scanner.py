@@ -23,7 +23,7 @@ from framework.errors import DataError
 from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
-from framework.importing.source import DeviceFrame, Source, metres
+from framework.importing.source import ARKIT_UP, DeviceFrame, Source, metres
 from framework.importing.video import Video
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
@@ -51,7 +51,7 @@ def open_source(path: Path) -> Source:
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
     frames = [partial(_read, path, row, video, confident) for row in rows]
-    return Source("Stray Scanner", frames, len(frames), posed=True)
+    return Source("Stray Scanner", frames, len(frames), posed=True, up_world=ARKIT_UP)
 
 
 def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: bool) -> DeviceFrame:

@@ -16,6 +16,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.interfaces import RGBDSequence
 from framework.registry import build
 from tests.phone_exports import room_frames, seen_by_phone, write_stray_scanner
+from tests.scenes.corner_room import look
 
 
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
@@ -31,11 +32,28 @@ def test_it_says_what_it_wrote_and_how_to_go_on(
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         f"{tmp_path}/out: from Stray Scanner, 2 frames",
+        "up is not up in these images, and detectors find little in them; --turn 180 turns them upright",
         f"check it: python -m framework check dataset=rgbd_folder dataset.root={tmp_path}/out",
         f"map it: python -m framework dataset=rgbd_folder dataset.root={tmp_path}/out",
     ]
     assert err == ""
     assert RgbdFolder(tmp_path / "out").camera.width == 160
+
+
+def test_turned_images_have_turned_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The room's y points down and ARKit's up: for a phone, these images stand on their heads."""
+    frames = room_frames()
+    write_stray_scanner(tmp_path / "export", frames)
+    command(monkeypatch, tmp_path / "export", tmp_path / "out", "--turn", "180", "--confidence", "0")
+    assert "--turn" not in capsys.readouterr().out
+    for frame, seen in zip(frames, RgbdFolder(tmp_path / "out"), strict=True):
+        assert seen.T_world_camera is not None
+        depth, _, color, ids = look(seen.camera, seen.T_world_camera)
+        assert np.abs(seen.color.astype(int) - color).mean() < 12
+        assert np.median(np.abs(seen.depth - depth)[(ids == 0) & (seen.depth > 0)]) < 1e-3
+        np.testing.assert_allclose(seen.T_world_camera[:3, 1], -frame.T_world_camera[:3, 1], atol=1e-6)
 
 
 def test_a_place_that_is_taken_is_told_before_anything_is_read(

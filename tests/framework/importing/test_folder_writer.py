@@ -101,7 +101,7 @@ def test_depth_that_no_pixel_can_hold_is_no_reading(tmp_path: Path) -> None:
     assert set(np.unique(seen.depth)) == {0, np.float32(65.5)}
 
 
-@pytest.mark.parametrize("bad", [{"width": -1}, {"stride": 0}, {"confidence": 3}])
+@pytest.mark.parametrize("bad", [{"width": -1}, {"stride": 0}, {"confidence": 3}, {"turn": 45}])
 def test_settings_that_cannot_be_are_refused(bad: dict[str, int]) -> None:
     with pytest.raises(ConfigError, match=f"--{next(iter(bad))} must be"):
         Writing(**bad)

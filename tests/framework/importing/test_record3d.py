@@ -17,6 +17,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
+from framework.importing.turning import Turn, upright
 from tests.phone_exports import check_imported, record3d_metadata, room_frames, write_r3d, write_record3d_exr
 
 FRAMES = room_frames()
@@ -199,3 +200,4 @@ def test_a_real_export(shared_data: Path, tmp_path: Path) -> None:
     assert T_world_camera is not None
     assert T_world_camera[1, 2] == pytest.approx(-0.77, abs=0.02)
     assert T_world_camera[1, 1] < -0.6
+    assert upright(written.ups) == Turn(0)

@@ -14,6 +14,7 @@ from framework.errors import DataError
 from framework.importing import stray_scanner
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
+from framework.importing.turning import Turn, upright
 from tests.phone_exports import check_imported, room_frames, write_stray_scanner, write_video
 
 FRAMES = room_frames()
@@ -145,3 +146,4 @@ def test_a_real_recording(shared_data: Path, tmp_path: Path) -> None:
     assert np.median(depth[depth > 0]) == pytest.approx(2.72, abs=0.05)
     # the accelerometer: gravity is 0.20 along the view, which is a camera that looks down
     assert sequence[0].T_world_camera[1, 2] == pytest.approx(-0.24, abs=0.01)
+    assert upright(written.ups) == Turn(1)  # the phone was held upright
