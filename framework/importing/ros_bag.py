@@ -116,9 +116,11 @@ def _pairs(bag: RosBag, topics: Topics) -> list[Pair]:
             stored[message.topic].append(message.stored_at * NANOSECONDS)
     except DataError as error:
         log.warning("%s; what comes before is used", error)
-    found = max((_associated(times[topics.color], times[topics.depth]) for times in (sensed, stored)), key=len)
-    if found:
-        return found
+    by_header, by_record = (_associated(times[topics.color], times[topics.depth]) for times in (sensed, stored))
+    if by_header and 2 * len(by_header) >= len(by_record):
+        return by_header
+    if by_record:
+        return by_record
     raise DataError(
         f"{bag.path}: none of {len(sensed[topics.color])} images of {topics.color} is within {APART:g} s of one of "
         f"{len(sensed[topics.depth])} of {topics.depth}"
