@@ -14,6 +14,7 @@ COMMANDS = {
     "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
     "ranks": "whether the rows of an experiment rank alike in several places: Spearman's rho",
     "figures": "run records below a folder become the paper's figures",
+    "import": "turns a recording of a phone or a sensor into a folder that can be mapped",
     "check": "looks whether a recording will map, and says what to set where it will not",
     "diff": "lists what appeared, vanished or moved between two visits of a place",
     "evaluate": "evaluates stored runs anew, without running them again",
@@ -25,7 +26,7 @@ COMMANDS = {
     "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
     "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
 }
-"""What each does. A command is the module of framework.commands with its name."""
+"""What each does."""
 
 PRINTING = (
     "tables",
@@ -55,6 +56,11 @@ debug=true, for any of them, shows where an error comes from. The keys of a run:
 
 
 RERUN = "--experimental-rerun"  # Hydra's: it reads a pickle, which may bring code
+
+
+def module_of(command: str) -> str:
+    """That of framework.commands with its name; a module named `import` could not be imported by a statement."""
+    return f"framework.commands.{'import_recording' if command == 'import' else command.replace('-', '_')}"
 
 
 def leave_working_folder(arguments: list[str]) -> None:
@@ -115,7 +121,7 @@ def main() -> None:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # Windows has none
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    import_module(f"framework.commands.{word.replace('-', '_')}").main()
+    import_module(module_of(word)).main()
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ from framework.errors import DataError
 from framework.files.json_file import read_json
 from framework.files.whole_files import MOST_TEXT
 
+CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")  # of camera.json
 DISTORTION = "distortion"  # the key of the lens distortion
 
 log = logging.getLogger(__name__)

@@ -25,7 +25,14 @@ from typing import Any
 import numpy as np
 
 from framework.data import FrameTruth, Int32, SceneTruth
-from framework.datasets.camera_json import DISTORTION, camera_of, check_keys, distortion_of, read_json_object
+from framework.datasets.camera_json import (
+    CAMERA_KEYS,
+    DISTORTION,
+    camera_of,
+    check_keys,
+    distortion_of,
+    read_json_object,
+)
 from framework.datasets.recording import FRAME_RATE, Contents, Recording, numbered_images
 from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.datasets.stored_frames import ImageFiles, RecordedFrame
@@ -36,7 +43,6 @@ from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.files.whole_files import is_there
 from framework.label_spaces import COCO
 
-CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")
 LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16
 MOST_DIGITS = 10  # of an id, zeros in front among them
 

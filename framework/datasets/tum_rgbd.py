@@ -3,6 +3,8 @@
     rgb.txt, depth.txt      a line an image, `timestamp filename`, s; `#` begins a comment
     rgb/, depth/            8-bit colour and uint16 depth along z, registered to colour, 5000 units a metre; 0 = none
     groundtruth.txt         optional; TUM format, T_world_camera of the colour camera, about 100 poses a second
+    camera.json             of recordings of one's own in this layout: intrinsics, depth scale and distortion, with the
+                            same keys as in an RGB-D folder; read where the folder's name has no freiburg in it
 
 The published correction factors of depth are in the images already. Colour and depth of freiburg1 and freiburg2 have
 the lens distortion of the colour camera, by which half of the pixels are off by 5 px or more, the corners by 37 and 27
@@ -24,6 +26,14 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float64
+from framework.datasets.camera_json import (
+    CAMERA_KEYS,
+    DISTORTION,
+    camera_of,
+    check_keys,
+    distortion_of,
+    read_json_object,
+)
 from framework.datasets.recording import Contents, Recording
 from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.datasets.undistortion import Distortion
@@ -43,7 +53,7 @@ log = logging.getLogger(__name__)
 class Intrinsics(Enum):
     """Which of the published calibrations of the colour camera holds."""
 
-    AUTO = "by the folder's name"
+    AUTO = "by the folder's name, or by its camera.json"
     FREIBURG1 = "freiburg1"
     FREIBURG2 = "freiburg2"
     FREIBURG3 = "freiburg3"
@@ -67,7 +77,7 @@ DISTORTIONS: Mapping[Intrinsics, Distortion | None] = {
 
 @dataclass
 class TumRgbd(Recording):
-    """A sequence of TUM RGB-D, or a recording in its layout by a camera with the same intrinsics.
+    """A sequence of TUM RGB-D, or a recording of one's own in its layout.
 
     Colour and depth belong together by time: the closest pairs first, each image once. The true pose is interpolated
     between the two around the time of the colour image, and not known where the nearest is farther than
@@ -83,7 +93,7 @@ class TumRgbd(Recording):
         super().__post_init__()
 
     def open(self) -> Contents:
-        intrinsics = _named(self.name) if self.intrinsics is Intrinsics.AUTO else self.intrinsics
+        calibration = self._calibration()
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
         pairs = associate(_times(color), _times(depth), self.max_difference)
         if not pairs:
@@ -96,12 +106,47 @@ class TumRgbd(Recording):
         truth = Trajectory.read(self.folder / "groundtruth.txt", self.max_difference)
         frames = [_recorded(color[i], depth[j], truth) for i, j in pairs]
         return Contents(
-            CAMERAS[intrinsics],
-            f"dataset.intrinsics={intrinsics.name}",
-            DEPTH_SCALE,
+            calibration.camera,
+            calibration.source,
+            calibration.depth_scale,
             frames,
-            DISTORTIONS[intrinsics] if self.undistort else None,
+            calibration.distortion if self.undistort else None,
         )
+
+    def _calibration(self) -> Calibration:
+        if self.intrinsics is not Intrinsics.AUTO:
+            return _published(self.intrinsics)
+        named, own = re.search(r"freiburg[123]", self.name), self.folder / "camera.json"
+        if named:
+            return _published(Intrinsics(named[0]))
+        if is_there(own):
+            return _read_calibration(own)
+        raise ConfigError(
+            f"dataset.intrinsics: the folder's name {self.name} has no freiburg1, freiburg2 or freiburg3 in it; choose "
+            f"FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT, or write {own} with {', '.join(CAMERA_KEYS)}"
+        )
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is known of the camera."""
+
+    camera: Camera
+    source: Path | str  # what says so, for messages
+    depth_scale: float  # units a metre
+    distortion: Distortion | None  # None = a pinhole
+
+
+def _published(intrinsics: Intrinsics) -> Calibration:
+    source = f"dataset.intrinsics={intrinsics.name}"
+    return Calibration(CAMERAS[intrinsics], source, DEPTH_SCALE, DISTORTIONS[intrinsics])
+
+
+def _read_calibration(path: Path) -> Calibration:
+    content = read_json_object(path)
+    check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
+    camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
+    return Calibration(camera, path, depth_scale, distortion_of(path, content))
 
 
 @dataclass(frozen=True)
@@ -174,16 +219,6 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 def _recorded(color: ListedImage, depth: ListedImage, truth: Trajectory) -> RecordedFrame:
     images = ImageFiles(color.path, depth.path)
     return RecordedFrame.posed(images, color.timestamp, lambda: truth.at(color.timestamp))
-
-
-def _named(folder: str) -> Intrinsics:
-    found = re.search(r"freiburg[123]", folder)
-    if not found:
-        raise ConfigError(
-            f"dataset.intrinsics: the folder's name {folder} has no freiburg1, freiburg2 or freiburg3 in it; "
-            "choose FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT"
-        )
-    return Intrinsics(found[0])
 
 
 def _read_list(path: Path) -> list[ListedImage]:

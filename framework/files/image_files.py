@@ -45,13 +45,28 @@ def decode_color(name: Path | str, data: bytes) -> UInt8:
 
 def read_uint16(path: Path) -> UInt16:
     """The (H, W) uint16 values of a PNG file. Raises FrameError when it is damaged or of another type."""
-    data = _read(path)
-    check_image(path, data)
-    image = _decode_png(path, data, cv2.IMREAD_UNCHANGED)
-    if image.dtype != np.uint16 or image.ndim != 2:
+    return decode_uint16(path, _read(path))
+
+
+def decode_uint16(name: Path | str, data: bytes) -> UInt16:
+    """Likewise, of what such a file holds; `name` is for messages."""
+    return np.asarray(_decode_channel(name, data, np.uint16), np.uint16)
+
+
+def read_uint8(path: Path) -> UInt8:
+    """The (H, W) uint8 values of a PNG file. Raises FrameError when it is damaged or of another type."""
+    return np.asarray(_decode_channel(path, _read(path), np.uint8), np.uint8)
+
+
+def _decode_channel(name: Path | str, data: bytes, dtype: type[np.generic]) -> Array:
+    check_image(name, data)
+    image = _decode_png(name, data, cv2.IMREAD_UNCHANGED)
+    if image.dtype != dtype or image.ndim != 2:
         channels = 1 if image.ndim == 2 else image.shape[2]
-        raise FrameError(f"{path} must be a PNG with one channel of uint16, found {channels} of {image.dtype}")
-    return np.asarray(image, np.uint16)
+        raise FrameError(
+            f"{name} must be a PNG with one channel of {dtype.__name__}, found {channels} of {image.dtype}"
+        )
+    return image
 
 
 def _read(path: Path) -> bytes:

@@ -100,8 +100,8 @@ class RunRecord:
         found = attempt(_found, scene)
         if found is not None:
             attempt(write_instances, self.directory / "instances.json", *found, scene.classes)
-            figures["instances.count"] = len(found[1])
             figures |= attempt(room_metrics, scene, found[0]) or {}
+            figures["instances.count"] = len(found[1])
         attempt(self._write_partial, video, figures, attempt.fault)
         if found is not None:
             attempt(write_mesh, self.directory / "mesh.ply", found[0])

@@ -22,7 +22,7 @@ LAYERS = [
     ["rendering"],
     ["detection", "mapping", "refinement", "tracking"],
     ["rivals", "datasets"],
-    ["checking", "synthetic"],
+    ["checking", "importing", "synthetic"],
     ["journal", "object_changes", "object_queries"],
     ["pipeline"],
     ["evaluation"],
@@ -37,7 +37,19 @@ LAYERS = [
 
 LAYER = {part: k for k, layer in enumerate(LAYERS) for part in layer}
 
-OPTIONAL = {"onnxruntime", "transformers", "torchvision", "rerun", "evo", "pandas", "pyorbbecsdk", "pyrealsense2"}
+OPTIONAL = {
+    "onnxruntime",
+    "transformers",
+    "torchvision",
+    "rerun",
+    "evo",
+    "pandas",
+    "pyorbbecsdk",
+    "pyrealsense2",
+    "OpenEXR",
+    "lzfse",
+    "rosbags",
+}
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
 
 

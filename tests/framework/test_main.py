@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from framework.__main__ import COMMANDS, leave_working_folder, main
+from framework.__main__ import COMMANDS, leave_working_folder, main, module_of
 from framework.files.search_paths import CONF
 from framework.records.provenance import config_hash
 
@@ -146,7 +146,7 @@ def test_help_lists_the_commands_and_each_is_there(tmp_path: Path) -> None:
     assert (done.returncode, done.stderr) == (0, "")
     for name, says in COMMANDS.items():
         assert re.search(rf"^  {name} +{re.escape(says)}$", done.stdout, re.MULTILINE)
-        assert find_spec(f"framework.commands.{name.replace('-', '_')}")
+        assert find_spec(module_of(name))
 
 
 def test_a_misspelt_command_suggests_the_nearest(tmp_path: Path) -> None:
@@ -160,6 +160,7 @@ FAULTY = {
     "tables": ["nowhere"],
     "ranks": ["nowhere", "elsewhere"],
     "figures": ["nowhere"],
+    "import": ["old", "new"],
     "check": ["out=check.jpg"],
     "diff": ["old", "old"],
     "evaluate": ["old"],

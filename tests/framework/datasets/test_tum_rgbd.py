@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import logging
+import shutil
 from pathlib import Path
 
 import cv2
@@ -10,7 +12,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
+from framework.data import Camera
 from framework.datasets.tum_rgbd import CAMERAS, Intrinsics, TumRgbd, associate
+from framework.datasets.undistortion import Distortion
 from framework.errors import ConfigError, DataError
 from tests.recordings import fault_of, mapped, opened, write_color, write_depth
 
@@ -99,6 +103,37 @@ def test_another_name_asks_for_the_camera(folder: Path) -> None:
         TumRgbd(mine)
     sequence = opened("tum_rgbd", f"dataset.root={mine}", "dataset.intrinsics=FREIBURG3")
     assert sequence.camera == CAMERAS[Intrinsics.FREIBURG3]
+
+
+OWN = {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 310.0, "cy": 250.0, "depth_scale": 1000.0}
+
+
+def test_a_recording_of_ones_own_brings_its_camera(folder: Path) -> None:
+    mine = folder.rename(folder.parent / "my_desk")
+    (mine / "camera.json").write_text(json.dumps(OWN))
+    sequence = TumRgbd(mine)
+    assert sequence.camera == Camera(640, 480, 600.0, 601.0, 310.0, 250.0)
+    assert sequence.lens is None
+    assert (sequence[0].depth == 10).all()  # 10,000 units of 1 mm
+    with pytest.raises(ConfigError, match=r"or write .*/nobodys/camera\.json with width, height, fx"):
+        TumRgbd(shutil.copytree(mine, folder.parent / "nobodys", ignore=shutil.ignore_patterns("camera.json")))
+
+
+def test_its_lens_is_undone_and_what_is_wrong_with_its_camera_is_said(folder: Path) -> None:
+    mine = folder.rename(folder.parent / "my_desk")
+    (mine / "camera.json").write_text(json.dumps(OWN | {"distortion": [0.1, 0, 0, 0, 0]}))
+    assert TumRgbd(mine).contents.distortion == Distortion(k1=0.1)
+    assert TumRgbd(mine, undistort=False).lens is None
+    (mine / "camera.json").write_text(json.dumps(OWN | {"fx": "wide"}))
+    with pytest.raises(DataError, match=r"camera\.json: fx must be a number"):
+        TumRgbd(mine)
+
+
+def test_the_published_camera_wins_over_a_file(folder: Path) -> None:
+    (folder / "camera.json").write_text("no JSON")
+    assert TumRgbd(folder).camera == CAMERAS[Intrinsics.FREIBURG1]
+    mine = folder.rename(folder.parent / "my_desk")
+    assert TumRgbd(mine, intrinsics=Intrinsics.FREIBURG3).camera == CAMERAS[Intrinsics.FREIBURG3]
 
 
 # Association

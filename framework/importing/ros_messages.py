@@ -1,0 +1,178 @@
+"""Messages of ROS bags: which there are, when, and the images in them.
+
+Message definitions that a bag brings are not used: the library would make code of them. Those of the standard types are
+known.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.data import Array, Float32, UInt8
+from framework.errors import ConfigError, DataError, FrameError, in_one_line
+from framework.files.image_files import decode_color, decode_uint16
+from framework.files.number_lines import SHOWN
+from framework.importing.source import readings
+
+NANOSECONDS = 1e-9  # s
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+
+COLOR_CHANNELS = {  # of 8 bits, as indices of R, G, B
+    "rgb8": (3, (0, 1, 2)),
+    "bgr8": (3, (2, 1, 0)),
+    "8UC3": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)),
+}
+MILLIMETRES, METRES = ("16UC1", "mono16", "Z16"), ("32FC1",)
+COMPRESSED_DEPTH = "compressedDepth"  # in the format of such images, behind the encoding
+DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: a number that nobody uses, quantization A and B
+
+
+@dataclass(frozen=True)
+class Message:
+    """One message, not decoded yet."""
+
+    topic: str
+    kind: str  # its type
+    stored_at: int  # ns, when it was recorded
+    raw: bytes
+
+
+class RosBag:
+    """A ROS 1 bag, or a ROS 2 bag: a folder, an .mcap or a .db3 file."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises DataError, naming the bag, when it cannot be read."""
+        self.path = path
+        rosbag1, rosbag2, typesys = _load_rosbags()
+        self._is_ros1 = path.suffix.lower() == ".bag"
+        self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
+        try:
+            self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
+            self._reader.open()
+            self.kinds: dict[str, str] = {found.topic: found.msgtype for found in self._reader.connections}
+        except Exception as error:  # of many kinds
+            raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
+
+    def topics(self, *kinds: str) -> list[str]:
+        """The topics with messages of these types."""
+        return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
+
+    def messages(self, topics: Sequence[str]) -> Iterator[Message]:
+        """The messages of some topics in the order of recording. Raises DataError where the bag is damaged."""
+        chosen = [found for found in self._reader.connections if found.topic in topics]
+        if not chosen:
+            return
+        try:
+            for connection, stored_at, raw in self._reader.messages(chosen):
+                yield Message(connection.topic, connection.msgtype, stored_at, bytes(raw))
+        except Exception as error:  # of many kinds
+            raise DataError(f"{self.path} is damaged: {in_one_line(error)[:SHOWN]}") from error
+
+    def first(self, topic: str) -> Any:
+        """The first message of a topic, decoded; None where there is none. Raises DataError."""
+        message = next(self.messages([topic]), None)
+        return None if message is None else self.decoded(message)
+
+    def decoded(self, message: Message) -> Any:
+        """What a message says. Raises FrameError, naming the topic, when it is damaged."""
+        decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
+        try:
+            return decode(message.raw, message.kind)
+        except Exception as error:  # of many kinds
+            raise FrameError(
+                f"{self.path}: a message of {message.topic} is damaged: {in_one_line(error)[:SHOWN]}"
+            ) from error
+
+    def sensed_at(self, message: Message) -> int:
+        """ns, by the message's header, which is its first field: when the device saw what it says."""
+        try:
+            if self._is_ros1:
+                seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
+            else:
+                order = "<" if message.raw[1] & 1 else ">"
+                seconds, nanoseconds = struct.unpack_from(f"{order}xxxxiI", message.raw)
+        except (struct.error, IndexError) as error:
+            raise FrameError(f"{self.path}: a message of {message.topic} has no header") from error
+        return int(seconds) * 10**9 + int(nanoseconds)
+
+
+def color_of(where: str, message: Any) -> UInt8:
+    """(H, W, 3) RGB of an Image or a CompressedImage. Raises FrameError, naming `where`."""
+    if hasattr(message, "format"):
+        return decode_color(where, message.data.tobytes())
+    if message.encoding not in COLOR_CHANNELS:
+        raise FrameError(f"{where}: colour must be one of {', '.join(COLOR_CHANNELS)}, found {message.encoding[:60]!r}")
+    channels, order = COLOR_CHANNELS[message.encoding]
+    return np.ascontiguousarray(_pixels(where, message, np.dtype(np.uint8), channels)[..., order])
+
+
+def depth_of(where: str, message: Any, unit: float) -> Float32:
+    """(H, W) m, 0 = no reading, of an Image or a CompressedImage; whole numbers count `unit` m.
+
+    Raises FrameError, naming `where`.
+    """
+    if hasattr(message, "format"):
+        return _compressed_depth(where, message, unit)
+    order = ">" if message.is_bigendian else "<"
+    if message.encoding in MILLIMETRES:
+        return _whole(_pixels(where, message, np.dtype(f"{order}u2"), 1)[..., 0], unit)
+    if message.encoding in METRES:
+        return readings(_pixels(where, message, np.dtype(f"{order}f4"), 1)[..., 0].astype(np.float32))
+    known = ", ".join((*MILLIMETRES, *METRES))
+    raise FrameError(f"{where}: depth must be one of {known}, found {message.encoding[:60]!r}")
+
+
+def _whole(stored: Array, unit: float) -> Float32:
+    none = np.iinfo(np.uint16).max
+    return np.where(stored == none, 0, stored).astype(np.float32) * np.float32(unit)
+
+
+def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
+    """A PNG, of compressedDepth behind a header of 12 bytes; that of floats holds quantized inverse depth."""
+    encoding, _, codec = message.format.partition(";")
+    data = message.data.tobytes()
+    if COMPRESSED_DEPTH not in codec:
+        return _whole(decode_uint16(where, data), unit)
+    if "rvl" in codec.lower():
+        raise FrameError(f"{where}: depth compressed by RVL is not read; record it as png, or uncompressed")
+    if len(data) < DEPTH_HEADER.size:
+        raise FrameError(f"{where} ends after {len(data)} bytes")
+    _, quantization_a, quantization_b = DEPTH_HEADER.unpack_from(data)
+    stored = decode_uint16(where, data[DEPTH_HEADER.size :])
+    if encoding.strip() not in METRES:
+        return _whole(stored, unit)
+    with np.errstate(all="ignore"):
+        return readings(np.where(stored == 0, 0, quantization_a / (stored.astype(np.float64) - quantization_b)))
+
+
+def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Array:
+    """(H, W, channels) of an Image."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    row = width * channels * dtype.itemsize
+    if not 0 < row <= step or height < 1 or len(message.data) != height * step:
+        raise FrameError(
+            f"{where} is damaged: {width}x{height} px of {message.encoding[:60]!r}, {step} bytes a row, do not make "
+            f"{len(message.data)} bytes"
+        )
+    rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
+    return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
+
+
+def _load_rosbags() -> tuple[Any, Any, Any]:
+    try:
+        from rosbags import rosbag1, rosbag2, typesys
+    except ImportError as error:
+        raise ConfigError("rosbags, which reads ROS bags, is not there: pip install instancemap[ros]") from error
+    return rosbag1, rosbag2, typesys
