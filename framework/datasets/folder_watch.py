@@ -22,9 +22,15 @@ from pathlib import Path
 
 from framework.data import Frame
 from framework.datasets.calibration import Calibration, check_max_depth
-from framework.datasets.camera_json import DISTORTION, camera_of, check_keys, distortion_of, read_json_object
+from framework.datasets.camera_json import (
+    CAMERA_KEYS,
+    DISTORTION,
+    camera_of,
+    check_keys,
+    distortion_of,
+    read_json_object,
+)
 from framework.datasets.recording import check_one_number, number_of
-from framework.datasets.rgbd_folder import CAMERA_KEYS
 from framework.datasets.stored_frames import ImageFiles
 from framework.errors import DataError, FrameError
 from framework.files.image_files import LARGEST_FILE, check_image
