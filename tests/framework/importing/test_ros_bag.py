@@ -219,7 +219,7 @@ def test_a_lens_is_written_for_who_reads_the_folder(tmp_path: Path) -> None:
     bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM, lens=[0.1, -0.2, 0.001, 0.002, 0.05])
     imported(bag.write(tmp_path / "bag"), tmp_path / "out")
     assert json.loads((tmp_path / "out/camera.json").read_text())["distortion"] == [0.1, -0.2, 0.001, 0.002, 0.05]
-    assert RgbdFolder(tmp_path / "out").lens is not None
+    assert RgbdFolder(tmp_path / "out").calibration.lens is not None
 
 
 def test_a_lens_of_another_model_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
