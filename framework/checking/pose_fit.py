@@ -19,6 +19,7 @@ SHORTEST_BASELINE = 0.02  # of the median depth: a pair that moves less says not
 FEWEST_PAIRS = 3  # that tell something
 SHORTEST_MOTION = 0.01  # of the image's width: pairs that move less fit with any poses
 POOR = 0.2  # of the motion: a larger error is not that of good poses; kitchen, flat, desk and ScanNet have 0.01 to 0.06
+ALIKE, ALIKE_PX = 1.15, 0.2  # times and px, within which two errors are the same
 CLEARLY = 0.5  # times the error as it is, or less, that another reading must have
 UNCERTAIN = 0.07  # of the factor, whatever the pairs say: what poses and depth of real recordings leave
 NOT_WORSE = 1.3  # times the error: the camera that only turns tells little of the scale
@@ -35,6 +36,11 @@ class PoseFit:
     depth_factor: float  # what all depths are multiplied by
     errors: Float64  # (P,) px, of each pair: the median over its points
     factor_within: float = 1.0  # times, to either side, that the factor may be another one; 1 where it is given
+
+    @property
+    def error(self) -> float:
+        """px"""
+        return float(np.median(self.errors))
 
 
 def readings() -> Iterator[PoseReading]:
@@ -105,12 +111,13 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     as_given = fit(telling, given, 1.0)
     others = tuple(fit(telling, reading, 1.0) for reading in readings())
     scaled = [fit(telling, reading) for reading in (given, *readings())]
-    best = min((as_given, *others, *scaled), key=lambda found: float(np.median(found.errors)))
-    now, then = float(np.median(as_given.errors)), float(np.median(best.errors))
+    alike = _that_fit_alike((as_given, *others, *scaled))
+    best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
+    now, then = as_given.error, best.error
     reading = best.reading if now > POOR * motion and then < CLEARLY * now else given
     chosen = _with_trusted_factor(telling, reading)
     factor = chosen.depth_factor
-    found = float(np.median(chosen.errors))
+    found = chosen.error
     told = (
         f"in {len(telling)} pairs of frames that move {motion:.0f} px, points lie {now:.1f} px from where they belong"
     )
@@ -123,7 +130,10 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
     findings = []
     if reading != given:
         text = f"they are {_named(reading)}: {told}, and {found:.1f} px when they are read so"
-        findings.append(Finding(Verdict.FAULT, "poses", text, _settings(reading, given)))
+        settings = {_settings(one.reading, given) for one in alike if one.reading not in (reading, given)}
+        if settings:
+            text += f"; {' or '.join(sorted(map(' '.join, settings)))} fits as well, as the camera moves"
+        findings.append(Finding(Verdict.FAULT, "poses", text, " ".join(_settings(reading, given))))
     else:
         text = f"they fit once the scale does: {told}, and {found:.1f} px then"
         findings.append(Finding(Verdict.FINE, "poses", text))
@@ -135,7 +145,7 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
 def _with_trusted_factor(pairs: Sequence[MatchedPair], reading: PoseReading) -> PoseFit:
     """With depth as it is, unless another factor is plain."""
     as_it_is, scaled = fit(pairs, reading, 1.0), fit(pairs, reading)
-    now, then = float(np.median(as_it_is.errors)), float(np.median(scaled.errors))
+    now, then = as_it_is.error, scaled.error
     far = not 1 / WRONG_SCALE < scaled.depth_factor < WRONG_SCALE
     return scaled if (far and then < NOT_WORSE * now) or then < CLEARLY * now else as_it_is
 
@@ -165,10 +175,16 @@ def _named(reading: PoseReading) -> str:
     return ", ".join(parts) or "T_world_camera with x right, y down, z forward"
 
 
-def _settings(reading: PoseReading, given: PoseReading) -> str:
+def _that_fit_alike(fits: Sequence[PoseFit]) -> list[PoseFit]:
+    """The best one, and those that nobody can tell from it: to a camera that only pans, some axes are the same."""
+    least = min(one.error for one in fits)
+    return [one for one in fits if one.error <= ALIKE * least + ALIKE_PX]
+
+
+def _settings(reading: PoseReading, given: PoseReading) -> tuple[str, ...]:
     """The parameters in which the readings differ."""
     names = ("pose_kind", "camera_axes", "quaternion_order")
-    return " ".join(
+    return tuple(
         f"dataset.{name}={getattr(reading, name).name}"
         for name in names
         if getattr(reading, name) != getattr(given, name)

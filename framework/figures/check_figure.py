@@ -108,11 +108,11 @@ def _readings(axes: Axes, poses: PoseJudgement) -> None:
     if poses.best is None or not poses.others:
         _say(axes, f"poses: {poses.findings[0].text}")
         return
-    fits = sorted(poses.others, key=_error)
+    fits = sorted(poses.others, key=lambda fit: fit.error)
     chosen = [fit.reading == poses.best.reading for fit in fits]
-    axes.barh(range(len(fits)), [_error(fit) for fit in fits], color=[CHOSEN if best else OTHER for best in chosen])
+    axes.barh(range(len(fits)), [fit.error for fit in fits], color=[CHOSEN if best else OTHER for best in chosen])
     for k, fit in enumerate(fits):
-        name = f" {_short(fit.reading)}: {_error(fit):.1f}"
+        name = f" {_short(fit.reading)}: {fit.error:.1f}"
         axes.text(0, k, name, fontsize=TEXT_PT - 1, va="center")
     axes.set_yticks([])
     axes.invert_yaxis()
@@ -149,10 +149,6 @@ def _findings(axes: Axes, check: RecordingCheck) -> None:
 def _say(axes: Axes, text: str) -> None:
     axes.axis("off")
     axes.text(0.5, 0.5, "\n".join(textwrap.wrap(text, 44)), ha="center", va="center", fontsize=TITLE_PT)
-
-
-def _error(fit: PoseFit) -> float:
-    return float(np.median(fit.errors))
 
 
 def _short(reading: PoseReading) -> str:

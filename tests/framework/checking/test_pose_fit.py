@@ -1,0 +1,110 @@
+"""Readings of poses, judged by points that are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.checking.finding import Verdict
+from framework.checking.matched_pairs import MatchedPair
+from framework.checking.pose_fit import fit, judge, motion_of, readings
+from framework.data import Camera, Float64, Frame
+from framework.datasets.reading import CameraAxes, PoseKind, PoseReading
+from framework.geometry import inverse, project, transform
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
+BLANK = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
+
+
+def pair(
+    T_world_first: Float64, T_world_second: Float64, stored: Callable[[Float64], Float64], seed: int
+) -> MatchedPair:
+    """Two frames of a cloud of points, with the poses that are stored of them, and what the images tell."""
+    chosen = np.random.default_rng(seed)
+    points = np.column_stack([chosen.uniform(-0.6, 0.6, (60, 2)), chosen.uniform(1.5, 3, 60)])
+    T_second_first = inverse(T_world_second) @ T_world_first
+    first, second = (Frame(k, k / 30, *BLANK, CAMERA, stored(T)) for k, T in enumerate((T_world_first, T_world_second)))
+    pixels = project(CAMERA, points).astype(np.float32)
+    moved = project(CAMERA, transform(T_second_first, points)).astype(np.float32)
+    return MatchedPair(first, second, 1, points.astype(np.float32), pixels, moved, T_second_first)
+
+
+def walk(seed: int, pan_only: bool = False) -> list[Float64]:
+    chosen = np.random.default_rng(seed)
+    poses = []
+    for k in range(12):
+        T = np.eye(4)
+        turn = (0, 0.08 * k, 0) if pan_only else chosen.normal(scale=0.1, size=3)
+        T[:3, :3] = Rotation.from_rotvec(turn).as_matrix()
+        T[:3, 3] = 0 if pan_only else chosen.normal(scale=0.15, size=3)
+        poses.append(T)
+    return poses
+
+
+def pairs_of(poses: list[Float64], stored: Callable[[Float64], Float64] = lambda T: T) -> list[MatchedPair]:
+    return [pair(a, b, stored, k) for k, (a, b) in enumerate(pairwise(poses))]
+
+
+def test_the_poses_move_points_to_where_they_are_seen() -> None:
+    for one in pairs_of(walk(0)):
+        np.testing.assert_allclose(motion_of(one, PoseReading()), one.T_second_first, atol=1e-12)
+    exact = fit(pairs_of(walk(0)), PoseReading())
+    assert exact.error == pytest.approx(0, abs=1e-3)
+    assert exact.depth_factor == pytest.approx(1, abs=1e-9)
+    assert exact.factor_within == pytest.approx(1.07, abs=0.01)
+
+
+@pytest.mark.parametrize("reading", list(readings()), ids=repr)
+def test_every_reading_is_found_by_a_camera_that_moves(reading: PoseReading) -> None:
+    def stored(T_world_camera: Float64) -> Float64:
+        """What the reading makes T_world_camera of; its order of steps, backwards."""
+        T = T_world_camera.copy()
+        T[:3, :3] = T[:3, :3] @ reading.camera_axes.R_axes_camera.T
+        if reading.pose_kind is PoseKind.T_CAMERA_WORLD:
+            T = inverse(T)
+        if reading.quaternion_order.name == "WXYZ":
+            T[:3, :3] = Rotation.from_quat(np.roll(Rotation.from_matrix(T[:3, :3]).as_quat(), 1)).as_matrix()
+        return T
+
+    judged = judge(pairs_of(walk(1), stored), PoseReading(), 1000.0, 2.0)
+    assert judged.best is not None
+    assert judged.best.reading == reading
+    assert judged.findings[0].verdict is (Verdict.FINE if reading == PoseReading() else Verdict.FAULT)
+    assert "fits as well" not in judged.findings[0].text
+
+
+def test_axes_that_a_pan_cannot_tell_apart_are_named() -> None:
+    """Turned about the image's vertical, an inverted pose and one of OpenGL's axes turn alike."""
+    judged = judge(pairs_of(walk(2, pan_only=True), inverse), PoseReading(), 1000.0, 2.0)
+    [fault] = judged.findings
+    assert fault.verdict is Verdict.FAULT
+    assert fault.setting in ("dataset.pose_kind=T_CAMERA_WORLD", "dataset.camera_axes=OPENGL")
+    other = {"dataset.pose_kind=T_CAMERA_WORLD", "dataset.camera_axes=OPENGL"} - {fault.setting}
+    assert f"{other.pop()}" in fault.text
+    assert "fits as well, as the camera moves" in fault.text
+
+
+@pytest.mark.parametrize("factor", [0.2, 5.0, 1000.0])
+def test_a_wrong_unit_is_measured(factor: float) -> None:
+    def stored(T: Float64) -> Float64:
+        scaled = T.copy()
+        scaled[:3, 3] *= factor
+        return scaled
+
+    judged = judge(pairs_of(walk(3), stored), PoseReading(), 1000.0 * factor, 2.0 / factor)
+    assert judged.best is not None
+    assert judged.best.depth_factor == pytest.approx(factor, rel=1e-6)
+    assert judged.findings[-1].setting == "dataset.depth_scale=1000"
+
+
+def test_poses_that_are_given_in_other_axes_are_right_when_read_so() -> None:
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    of_opengl = pairs_of(walk(4), lambda T: T @ flip)
+    judged = judge(of_opengl, PoseReading(camera_axes=CameraAxes.OPENGL), 1000.0, 2.0)
+    assert [finding.verdict for finding in judged.findings] == [Verdict.FINE]
+    wrong = judge(pairs_of(walk(4)), PoseReading(camera_axes=CameraAxes.OPENGL), 1000.0, 2.0)
+    assert wrong.findings[0].setting == "dataset.camera_axes=OPENCV"
