@@ -31,7 +31,7 @@ test: $(INSTALLED_DEV) ## lint, check types, run the tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
-	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --quiet
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --quiet
 
 .PHONY: install
 install: $(INSTALLED_DEV) ## only set up, for developers

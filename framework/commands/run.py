@@ -59,7 +59,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     The first signal ends it after the frame, or the record, that is in work, the second one at once.
     """
     from framework.api import begin, pipeline_of  # here: a misspelt name is answered before these load
-    from framework.checking.recording_check import warn_of_poses
+    from framework.datasets.recording import Recording
     from framework.detection.cache import cache_metrics
     from framework.interfaces import RGBDSequence, RGBDVideo
     from framework.records.run_record import RunRecord, reason
@@ -74,7 +74,10 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"
     log.info("mapping %s: %s, %s", video.name, length, chosen)
-    warn_of_poses(video)
+    if isinstance(video, Recording):  # files of anybody's
+        from framework.checking.recording_check import warn_of_poses
+
+        warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption:
         result = pipeline.run_to_any_end(video)
         with interruption.second_ends_at_once("once the record is written"):

@@ -113,7 +113,7 @@ def test_a_recording_of_ones_own_brings_its_camera(folder: Path) -> None:
     (mine / "camera.json").write_text(json.dumps(OWN))
     sequence = TumRgbd(mine)
     assert sequence.camera == Camera(640, 480, 600.0, 601.0, 310.0, 250.0)
-    assert sequence.lens is None
+    assert sequence.calibration.lens is None
     assert (sequence[0].depth == 10).all()  # 10,000 units of 1 mm
     with pytest.raises(ConfigError, match=r"or write .*/nobodys/camera\.json with width, height, fx"):
         TumRgbd(shutil.copytree(mine, folder.parent / "nobodys", ignore=shutil.ignore_patterns("camera.json")))
@@ -123,7 +123,7 @@ def test_its_lens_is_undone_and_what_is_wrong_with_its_camera_is_said(folder: Pa
     mine = folder.rename(folder.parent / "my_desk")
     (mine / "camera.json").write_text(json.dumps(OWN | {"distortion": [0.1, 0, 0, 0, 0]}))
     assert TumRgbd(mine).contents.distortion == Distortion(k1=0.1)
-    assert TumRgbd(mine, undistort=False).lens is None
+    assert TumRgbd(mine, undistort=False).calibration.lens is None
     (mine / "camera.json").write_text(json.dumps(OWN | {"fx": "wide"}))
     with pytest.raises(DataError, match=r"camera\.json: fx must be a number"):
         TumRgbd(mine)
