@@ -36,7 +36,7 @@ def visit(sequence: RGBDSequence, *overrides: str) -> Visit:
 def changed_room(
     start: int, without: tuple[int, ...] = (), moved: Mapping[int, tuple[float, float]] | None = None
 ) -> Synthetic:
-    """Every fourth frame of the walk, the room without some things, or with some of them elsewhere by (x, y) m."""
+    """Every sixth frame of the walk, the room without some things, or with some of them elsewhere by (x, y) m."""
     room = copy(ROOM)
     shift = moved or {}
     objects = [
@@ -45,7 +45,7 @@ def changed_room(
         if key not in without
     ]
     room._renderer = Renderer(assemble(objects), list(ROOM.room.lamps))
-    room._chosen = range(start, ROOM.frames, 4)
+    room._chosen = range(start, ROOM.frames, 6)
     return room
 
 

@@ -165,7 +165,7 @@ def test_a_sweep_without_an_experiment_has_one_place_and_tells_what_failed(tmp_p
 @pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Signals) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=5")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=1")
     wait_until(lambda: len(begun(tmp_path)) == 2, process)
     family = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(told)
