@@ -43,6 +43,17 @@ def test_the_first_is_noted_and_the_second_raises_where_it_may(
     assert signal.getsignal(number) is signal.SIG_DFL
 
 
+@pytest.fixture(autouse=True)
+def nobody_else_handles_signals() -> Iterator[None]:
+    """Libraries that other tests load in this process, such as Ray, have handlers of their own."""
+    before = {number: signal.getsignal(number) for number in ENDING}
+    for number in ENDING:
+        signal.signal(number, signal.default_int_handler if number == signal.SIGINT else signal.SIG_DFL)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 def test_one_inside_of_another_is_the_same() -> None:
     with signals_deferred(signal.SIGINT, signal.SIGTERM) as outer:
         with signals_deferred(signal.SIGINT) as inner:
