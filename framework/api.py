@@ -80,7 +80,7 @@ def go_on(pipeline: Pipeline, run: Path) -> None:
     The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
     that can be read, ConfigError where the stages cannot go on with it.
     """
-    scene = _scene_of("map", run)
+    scene = scene_of("map", run)
     pipeline.fuser.go_on(scene)
     pipeline.tracker.recall(read_places(run / PLACES), scene)
 
@@ -90,7 +90,7 @@ def begin_in(pipeline: Pipeline, run: Path) -> None:
 
     Raises likewise.
     """
-    pipeline.tracker.recall(read_places(run / PLACES), _scene_of("world", run))
+    pipeline.tracker.recall(read_places(run / PLACES), scene_of("world", run))
 
 
 def begin(config: DictConfig, pipeline: Pipeline) -> None:
@@ -104,7 +104,8 @@ def begin(config: DictConfig, pipeline: Pipeline) -> None:
         begin_in(pipeline, checked_path("world", world))
 
 
-def _scene_of(key: str, run: Path) -> SceneMap:
+def scene_of(key: str, run: Path) -> SceneMap:
+    """The map of a stored run. Raises DataError, which begins with `key`, where there is none that can be read."""
     if not (run / MAP).is_file():
         raise DataError(f"{key}: there is no {run / MAP}: expected the directory of a run")
     return load_scene(run / MAP)
@@ -215,7 +216,7 @@ def _override(name: str, value: object) -> str:
         return f"{name}={'null' if value is None else value}"
     if isinstance(value, str | Path):
         return f"{name}={QuotedString(str(value), Quote.single).with_quotes()}"
-    raise ConfigError(f"Mapper: {name} must be a name, a number, true, false or None, found {value!r:.60}")
+    raise ConfigError(f"{name} must be a name, a number, true, false or None, found {value!r:.60}")
 
 
 def open_dataset(name: str, **parameters: object) -> RGBDSequence:

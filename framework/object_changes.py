@@ -94,7 +94,6 @@ class _Sought:
     """An object of one visit, and what the other one tells of it."""
 
     instance: Instance
-    points: Float32  # (M, 3) m, of its surface
     seen: float  # share of its surface about which the other visit tells something
     gone: float  # probability that it is not there in the other visit
     match: int | None  # the object of the other visit that is where it is
@@ -118,7 +117,6 @@ def _looked_for(visit: Visit, other: Visit) -> list[_Sought]:
         sought.append(
             _Sought(
                 instance,
-                points[own],
                 float(seen.mean()),
                 probability_gone(instance.confidence, there[own], through[own], match is not None),
                 match,

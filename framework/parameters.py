@@ -35,6 +35,16 @@ def checked_path(name: str, value: object) -> Path:
     return Path(str(value)).expanduser().absolute()
 
 
+def checked_file(name: str, value: object, suffix: str = "") -> Path:
+    """The file that a key of the config names to be written, absolute. Raises ConfigError where that cannot be."""
+    path = checked_path(name, value)
+    if suffix and path.suffix.lower() != suffix:
+        raise ConfigError(f"{name} must end in {suffix}, found {path.name}")
+    if not path.parent.is_dir():
+        raise ConfigError(f"{name}: there is no folder {path.parent}")
+    return path
+
+
 def check_count(name: str, value: int, most: int) -> None:
     """Raises ConfigError unless a number of things is from 1 to `most`, which memory has room for."""
     require(1 <= value <= most, name, value, f"at least 1 and at most {most}")

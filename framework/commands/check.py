@@ -6,15 +6,15 @@ Exit status 1 = something is wrong.
 from __future__ import annotations
 
 import logging
-from pathlib import Path
 
 import hydra
 from omegaconf import DictConfig
 
 from framework.commands.command_line import Jobs
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 from framework.files.search_paths import CONF
 from framework.interfaces import MapFuser, RGBDSequence
+from framework.parameters import checked_file
 
 log = logging.getLogger(__name__)
 jobs = Jobs()
@@ -24,11 +24,7 @@ jobs = Jobs()
 @jobs.reported
 def job(config: DictConfig) -> None:
     """Builds the dataset that the config names, looks at it, prints what it found and draws it."""
-    out = Path(config.out).expanduser().absolute()
-    if out.suffix.lower() != ".png":
-        raise ConfigError(f"out must end in .png, found {out.name}")
-    if not out.parent.is_dir():
-        raise ConfigError(f"out: there is no folder {out.parent}")
+    out = checked_file("out", config.out, ".png")
 
     from framework.checking.recording_check import check
     from framework.figures.check_figure import write_check

@@ -21,7 +21,7 @@ from framework.commands.command_line import Jobs
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.search_paths import CONF
 from framework.interfaces import Detector, RGBDSequence
-from framework.parameters import checked_path
+from framework.parameters import checked_file
 
 if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
     from framework.data import Bool, Detections
@@ -40,9 +40,7 @@ def job(config: DictConfig) -> None:
     """Builds the dataset and the detector that the config names, and writes what the one finds in the other."""
     if config.out is None:
         raise ConfigError("out must be given: out=detections.json")
-    out = checked_path("out", config.out)
-    if not out.parent.is_dir():
-        raise ConfigError(f"out: there is no folder {out.parent}")
+    out = checked_file("out", config.out)
 
     from framework.detection.cache import with_cache
     from framework.label_spaces import COCO

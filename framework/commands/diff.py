@@ -9,13 +9,12 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.errors import DataError
 from framework.files.json_file import read_json, write_json
 from framework.files.tum_trajectory import read_tum
 from framework.files.whole_files import is_there
 from framework.files.yaml_file import load_yaml
 from framework.object_changes import Change, Kind, Visit, changes
-from framework.records.stored_runs import CONFIG, MAP, METRICS, TRAJECTORY
+from framework.records.stored_runs import CONFIG, METRICS, TRAJECTORY
 
 log = logging.getLogger(__name__)
 
@@ -52,12 +51,11 @@ def main() -> None:
 
 def visit_of(run: Path) -> Visit:
     """What a stored run saw. Raises DataError for a directory that holds no run's map and trajectory."""
-    from framework.api import load_scene  # here: what is wrong with the arguments is said at once
+    from framework.api import scene_of  # here: what is wrong with the arguments is said at once
 
-    if not (run / MAP).is_file():
-        raise DataError(f"there is no {run / MAP}: expected the directory of a run")
+    scene = scene_of("diff", run)
     _, poses = read_tum(run / TRAJECTORY)
-    return Visit(load_scene(run / MAP), poses)
+    return Visit(scene, poses)
 
 
 def in_world(run: Path, world: Path) -> bool:

@@ -17,7 +17,7 @@ from framework.commands.command_line import Jobs
 from framework.errors import ConfigError, DataError, FrameError
 from framework.files.search_paths import CONF
 from framework.interfaces import ClusterRefiner, Detector, RGBDSequence
-from framework.parameters import checked_path
+from framework.parameters import checked_file
 
 if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
     from framework.data import Detections, Frame
@@ -34,11 +34,7 @@ def job(config: DictConfig) -> None:
     """Builds dataset, detector and refiner, and draws what the last one does to one frame."""
     if config.out is None:
         raise ConfigError("out must be given: out=refinement.png")
-    out = checked_path("out", config.out)
-    if out.suffix.lower() != ".png":
-        raise ConfigError(f"out must end in .png, found {out.name}")
-    if not out.parent.is_dir():
-        raise ConfigError(f"out: there is no folder {out.parent}")
+    out = checked_file("out", config.out, ".png")
 
     from framework.detection.cache import with_cache
     from framework.evaluation.refined_points import Refinement

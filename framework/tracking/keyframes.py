@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, check_rigid
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.geometry import back_project, transform
 from framework.parameters import check_bounds
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
@@ -108,7 +108,12 @@ class Keyframes:
         }
 
     def restore(self, arrays: Mapping[str, Array]) -> None:
-        """Takes over the keyframes that another one has `saved`. Raises DataError where they are none."""
+        """Takes over the keyframes that another one has `saved`.
+
+        Raises ConfigError where it has saved nothing, DataError where these are none.
+        """
+        if not arrays:
+            raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
         if set(arrays) != set(SAVED):
             raise DataError(f"keyframes are {', '.join(SAVED)}, found {', '.join(arrays) or 'nothing'}")
         for name, (shape, kind) in SAVED.items():

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Array, Float64, Frame, Pose
-from framework.errors import ConfigError
 from framework.interfaces import PoseTracker, SceneMap
 from framework.tracking.features import Features
 from framework.tracking.keyframes import Keyframes
@@ -70,8 +69,6 @@ class PycolmapPnp(PoseTracker):
         return self._keyframes.saved()
 
     def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
-        if not places:
-            raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
         self._keyframes.restore(places)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:

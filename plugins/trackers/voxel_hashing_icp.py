@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Array, Float64, Frame, Pose
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds, require
@@ -168,8 +168,6 @@ class VoxelHashingIcp(PoseTracker):
         return self._keyframes.saved()
 
     def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
-        if not places:
-            raise ConfigError("the run before has left no keyframes, by which a camera finds itself in its map")
         self._keyframes.restore(places)
         self._before = scene
 

@@ -47,6 +47,8 @@ def test_what_it_names_mends_the_recording(inverted: Path, tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
+        (("out=2024",), "out must be a path"),
+        (("out=null",), "out must be a path"),
         (("out=check.jpg",), "out must end in .png"),
         (("out=nowhere/check.png",), "there is no folder"),
         (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: the folder nowhere"),
