@@ -43,10 +43,10 @@ class PoseFit:
         return float(np.median(self.errors))
 
 
-def readings() -> Iterator[PoseReading]:
-    """Those that are tried, the format's own first."""
+def readings(pose_unit: float = 1.0) -> Iterator[PoseReading]:
+    """Those that are tried, the format's own first, of translations in that unit, m."""
     for order, kind, axes in product(QuaternionOrder, PoseKind, CameraAxes):
-        yield PoseReading(kind, axes, order)
+        yield PoseReading(kind, axes, order, pose_unit)
 
 
 def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float | None = None) -> PoseFit:
@@ -109,8 +109,8 @@ def judge(pairs: Sequence[MatchedPair], given: PoseReading, depth_scale: float, 
         return PoseJudgement((Finding(Verdict.UNKNOWN, "poses", text),), None, None)
     motion = float(np.median([pair.motion for pair in telling]))
     as_given = fit(telling, given, 1.0)
-    others = tuple(fit(telling, reading, 1.0) for reading in readings())
-    scaled = [fit(telling, reading) for reading in (given, *readings())]
+    others = tuple(fit(telling, reading, 1.0) for reading in readings(given.pose_unit))
+    scaled = [fit(telling, reading) for reading in (given, *readings(given.pose_unit))]
     alike = _that_fit_alike((as_given, *others, *scaled))
     best = min(alike, key=lambda one: (len(_settings(one.reading, given)), one.error))
     now, then = as_given.error, best.error
@@ -157,7 +157,7 @@ def _scale_finding(chosen: PoseFit, depth_scale: float, median_depth: float) -> 
         text = (
             f"they move {factor:.3g} times as far as the images, whose median depth of {median_depth:.2f} m is a room's"
         )
-        unit = 10.0 ** round(np.log10(1 / factor))
+        unit = chosen.reading.pose_unit * 10.0 ** round(np.log10(1 / factor))
         return Finding(Verdict.FAULT, "poses", text, f"dataset.pose_unit={unit:g}")
     scale = depth_scale / factor
     fitting = [usual for usual in USUAL_SCALES if abs(np.log(usual / scale)) < np.log(chosen.factor_within)]

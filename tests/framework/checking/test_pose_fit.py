@@ -108,3 +108,17 @@ def test_poses_that_are_given_in_other_axes_are_right_when_read_so() -> None:
     assert [finding.verdict for finding in judged.findings] == [Verdict.FINE]
     wrong = judge(pairs_of(walk(4)), PoseReading(camera_axes=CameraAxes.OPENGL), 1000.0, 2.0)
     assert wrong.findings[0].setting == "dataset.camera_axes=OPENCV"
+
+
+def test_a_unit_that_is_set_is_kept_while_axes_are_sought() -> None:
+    """In millimetres and inverted: with the unit set, the direction alone is left to be named."""
+
+    def stored(T: Float64) -> Float64:
+        inverted = inverse(T)
+        inverted[:3, 3] *= 1000
+        return inverted
+
+    [fault] = judge(pairs_of(walk(5), stored), PoseReading(pose_unit=0.001), 1000.0, 2.0).findings
+    assert fault.setting == "dataset.pose_kind=T_CAMERA_WORLD"
+    wrong_unit = judge(pairs_of(walk(6)), PoseReading(pose_unit=0.001), 1000.0, 2.0)
+    assert wrong_unit.findings[-1].setting == "dataset.pose_unit=1"
