@@ -1,9 +1,9 @@
 """Which way is up, and how high the floor is, from the surface of a room and how the camera was held.
 
 Rooms have floors, tables and walls: up is the direction that most of the surface is perpendicular to or along, near to
-where the images' upper edges pointed on average, for these tell walls from floors. Angles to the truth: 0.1 to 1.0
-degrees in a flat, a ScanNet room, two windows of TUM's desk and three made-up rooms; kitchen and study room look right,
-unmeasured. Heights of the floor: 0.03 m off at most, where the truth has it at 0.
+where the images' upper edges pointed on average, for these tell walls from floors, as does what faces up. Angles to the
+truth: 0 to 1.0 degrees in a flat, a ScanNet room, five windows of TUM's desk and three made-up rooms; kitchen and study
+room look right, unmeasured. Heights of the floor: 0.03 m off at most, where the truth has it at 0 and it is told.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ DIRECTIONS = 3000  # on half a sphere, that are tried: 2.6 degrees apart
 SPREAD = np.radians(4.0)  # standard deviation of a surface's normal from what it is meant to be
 NEAR = np.radians(10.0)  # surfaces that refine the direction found
 HELD_WITHIN = np.radians(50.0)  # of up, that images' upper edges point on average
+FACING_UP = 2.0  # votes of what faces up; in a boxy room all three axes have the same share; 1.5 to 4 do as well
 LEAST_SHARE = 0.15  # of the surface must be level or upright; of a heap of things nothing is
 LEVEL = np.cos(np.radians(18.0))  # a normal's dot product with up, of what may be floor
 STEP = 0.05  # m, of heights
 FLOOR_SHARE = 0.05  # of all level surface, that lies within a step of the floor's height, at least
-BELOW_FLOOR = 0.05  # of all surface, that may lie lower: noise, and what windows and mirrors show
+BELOW_FLOOR = 0.02  # of all surface, that may lie lower: noise, and what windows and mirrors show
 
 
 class Gravity:
@@ -58,9 +59,10 @@ class Gravity:
         directions = half_sphere(DIRECTIONS)
         directions *= np.where(directions @ camera_up < 0, -1.0, 1.0)[:, None]
         directions = directions[directions @ camera_up > np.cos(HELD_WITHIN)]
-        share = level_or_upright(normals[::VOTING], areas[::VOTING], directions)
-        up = _refined(directions[int(share.argmax())], normals, areas)
-        return up if share.max() >= LEAST_SHARE else None
+        votes = level_or_upright(normals[::VOTING], areas[::VOTING], directions, FACING_UP)
+        up = _refined(directions[int(votes.argmax())], normals, areas)
+        share = level_or_upright(normals[::VOTING], areas[::VOTING], directions[[int(votes.argmax())]])
+        return up if share[0] >= LEAST_SHARE else None
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
@@ -80,11 +82,13 @@ def half_sphere(count: int) -> Float64:
     return np.stack([radius * np.cos(turn), radius * np.sin(turn), z], axis=1)
 
 
-def level_or_upright(normals: Float64, areas: Float64, directions: Float64) -> Float64:
-    """(D,) the share of the surface that is level, and of that which is upright, if a direction is up; 0.01 = none."""
-    cosines = np.abs(normals.astype(np.float32) @ directions.T.astype(np.float32))
+def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
+    """(D,) the share of the surface that is level or upright if a direction is up, times `facing_up` what faces it."""
+    signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
+    cosines = np.abs(signed)
     # of small angles: 1 - cos(a) = a^2 / 2, and for what is upright cos(90 deg - a) = a
-    votes = np.exp((cosines - 1) / np.float32(SPREAD**2)) + np.exp(-0.5 * (cosines / np.float32(SPREAD)) ** 2)
+    level = np.exp((cosines - 1) / np.float32(SPREAD**2)) * np.where(signed > 0, np.float32(facing_up), np.float32(1))
+    votes = level + np.exp(-0.5 * (cosines / np.float32(SPREAD)) ** 2)
     return np.asarray(areas @ votes.astype(np.float64) / areas.sum())
 
 

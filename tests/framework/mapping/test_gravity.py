@@ -65,6 +65,20 @@ def test_up_is_found_however_the_world_lies(seed: int) -> None:
     assert floor == pytest.approx(0, abs=0.005)
 
 
+def test_what_faces_up_decides_between_the_axes_of_a_box() -> None:
+    """A camera that is held askew, over a table among walls, with what leans along x, as TUM's freiburg1_rpy is."""
+    vertices, triangles = joined(
+        rectangle(np.zeros(3), 2 * X, 2 * Y),
+        rectangle(2 * X, 2 * Z, 2 * Y),  # the wall that the camera, leaning to x, looks at: it faces away from x
+        rectangle(2 * Y, 1.5 * X, 1.5 * Z),
+        rectangle(3 * Y, X, Y + Z),  # a lid that leans, along x
+    )
+    askew = Gravity((0.68, 0.2, 0.7))  # nearer to x than to z but for 1 degree
+    up = askew.up(vertices, triangles)
+    assert up is not None
+    assert np.degrees(np.arccos(min(up @ Z, 1.0))) < 0.1
+
+
 def test_noise_and_clutter_leave_it_where_it_is() -> None:
     chosen = np.random.default_rng(0)
     vertices, triangles = room()
