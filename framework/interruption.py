@@ -7,10 +7,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
-from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from types import FrameType
 
 ENDING = tuple(
@@ -137,10 +137,11 @@ def heard_from_sweep() -> Interruption:
 
 
 @contextmanager
-def signals_passed_on(at_work: Callable[[], bool]) -> Iterator[None]:
+def signals_passed_on(at_work: Callable[[], Collection[BaseProcess]]) -> Iterator[None]:
     """While the body runs, the first signal is passed on to the worker processes of this one, and raises in the end.
 
-    That is when nobody is `at_work` any more; the second signal raises at once.
+    It is passed on to those `at_work`, and that is when none is at work any more. An idle one may not have begun to
+    listen: it would die, and joblib kills all workers when one has. The second signal raises at once.
     """
 
     def end_workers(number: int, _frame: FrameType | None) -> None:
@@ -148,9 +149,12 @@ def signals_passed_on(at_work: Callable[[], bool]) -> Iterator[None]:
         for each in taken:
             signal.signal(each, _raise_interrupted)
         _say(f"{asked}: ending once the runs in work have left their records; a second time ends at once\n")
-        for worker in active_children():
-            worker.terminate()
-        while at_work():
+        told: set[int | None] = set()
+        while busy := at_work():
+            for worker in busy:
+                if worker.pid not in told:
+                    worker.terminate()
+                    told.add(worker.pid)
             time.sleep(0.1)
         raise asked
 

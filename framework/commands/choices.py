@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Sequence
 from difflib import get_close_matches
+from math import prod
 
 from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -13,17 +14,24 @@ from hydra.errors import HydraException
 from framework.configs import config_directory
 from framework.errors import ConfigError
 
-COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)  # glob() asks the disk
+MANY = 1_000_000  # where glob() asks the disk
+COUNTED = (ValueType.SIMPLE_CHOICE_SWEEP, ValueType.CHOICE_SWEEP, ValueType.RANGE_SWEEP)
 
 
-def check_sweep(overrides: Sequence[str], rows: Collection[str]) -> None:
-    """Raises ConfigError for a sweep without a single run, and for a row that is none of an experiment's `rows`."""
+def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
+    """How many runs a sweep has at most, as far as its command line tells.
+
+    Raises ConfigError for a sweep without a single run, and for a row that is none of an experiment's `rows`.
+    """
+    runs: dict[str, int] = {}  # by key, of which the last one counts
     for override in OverridesParser.create().parse_overrides([*overrides]):
         values = _values(override)
+        runs[override.get_key_element()] = len(values) or MANY
         if not values and override.value_type in COUNTED:
             raise ConfigError(f"{override.input_line} has no value: the sweep would be empty")
         if override.key_or_group == "row" and rows:
             check_row(values, rows)
+    return prod(runs.values())
 
 
 def check_row(asked: Sequence[str], rows: Collection[str]) -> None:

@@ -6,6 +6,7 @@ import logging
 import sys
 from collections.abc import Mapping
 from contextlib import nullcontext
+from multiprocessing import parent_process
 from pathlib import Path
 
 import hydra
@@ -16,7 +17,7 @@ from omegaconf import DictConfig
 from framework.commands.choices import fault_of_first_run
 from framework.commands.command_line import Jobs, is_of_sweep
 from framework.commands.experiment import with_row
-from framework.commands.sweep import ending, has_workers
+from framework.commands.sweep import by_joblib, ending
 from framework.errors import PartialRunError
 from framework.files.directory_lock import locked
 from framework.files.search_paths import CONF
@@ -32,7 +33,7 @@ jobs = Jobs()
 def job(config: DictConfig) -> None:
     """One run: builds the stages that the config names, maps the sequence, leaves the record in Hydra's directory."""
     hydra_config = HydraConfig.get()
-    if is_of_sweep(hydra_config) and has_workers(hydra_config):
+    if is_of_sweep(hydra_config) and by_joblib(hydra_config) and parent_process() is not None:
         heard_from_sweep().check()
     directory = Path(hydra_config.runtime.output_dir)
     config, choices = with_row(config, hydra_config)

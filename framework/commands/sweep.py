@@ -8,19 +8,21 @@ import textwrap
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from multiprocessing import active_children
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
 from hydra.experimental.callback import Callback
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.commands.choices import check_sweep
+from framework.commands.choices import checked_sweep
 from framework.configs import one_line
 from framework.errors import ConfigError, InstanceMapError
-from framework.files.directory_lock import is_locked, locked, new_directory
+from framework.files.directory_lock import holder, holder_name, is_locked, locked, new_directory
 from framework.files.whole_files import check_regular, remove_left_over
 from framework.interruption import signals_passed_on
 from framework.parameters import checked_rows
@@ -87,16 +89,33 @@ def run_in(directory: Path, wait: bool) -> Iterator[None]:
 
 
 def sweep_of(config: DictConfig) -> AbstractContextManager[None]:
-    """The place of a sweep, once it is known that it has runs. Raises InstanceMapError."""
-    check_sweep(config.hydra.overrides.task, checked_rows(config.get("rows")))
-    directory = place_of("hydra.sweep.dir", config.hydra.sweep.dir)
-    workers = has_workers(config.hydra)
-    return sweep_in(directory, "table" in config, config.get("figure") is not None, workers)
+    """The place of a sweep, once it is known that it has runs. Raises InstanceMapError.
+
+    Has joblib start no more workers than there are runs: the signals of a terminal reach all of them, and one that
+    never had a run would die of them, and all others with it.
+    """
+    own = config.hydra
+    swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
+    runs = checked_sweep([*swept, *own.overrides.task], checked_rows(config.get("rows")))
+    workers = 0
+    if by_joblib(own):
+        workers = min(joblib_workers(own.launcher.n_jobs), runs)
+        with flag_override(own, "readonly", False):
+            own.launcher.n_jobs = workers
+    directory = place_of("hydra.sweep.dir", own.sweep.dir)
+    return sweep_in(directory, "table" in config, config.get("figure") is not None, workers > 1)
 
 
-def has_workers(own: DictConfig | HydraConf) -> bool:
-    """Whether the jobs of a sweep are run by processes that this one has started."""
+def by_joblib(own: DictConfig | HydraConf) -> bool:
+    """Whether the jobs of a sweep are run by processes that this one has started, or a single one by itself."""
     return str(own.launcher._target_).endswith(".JoblibLauncher")
+
+
+def joblib_workers(asked: int | None) -> int:
+    """How many processes joblib makes of `n_jobs`; with 1 it starts none."""
+    from joblib import effective_n_jobs  # type: ignore[import-untyped]
+
+    return int(effective_n_jobs(asked))
 
 
 @contextmanager
@@ -112,7 +131,7 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool
     with locked(directory):
         remove_left_over(directory)
         try:
-            with signals_passed_on(lambda: any(map(is_locked, directory.iterdir()))) if workers else nullcontext():
+            with signals_passed_on(lambda: at_work_in(directory)) if workers else nullcontext():
                 yield
         except BaseException as error:
             with suppress(InstanceMapError):  # more is to be said about how it ended than that nothing is there
@@ -124,6 +143,12 @@ def sweep_in(directory: Path, with_table: bool, with_figure: bool, workers: bool
                 ) from error
             raise
         _report(directory, with_table, with_figure)
+
+
+def at_work_in(directory: Path) -> list[BaseProcess]:
+    """The processes that this one has started and that have a run in work in the place of a sweep."""
+    busy = {holder(run) for run in directory.iterdir() if is_locked(run)}
+    return [worker for worker in active_children() if holder_name(worker.pid) in busy]
 
 
 def _report(directory: Path, with_table: bool, with_figure: bool) -> None:

@@ -53,7 +53,7 @@ def locked(directory: Path, wait: bool = False) -> Iterator[None]:
         log.warning("%s cannot be locked (%s): start nothing else there meanwhile", directory, error.strerror)
     try:
         with written_whole(directory / HOLDER) as temporary:
-            temporary.write_text(f"process {os.getpid()} on {socket.gethostname()}\n")
+            temporary.write_text(f"{holder_name(os.getpid())}\n")
         yield
     finally:
         lock.release()
@@ -74,17 +74,26 @@ def is_locked(directory: Path) -> bool:
     return False
 
 
+def holder(directory: Path) -> str:
+    """Who has `directory` to itself, or had it last, in words; "" = that is not known."""
+    try:
+        return read_text(directory / HOLDER).strip()
+    except DataError:
+        return ""
+
+
+def holder_name(process: int | None) -> str:
+    """A process of this machine as `holder` names it."""
+    return f"process {process} on {socket.gethostname()}"
+
+
 def _acquire(lock: FileLock, directory: Path, wait: bool) -> None:
     try:
         lock.acquire(blocking=False)
     except Timeout as error:
-        try:
-            holder = read_text(directory / HOLDER).strip()
-        except DataError:
-            holder = ""
-        holder = holder or "another process"
+        who = holder(directory) or "another process"
         if not wait:
-            message = f"{directory} is in use by {holder}; wait until it has ended, or end it"
+            message = f"{directory} is in use by {who}; wait until it has ended, or end it"
             raise DataError(message) from error
-        log.warning("waiting for %s, which is at work in %s", holder, directory)
+        log.warning("waiting for %s, which is at work in %s", who, directory)
         lock.acquire()

@@ -2,23 +2,25 @@
 
 import pytest
 
-from framework.commands.choices import check_sweep, single_run
+from framework.commands.choices import MANY, checked_sweep, single_run
 from framework.errors import ConfigError
 
 ROWS = ("ours", "voxblox_pp", "label_count")
 
 
 @pytest.mark.parametrize(
-    "overrides",
+    ("overrides", "runs"),
     [
-        [],
-        ["row=ours"],
-        ["row=ours,label_count", "seed=0,1", "~detector", "+new=1"],
-        ["seed=range(0,3)", "dataset=glob(*)", "sequences='a,b'", "row=choice(ours,voxblox_pp)"],
+        ([], 1),
+        (["row=ours"], 1),
+        (["row=ours,label_count", "seed=0,1", "~detector", "+new=1"], 4),
+        (["row=ours,label_count", "seed=0,1,2", "row=ours"], 3),
+        (["seed=range(0,3)", "sequences='a,b'", "row=choice(ours,voxblox_pp)"], 6),
+        (["seed=range(0,3)", "dataset=glob(*)"], 3 * MANY),
     ],
 )
-def test_sweeps_that_have_runs_pass(overrides: list[str]) -> None:
-    check_sweep(overrides, ROWS)
+def test_sweeps_that_have_runs_are_counted(overrides: list[str], runs: int) -> None:
+    assert checked_sweep(overrides, ROWS) == runs
 
 
 @pytest.mark.parametrize(
@@ -32,12 +34,12 @@ def test_sweeps_that_have_runs_pass(overrides: list[str]) -> None:
 )
 def test_sweeps_that_cannot_run_are_refused(overrides: list[str], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        check_sweep(overrides, ROWS)
+        checked_sweep(overrides, ROWS)
     assert str(caught.value).startswith(message)
 
 
 def test_without_rows_a_row_is_a_key_like_others() -> None:
-    check_sweep(["row=a,b"], ())
+    assert checked_sweep(["row=a,b"], ()) == 2
 
 
 def test_the_first_run_of_a_sweep() -> None:

@@ -180,47 +180,57 @@ def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Sig
 ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=100000")
 
 
-@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
-@pytest.mark.parametrize("all_at_once", [False, True])
+@pytest.mark.parametrize(
+    ("told", "all_at_once", "n_jobs", "seeds", "at_work"),
+    [
+        (signal.SIGINT, False, 2, "1,2,3", 2),
+        (signal.SIGTERM, True, 2, "1,2,3", 2),
+        (signal.SIGINT, True, 3, "1,2", 2),  # more than there is work for
+        (signal.SIGINT, False, 1, "1,2", 1),  # which joblib starts no worker for
+    ],
+)
 def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
-    tmp_path: Path, told: signal.Signals, all_at_once: bool
+    tmp_path: Path, told: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
 ) -> None:
     """A terminal sends Ctrl-C to the workers, too; `kill` does not."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2,3", *ENDLESS, "fuser.note=${seed}.note")
-    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == 2, process)
+    by_joblib = (*BY_JOBLIB, f"hydra.launcher.n_jobs={n_jobs}")
+    process = begin(tmp_path, *by_joblib, "row=all", f"seed={seeds}", *ENDLESS, "fuser.note=${seed}.note")
+    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == at_work, process)
     if all_at_once:
         os.killpg(process.pid, told)
     else:
         process.send_signal(told)
     done = end(process)
     assert done.returncode == 128 + told
-    assert done.stderr.count("ending once the runs in work have left their records; a second time ends at once") == 1
+    ending = "once the runs in work have left their records" if n_jobs > 1 else "after this frame"
+    assert done.stderr.count(f"ending {ending}; a second time ends at once") == 1
     assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
     assert "Traceback" not in done.stderr
     partial = list((tmp_path / PLACE).glob("*/metrics.partial.json"))
-    assert len(partial) == 2
+    assert len(partial) == at_work
     for file in partial:
-        assert json.loads(file.read_text())["partial"] == "ended by SIGTERM"
+        how = "ended by SIGTERM" if n_jobs > 1 else "interrupted by Ctrl-C"
+        assert json.loads(file.read_text())["partial"] == how
         assert {path.name for path in file.parent.iterdir()} >= set(MAPPED)
 
 
 def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
     slow_record = ("fuser.slow_save_s=100", "fuser.note=${seed}.note")
-    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1", *ENDLESS, *slow_record)
-    wait_until(lambda: list(tmp_path.glob("*.note")), process)
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2", *ENDLESS, *slow_record)
+    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == 2, process)
     family = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGINT)
-    wait_until(lambda: list((tmp_path / PLACE).glob("*/mesh.ply")), process)
+    wait_until(lambda: len(list((tmp_path / PLACE).glob("*/mesh.ply"))) == 2, process)
     process.send_signal(signal.SIGINT)
     sent = time.monotonic()
     done = end(process)
     assert time.monotonic() - sent < 15
     assert done.returncode == 128 + signal.SIGINT
     assert not psutil.wait_procs(family, timeout=10)[1]
-    [partial] = (tmp_path / PLACE).glob("*/metrics.partial.json")
-    assert json.loads(partial.read_text())["frames"] > 0
+    partial = [json.loads(path.read_text()) for path in (tmp_path / PLACE).glob("*/metrics.partial.json")]
+    assert [each["frames"] > 0 for each in partial] == [True, True]
 
 
 def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) -> None:
