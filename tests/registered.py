@@ -11,14 +11,16 @@ from framework.commands.plugins import registered
 from framework.files.search_paths import CONF
 from framework.registry import STAGES, build, find_class
 
-OPTIONS = [(stage, option.name) for stage in STAGES for option in registered(stage)]
+OPTION = {(stage, option.name): option for stage in STAGES for option in registered(stage)}
+OPTIONS = [*OPTION]
 
 
 def names(stage: str, kind: type = object) -> list[str]:
     """The options of one stage, or those of them whose class is of a kind."""
-    found = [name for of, name in OPTIONS if of == stage]
     return [
-        name for name in found if issubclass(find_class(STAGES[stage], composed(stage, name)[stage]._target_), kind)
+        option.name
+        for option in OPTION.values()
+        if option.stage == stage and issubclass(find_class(STAGES[stage], option.target), kind)
     ]
 
 

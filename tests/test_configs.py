@@ -10,7 +10,6 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from framework.commands.plugins import registered as options_of
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
 from framework.interfaces import RGBDSequence
@@ -26,10 +25,9 @@ def test_every_option_composes_and_builds(stage: str, name: str, ready: Callable
 
 
 NEEDY = {  # by option: the first parameter that only the user knows
-    (stage, name): asked[0]
-    for stage, name in registered.OPTIONS
-    for node in [registered.composed(stage, name)[stage]]
-    if (asked := [key for key in node if OmegaConf.is_missing(node, key)])
+    key: asked[0]
+    for key, option in registered.OPTION.items()
+    if (asked := [parameter.name for parameter in option.parameters if parameter.default == "???"])
 }
 
 
@@ -44,7 +42,7 @@ def test_what_only_the_user_knows_is_asked_for_and_what_is_absent_is_named(stage
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_every_parameter_is_in_the_yaml_with_a_comment(stage: str, name: str) -> None:
-    [option] = [option for option in options_of(stage) if option.name == name]
+    option = registered.OPTION[stage, name]
     assert option.documentation
     assert not option.documentation.startswith("cannot be used"), option.documentation
     node = registered.composed(stage, name)[stage]

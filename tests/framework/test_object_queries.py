@@ -167,13 +167,13 @@ def test_stages_and_parameters_go_by_name(value: str) -> None:
 def test_by_hand_and_by_the_command_line_it_is_the_same_map_to_the_byte(tmp_path: Path) -> None:
     """The beginning of the demo, tracked and labelled by the network."""
     asked = ("fuser.voxel_size=0.02", "seed=3")
-    line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=10", *asked, "hydra.run.dir=run"]
+    line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]
     done = subprocess.run(
         line, cwd=tmp_path, env={"PYTHONPATH": str(CHECKOUT)}, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
     mapper = Mapper(*asked)
-    for frame in TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy", stop=10):
+    for frame in TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy", stop=6):
         mapper.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=frame.camera, timestamp=frame.timestamp)
     mapper.save(tmp_path / "map.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "run" / "map.npz").read_bytes()

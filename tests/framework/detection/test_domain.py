@@ -13,14 +13,11 @@ import pytest
 from framework.api import Mapper
 from framework.commands.detect import write_detections
 from framework.commands.show_refinement import detected
-from framework.datasets.scenenn.scenenn import SceneNN
+from framework.datasets.scenenn.scenenn import MADE_BY, SceneNN
 from framework.detection.cache import CachedDetector
 from framework.detection.domain import RENDERED_ROOMS, domain_of
 from framework.interfaces import Detector, RGBDSequence
 from framework.pipeline import Pipeline
-from framework.synthetic.benchmark import SCENES
-from framework.synthetic.scene_writers import write_scenes
-from framework.synthetic.scenenn_scene import Recording
 from framework.synthetic.sequence import Synthetic
 from tests import option_files, registered
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
@@ -101,8 +98,7 @@ def test_the_network_of_the_rooms_is_for_rendered_rooms_and_the_others_are_for_a
 def test_a_dataset_knows_whether_it_was_rendered(tmp_path: Path) -> None:
     """What `synthesize` writes says so; a folder of SceneNN itself does not."""
     assert Synthetic.domain == RENDERED_ROOMS
-    write_scenes(tmp_path / "rooms", {"bedroom": SCENES["bedroom"]}, Recording(frames=1, width=64), jobs=1)
-    assert SceneNN(tmp_path / "rooms", scene="bedroom").domain == RENDERED_ROOMS
-    (tmp_path / "real").mkdir()
-    option_files.overrides("dataset", "scenenn", tmp_path / "real")
-    assert SceneNN(tmp_path / "real").domain == ""
+    option_files.overrides("dataset", "scenenn", tmp_path)
+    assert SceneNN(tmp_path).domain == ""
+    (tmp_path / MADE_BY).write_text("{}")  # tests/framework/synthetic/test_scene_writers.py: as it is written
+    assert SceneNN(tmp_path).domain == RENDERED_ROOMS

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from framework.datasets.scenenn.scenenn import SceneNN
+from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError, DataError
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.furniture.groups import toilet_group
@@ -70,6 +72,7 @@ def test_what_is_complete_is_kept_and_what_is_missing_is_written_again(root: Pat
 def test_what_all_scenes_share(root: Path) -> None:
     assert (root / "release.txt").read_text() == f"synthetic {GENERATION}, seed 1, 10 frames\n"
     assert json.loads((root / "synthesize.json").read_text())["generation"] == GENERATION
+    assert SceneNN(root, scene="007").domain == RENDERED_ROOMS
     assert "fx 54.447329\n" in (root / "intrinsic" / "asus.ini").read_text()
     assert not list(root.rglob(".*")), "nothing unfinished is left"
 
