@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tests.cores  # noqa: F401  # isort: skip; before numba is loaded, which reads what it sets
 from framework import configs
 from tests.scenes.corner_room import CornerRoom
 

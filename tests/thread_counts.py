@@ -8,18 +8,21 @@ from typing import TypeVar
 import numba
 import pytest
 
+from tests.cores import all_cores
+
 Made = TypeVar("Made")
 
 
 def by_one_thread_and_two(make: Callable[[], Made]) -> tuple[Made, Made]:
     """What `make` returns with one numba thread and with two; skips the test on a machine with one core."""
-    usual = numba.get_num_threads()
-    if usual < 2:
+    if numba.config.NUMBA_NUM_THREADS < 2:
         pytest.skip("this machine has one core")
+    usual = numba.get_num_threads()
     try:
         numba.set_num_threads(1)
         by_one = make()
         numba.set_num_threads(2)
-        return by_one, make()
+        with all_cores():
+            return by_one, make()
     finally:
         numba.set_num_threads(usual)
