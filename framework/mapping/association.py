@@ -20,7 +20,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
-from framework.mapping.evidence import Evidence, best_instance
+from framework.mapping.evidence import Evidence, best_instance, labeled_voxel
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.pixel_lists import PixelLists, cover_another
 from framework.mapping.raycasting import voxel_seen
@@ -88,8 +88,9 @@ def look_up_instances(
             z = depth[row * stride, column * stride]
             if z > np.float32(0.0):
                 block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
-                if block >= 0 and grid.label_row[block] >= 0:
-                    instance_ids[row, column] = best_instance(evidence, grid.label_row[block], n)
+                voxel = labeled_voxel(grid, evidence, block, n) if block >= 0 else np.int32(-1)
+                if voxel >= 0:
+                    instance_ids[row, column] = best_instance(evidence, voxel)
 
 
 @njit(cache=True, nogil=True)

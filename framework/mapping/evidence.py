@@ -16,9 +16,12 @@ with. On real detections (maskrcnn2go, replica_floor2) the likeliest instance is
 likeliest class in 99.6 %; with 12 class slots in 99.5 %, with a slot for each of the 80 classes in 99.6 %, too: what
 speaks for a class before somebody names it is lost.
 
-Class evidence is kept in whole units, so that it can be small and its sums do not depend on their order. Rows of 512
-voxels exist only for blocks in which something was detected: 8 bytes an instance slot, 3 a class slot, so 80 bytes a
-voxel in compact storage.
+Class evidence is kept in whole units, so that it can be small and its sums do not depend on their order.
+
+Bytes: a voxel has slots once a cluster has named an instance there, 8 bytes an instance slot and 3 a class slot, so 80
+in compact storage. They are found through rows of 512 numbers, 4 bytes each, of the blocks that have such voxels. In
+redkitchen (maskrcnn2go, 1 cm, 80 frames) these are 21 % of the voxels of half of the blocks, 89 bytes each with their
+share of the rows: the slots lie near the surface and under masks.
 """
 
 from __future__ import annotations
@@ -33,11 +36,12 @@ from numba import njit, prange
 from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
 from framework.errors import DataError
 from framework.mapping.integration import SeenBlocks
-from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more
+from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more, reserved
 
 Integers = npt.NDArray[Any]  # of int16 or int64
 
 INSTANCE_SLOTS, CLASS_SLOTS = 4, 16  # labels that a voxel can tell apart in compact storage
+RESERVED = 128  # voxels with slots for each block of the budget: most have fewer, and slots for more are made
 NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 NO_CLASS = 255  # in a free slot
@@ -67,10 +71,14 @@ class Storage(Enum):
 class Evidence(NamedTuple):
     """How much speaks for each label, relative to every label not named. The best label is always in slot 0."""
 
-    instance_ids: Int32  # (R, 512, S), 0 = free slot
-    instance_value: Float32  # (R, 512, S)
-    class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
-    class_value: Integers  # (R, 512, T) units, int16 or in exact storage int64
+    labeled: Int32  # (R, 512) the number of a voxel among those that have slots, -1 = it has none
+    instance_ids: Int32  # (L, S), 0 = free slot
+    instance_value: Float32  # (L, S)
+    class_ids: UInt8  # (L, T), NO_CLASS = free slot
+    class_value: Integers  # (L, T) units, int16 or in exact storage int64
+
+
+SLOTS = Evidence._fields[1:]
 
 
 class Measurement(NamedTuple):
@@ -116,22 +124,29 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
 
 
 @device
-def best_instance(evidence, row, n):
-    """The most likely instance of a voxel, 0 when none is more likely than the rest."""
-    return evidence.instance_ids[row, n, 0] if evidence.instance_value[row, n, 0] > 0 else np.int32(0)
+def labeled_voxel(grid, evidence, block, n):
+    """The number of voxel n of a block among those that have slots, -1 if it has none."""
+    row = grid.label_row[block]
+    return evidence.labeled[row, n] if row >= 0 else np.int32(-1)
 
 
 @device
-def best_counted_instance(evidence, row, n, counts):
-    """The most likely instance of a voxel among those that count, by id in counts; 0 when none is likelier than the
-    rest.
+def best_instance(evidence, voxel):
+    """The most likely instance of a labelled voxel, 0 when none is more likely than the rest."""
+    return evidence.instance_ids[voxel, 0] if evidence.instance_value[voxel, 0] > 0 else np.int32(0)
+
+
+@device
+def best_counted_instance(evidence, voxel, counts):
+    """The most likely instance of a labelled voxel among those that count, by id in counts; 0 when none is likelier
+    than the rest.
     """
     best = np.int32(0)
     best_value = np.float32(0.0)
-    for s in range(evidence.instance_ids.shape[2]):
-        label = evidence.instance_ids[row, n, s]
+    for s in range(evidence.instance_ids.shape[1]):
+        label = evidence.instance_ids[voxel, s]
         if label > 0 and counts[label]:
-            value = evidence.instance_value[row, n, s]
+            value = evidence.instance_value[voxel, s]
             if value > best_value or (value == best_value and label < best):
                 best = label
                 best_value = value
@@ -139,10 +154,9 @@ def best_counted_instance(evidence, row, n, counts):
 
 
 @device
-def best_class(evidence, row, n):
-    """The most likely class of a voxel, -1 when none was ever named."""
-    named = evidence.instance_ids[row, n, 0] > 0
-    return np.int32(evidence.class_ids[row, n, 0]) if named else np.int32(-1)
+def best_class(evidence, voxel):
+    """The most likely class of a labelled voxel."""
+    return np.int32(evidence.class_ids[voxel, 0])
 
 
 @device
@@ -190,17 +204,16 @@ def best_first(labels, values, free):
 
 
 @device
-def update_voxel(evidence, row, n, measurement, point):
-    """Both recursions for one voxel that is seen at a pixel whose list of cluster points starts at `point`, -1 = empty.
+def update_voxel(evidence, voxel, measurement, point):
+    """Both recursions for one labelled voxel, seen at a pixel whose list of cluster points starts at `point`, -1 =
+    empty.
 
     Returns the number of evictions.
     """
-    ids = evidence.instance_ids[row, n]
-    if point < 0 and ids[0] == 0:
-        return 0  # nothing is known of the voxel, and nothing is said about it
-    id_values = evidence.instance_value[row, n]
-    classes = evidence.class_ids[row, n]
-    class_values = evidence.class_value[row, n]
+    ids = evidence.instance_ids[voxel]
+    id_values = evidence.instance_value[voxel]
+    classes = evidence.class_ids[voxel]
+    class_values = evidence.class_value[voxel]
     combine = measurement.combine
     evicted = 0
     # evidence of absence: an instance that was found in this frame, but not here
@@ -246,12 +259,32 @@ def update_voxel(evidence, row, n, measurement, point):
     return evicted
 
 
+@device
+def _is_named(measurement, point):
+    """Whether one of a pixel's list of cluster points, -1 = empty, is of a cluster with an instance."""
+    while point >= 0 and measurement.instance_id[measurement.cluster[point]] == 0:
+        point = measurement.next_point[point]
+    return point >= 0
+
+
+@device
+def _label(evidence, row, n, voxel, free_classes):
+    """Gives voxel n of a row the slots of number `voxel`."""
+    evidence.labeled[row, n] = voxel
+    for s in range(evidence.instance_ids.shape[1]):
+        evidence.instance_ids[voxel, s] = 0
+        evidence.instance_value[voxel, s] = 0
+    for s in range(evidence.class_ids.shape[1]):
+        evidence.class_ids[voxel, s] = free_classes[s]
+        evidence.class_value[voxel, s] = 0
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def _find_blocks_under_clusters(grid, seen, measurement, first_point, wants_row):
-    """Notes in wants_row (A,) the blocks without a row that have a voxel under some cluster with an instance."""
+def _count_new(grid, seen, evidence, measurement, first_point, new):
+    """Counts in new (A,) the voxels of each block without slots that lie under some cluster with an instance."""
     for a in prange(seen.blocks.shape[0]):
-        wants_row[a] = False
-        if seen.near[a] and grid.label_row[seen.blocks[a]] < 0:
+        new[a] = 0
+        if seen.near[a]:
             pixels = seen.near_pixel[a]
             under = np.int32(0)
             for n in range(BLOCK_VOXELS):  # without a branch, so that it is vectorised: most blocks are under none
@@ -259,58 +292,62 @@ def _find_blocks_under_clusters(grid, seen, measurement, first_point, wants_row)
                 under = one_more(under, (pixel >= 0) & (first_point[max(pixel, np.int32(0))] >= 0))
             for n in range(BLOCK_VOXELS if under > 0 else 0):
                 pixel = pixels[n]
-                p = first_point[pixel] if pixel >= 0 else np.int32(-1)
-                while p >= 0 and measurement.instance_id[measurement.cluster[p]] == 0:
-                    p = measurement.next_point[p]
-                if p >= 0:
-                    wants_row[a] = True
-                    break
+                if pixel >= 0 and labeled_voxel(grid, evidence, seen.blocks[a], n) < 0:
+                    new[a] = one_more(new[a], _is_named(measurement, first_point[pixel]))
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _update(grid, seen, evidence, measurement, first_point, evicted):
-    """Updates the near voxels of the seen blocks that have a row; evicted (A,) counts slots given away."""
+def _update(grid, seen, evidence, measurement, first_point, first_new, free_classes, evicted):
+    """Updates the near voxels of the seen blocks that have slots, or get them now, from first_new (A,) on, with
+    free_classes (T,) in those for classes; evicted (A,) counts slots given away.
+    """
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         row = grid.label_row[seen.blocks[a]]
         if seen.near[a] and row >= 0:
+            new = first_new[a]
             for n in range(BLOCK_VOXELS):
                 pixel = seen.near_pixel[a, n]
                 if pixel >= 0:
-                    evicted[a] += update_voxel(evidence, row, n, measurement, first_point[pixel])
+                    point = first_point[pixel]
+                    voxel = evidence.labeled[row, n]
+                    if voxel < 0 and _is_named(measurement, point):
+                        voxel = new
+                        new += np.int32(1)
+                        _label(evidence, row, n, voxel, free_classes)
+                    if voxel >= 0:
+                        evicted[a] += update_voxel(evidence, voxel, measurement, point)
+
+
+@njit(cache=True, nogil=True)
+def _fewest_free(instance_ids):
+    """The free slots of the voxel that has fewest of them, of instance_ids (L, S)."""
+    slots = instance_ids.shape[1]
+    fewest = slots
+    for ids in instance_ids:
+        free = 0
+        while free < fewest and ids[slots - 1 - free] == 0:
+            free += 1
+        fewest = min(fewest, free)
+    return fewest
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _count_free(evidence, rows, least):
-    """The free instance slots of the fullest voxel of each of the first rows, in least (rows,)."""
-    for row in prange(rows):
-        slots = evidence.instance_ids.shape[2]
-        fewest = slots
-        for n in range(BLOCK_VOXELS):
-            free = 0
-            while free < fewest and evidence.instance_ids[row, n, slots - 1 - free] == 0:
-                free += 1
-            fewest = min(fewest, free)
-        least[row] = fewest
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _merge(evidence, rows, kept, dropped, combine):
-    for row in prange(rows):
-        for n in range(BLOCK_VOXELS):
-            ids = evidence.instance_ids[row, n]
-            values = evidence.instance_value[row, n]
-            for s in range(len(ids)):
-                if ids[s] == dropped:
-                    gain = values[s]
-                    last = len(ids) - 1  # slots stay filled from the front
-                    while ids[last] == 0:
-                        last -= 1
-                    ids[s], values[s] = ids[last], values[last]
-                    ids[last], values[last] = 0, 0
-                    add_evidence(ids, values, 0, kept, gain, combine, UNBOUNDED)
-                    best_first(ids, values, 0)
-                    break
+def _merge(evidence, count, kept, dropped, combine):
+    for voxel in prange(count):
+        ids = evidence.instance_ids[voxel]
+        values = evidence.instance_value[voxel]
+        for s in range(len(ids)):
+            if ids[s] == dropped:
+                gain = values[s]
+                last = len(ids) - 1  # slots stay filled from the front
+                while ids[last] == 0:
+                    last -= 1
+                ids[s], values[s] = ids[last], values[last]
+                ids[last], values[last] = 0, 0
+                add_evidence(ids, values, 0, kept, gain, combine, UNBOUNDED)
+                best_first(ids, values, 0)
+                break
 
 
 class EvidenceRows:
@@ -321,14 +358,25 @@ class EvidenceRows:
         self.combine = combine
         self.storage = storage
         self.row_count = 0
+        self.voxel_count = 0  # with slots
         self.evicted = 0  # slots given to another label so far
         self._class_slots = CLASS_SLOTS
-        self.evidence = self._free_rows(64)
+        self.evidence = self._free()
 
     @property
     def byte_count(self) -> int:
-        """Of the rows in use."""
-        return sum(array[: self.row_count].nbytes for array in self.evidence)
+        """Of what is in use: capacity that no voxel has been given yet takes no memory."""
+        return sum(array.nbytes for array in self.in_use())
+
+    def in_use(self) -> Evidence:
+        """The evidence without capacity that is free."""
+        slots = {name: getattr(self.evidence, name)[: self.voxel_count] for name in SLOTS}
+        return Evidence(self.evidence.labeled[: self.row_count], **slots)
+
+    def fill(self, saved: Evidence) -> None:
+        """Takes the evidence of a saved map for its own."""
+        self.evidence = saved
+        self.row_count, self.voxel_count = len(saved.labeled), len(saved.instance_ids)
 
     def begin(self, classes: int) -> None:
         """Says how many classes there are, before the first update. Raises DataError when they are too many."""
@@ -336,20 +384,21 @@ class EvidenceRows:
             raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
         if self.storage is Storage.EXACT:
             self._class_slots = max(classes, 1)
-            self.evidence = self._free_rows(64)
+            self.evidence = self._free()
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
         """Updates the voxels near the measured surface of the blocks that a frame has seen."""
         if not measurement.instance_id.any():
             return  # the frame says nothing, neither for an instance nor against one
         first_point = measurement.first_point.ravel()
-        wants_row = np.empty(len(seen.blocks), np.bool_)
+        new = np.empty(len(seen.blocks), np.int32)
         evicted = np.empty(len(seen.blocks), np.int32)
-        _find_blocks_under_clusters(self.voxels.grid, seen, measurement, first_point, wants_row)
-        self._add_rows(seen.blocks[wants_row])
+        _count_new(self.voxels.grid, seen, self.evidence, measurement, first_point, new)
         if self.storage is Storage.EXACT:
             self._make_room_for_instances(len(measurement.instance_id))
-        _update(self.voxels.grid, seen, self.evidence, measurement, first_point, evicted)
+        first_new = self._make_room(seen.blocks, new)
+        free_classes = self._free_classes()
+        _update(self.voxels.grid, seen, self.evidence, measurement, first_point, first_new, free_classes, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
@@ -357,53 +406,57 @@ class EvidenceRows:
 
         Rare, and it visits the whole map.
         """
-        _merge(self.evidence, self.row_count, np.int32(kept), np.int32(dropped), int(self.combine))
+        _merge(self.evidence, self.voxel_count, np.int32(kept), np.int32(dropped), int(self.combine))
 
-    def _free_rows(self, rows: int) -> Evidence:
-        class_shape = (rows, BLOCK_VOXELS, self._class_slots)
-        return Evidence(
-            instance_ids=np.empty((rows, BLOCK_VOXELS, INSTANCE_SLOTS), np.int32),
-            instance_value=np.empty((rows, BLOCK_VOXELS, INSTANCE_SLOTS), np.float32),
-            class_ids=np.empty(class_shape, np.uint8),
-            class_value=np.empty(class_shape, np.int16 if self.storage is Storage.COMPACT else np.int64),
-        )
+    def _free(self) -> Evidence:
+        rows = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
+        return Evidence(rows, **reserved(RESERVED * self.voxels.max_blocks, self._free_slots))
 
-    def _first_classes(self) -> UInt8:
+    def _free_slots(self, voxels: int) -> dict[str, Any]:
+        return {
+            "instance_ids": np.empty((voxels, INSTANCE_SLOTS), np.int32),
+            "instance_value": np.empty((voxels, INSTANCE_SLOTS), np.float32),
+            "class_ids": np.empty((voxels, self._class_slots), np.uint8),
+            "class_value": np.empty(
+                (voxels, self._class_slots), np.int16 if self.storage is Storage.COMPACT else np.int64
+            ),
+        }
+
+    def _free_classes(self) -> UInt8:
         """What a new voxel's class slots hold: nothing, or in exact storage every class."""
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
         return named.astype(np.uint8)
 
+    def _make_room(self, blocks: Int32, new: Int32) -> Int32:
+        """Reserves slots for so many `new` (A,) voxels of each of these blocks, and rows for the blocks without one.
+
+        Returns (A,) the number of each block's first new voxel.
+        """
+        without = blocks[(new > 0) & (self.voxels.grid.label_row[blocks] < 0)]
+        last_new = self.voxel_count + np.cumsum(new)
+        rows, voxels = self.row_count + len(without), int(last_new[-1]) if len(last_new) else self.voxel_count
+        if rows > len(self.evidence.labeled):
+            longer = grown(self.evidence.labeled, max(rows, 2 * len(self.evidence.labeled)))
+            self.evidence = self.evidence._replace(labeled=longer)
+        if voxels > len(self.evidence.instance_ids):
+            capacity = max(voxels, 2 * len(self.evidence.instance_ids))
+            slots = {name: grown(getattr(self.evidence, name), capacity) for name in SLOTS}
+            self.evidence = self.evidence._replace(**slots)
+        self.evidence.labeled[self.row_count : rows] = -1
+        self.voxels.grid.label_row[without] = np.arange(self.row_count, rows, dtype=np.int32)
+        self.row_count, self.voxel_count = rows, voxels
+        return np.asarray(last_new - new, np.int32)
+
     def _make_room_for_instances(self, new: int) -> None:
         """Doubles the slots until every voxel has `new` free ones."""
-        least = np.empty(self.row_count, np.int64)
-        _count_free(self.evidence, self.row_count, least)
-        slots = self.evidence.instance_ids.shape[2]
-        missing = new - int(least.min(initial=slots))
+        slots = self.evidence.instance_ids.shape[1]
+        missing = new - int(_fewest_free(self.evidence.instance_ids[: self.voxel_count]))
         while missing > 0:
             missing -= slots
             slots *= 2
-        added = ((0, 0), (0, 0), (0, slots - self.evidence.instance_ids.shape[2]))
-        if added[2][1]:
+        added = ((0, 0), (0, slots - self.evidence.instance_ids.shape[1]))
+        if added[1][1]:
             self.evidence = self.evidence._replace(
                 instance_ids=np.pad(self.evidence.instance_ids, added),
                 instance_value=np.pad(self.evidence.instance_value, added),
             )
-
-    def _add_rows(self, blocks: Int32) -> None:
-        """Gives each of these blocks a row, in the order given."""
-        needed = self.row_count + len(blocks)
-        if needed > len(self.evidence.instance_ids):
-            capacity = max(needed, 2 * len(self.evidence.instance_ids))
-            self.evidence = Evidence(
-                instance_ids=grown(self.evidence.instance_ids, capacity),
-                instance_value=grown(self.evidence.instance_value, capacity),
-                class_ids=grown(self.evidence.class_ids, capacity),
-                class_value=grown(self.evidence.class_value, capacity),
-            )
-        new = slice(self.row_count, needed)
-        self.evidence.instance_ids[new] = 0
-        self.evidence.instance_value[new] = 0
-        self.evidence.class_ids[new] = self._first_classes()
-        self.evidence.class_value[new] = 0
-        self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
-        self.row_count = needed

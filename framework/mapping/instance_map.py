@@ -12,18 +12,26 @@ from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMe
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes, look_up_instances
-from framework.mapping.evidence import INSTANCE_SLOTS, NO_CLASS, Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.evidence import NO_CLASS, Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import check_known, check_like, faults_of, plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import (
+    check_known,
+    check_like,
+    check_numbers,
+    faults_of,
+    plain_table,
+    read_map,
+    table_of,
+    write_map,
+)
 from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import render
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
-from framework.mapping.voxel_grid import BLOCK_VOXELS
 
-FORMAT = 6  # of the saved file; a change of meaning counts it up
+FORMAT = 7  # of the saved file; a change of meaning counts it up
 
 
 class InstanceMap(SceneMap):
@@ -124,9 +132,7 @@ class InstanceMap(SceneMap):
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
         }
-        r = self.labels.row_count
-        arrays |= {name: array[:r] for name, array in self.labels.evidence._asdict().items()}
-        write_map(path, header, arrays)
+        write_map(path, header, arrays | self.labels.in_use()._asdict())
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
@@ -134,21 +140,22 @@ class InstanceMap(SceneMap):
         with faults_of(path):
             classes, storage = header.classes(), header.option("storage", Storage)
             table = table_of(header.part("table"), len(classes))
-            volume = TsdfVolume.load(header, arrays, len(arrays["instance_ids"]))
+            volume = TsdfVolume.load(header, arrays, len(arrays["labeled"]))
             scene = cls(volume, Confirmation.of(header.part("confirmation")), table.combine, table.logarithmic, storage)
             scene.begin(classes)
-            slots = INSTANCE_SLOTS
+            expected = scene.labels.evidence._asdict()
+            check_like(arrays, {"labeled": expected.pop("labeled")}, len(arrays["labeled"]))
             if storage is Storage.EXACT and arrays["instance_ids"].ndim:
                 slots = max(arrays["instance_ids"].shape[-1], 1)  # as many as were needed
-            free = np.empty((0, BLOCK_VOXELS, slots), np.float32)
-            free_rows = scene.labels.evidence._replace(instance_ids=free.astype(np.int32), instance_value=free)
-            check_like(arrays, free_rows._asdict(), len(arrays["instance_ids"]))
+                for name in ("instance_ids", "instance_value"):
+                    expected[name] = np.empty((0, slots), expected[name].dtype)
+            check_like(arrays, expected, len(arrays["instance_ids"]))
+            check_numbers("labeled", arrays["labeled"], len(arrays["instance_ids"]))
             check_known("class_ids", arrays["class_ids"], [*range(len(classes)), NO_CLASS])
             check_known("instance_ids", arrays["instance_ids"], [0, *table.records])
-            if ((arrays["instance_ids"][..., 0] > 0) & (arrays["class_ids"][..., 0] == NO_CLASS)).any():
-                raise DataError("class_ids has no class where instance_ids has an instance")
-            scene.labels.evidence = Evidence(**{name: arrays[name] for name in Evidence._fields})
-            scene.labels.row_count = len(scene.labels.evidence.instance_ids)
+            if (arrays["instance_ids"][:, 0] == 0).any() or (arrays["class_ids"][:, 0] == NO_CLASS).any():
+                raise DataError("instance_ids and class_ids must have a first one for each voxel with labels")
+            scene.labels.fill(Evidence(**{name: arrays[name] for name in Evidence._fields}))
             scene.labels.evicted = header.whole("evicted")
             scene.table = table
         return scene

@@ -142,12 +142,14 @@ def check_known(name: str, array: Array, known: Iterable[int]) -> None:
         raise DataError(f"{name} has {unknown[0]}, which is none of the map's")
 
 
-def check_rows(label_row: Array, rows: int) -> None:
-    """Raises DataError unless each of the label evidence's rows is that of one block; -1 = a block has none."""
-    used = label_row[label_row != -1]
-    check_known("label_row", used, range(rows))
-    if len(np.unique(used)) < max(len(used), rows):
-        raise DataError(f"label_row must name each of the {rows} rows once")
+def check_numbers(name: str, numbers: Array, count: int) -> None:
+    """Raises DataError unless the array has each of the numbers 0 to `count` - 1 once, and -1 for none."""
+    used = numbers[numbers != -1]
+    beyond = used[(used < 0) | (used >= count)]
+    if beyond.size:
+        raise DataError(f"{name} has {beyond[0]}, which is none of the map's")
+    if used.size != count or not np.array_equal(np.bincount(used, minlength=count), np.ones(count)):
+        raise DataError(f"{name} must have each of the {count} numbers once")
 
 
 def check_blocks(coords: Any) -> None:

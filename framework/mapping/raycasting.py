@@ -19,7 +19,7 @@ from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, SurfaceView, View, check_array, check_view
 from framework.geometry import inverse
-from framework.mapping.evidence import Evidence, best_class, best_instance
+from framework.mapping.evidence import Evidence, best_class, best_instance, labeled_voxel
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.row_interpolation import blend_colors, gather_corners, points_of_row, step_to_surface
 from framework.mapping.sensor import Sensor, pinhole, ray_direction, seen_point
@@ -338,10 +338,10 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
             z = depth[v, u]
             if z > np.float32(0.0):
                 block, n, key, region = voxel_seen(grid, view, u, v, z, key, region)
-                if block >= 0 and grid.label_row[block] >= 0:
-                    row = grid.label_row[block]
-                    instance_ids[v, u] = best_instance(evidence, row, n)
-                    class_ids[v, u] = best_class(evidence, row, n)
+                voxel = labeled_voxel(grid, evidence, block, n) if block >= 0 else np.int32(-1)
+                if voxel >= 0:
+                    instance_ids[v, u] = best_instance(evidence, voxel)
+                    class_ids[v, u] = best_class(evidence, voxel)
 
 
 def tile_bounds(voxels: VoxelGrid, sensor: Sensor, camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float32]:

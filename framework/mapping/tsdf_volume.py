@@ -10,7 +10,7 @@ import numpy as np
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
 from framework.mapping.gravity import Gravity
 from framework.mapping.integration import Integrator, SeenBlocks
-from framework.mapping.map_file import check_blocks, check_like, check_rows
+from framework.mapping.map_file import check_blocks, check_like, check_numbers
 from framework.mapping.map_header import MapHeader
 from framework.mapping.meshing import Surface, SurfaceNets
 from framework.mapping.raycasting import render_near, render_surface
@@ -110,7 +110,7 @@ class TsdfVolume:
         volume.integrator.frames = header.whole("frames")  # rounding goes on from there
         volume.gravity = Gravity.of(header.items("camera_up"))
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
-        check_rows(arrays["label_row"], rows)
+        check_numbers("label_row", arrays["label_row"], rows)
         volume.fill(arrays)
         return volume
 

@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Bool, Int32, UInt8
-from framework.mapping.evidence import Evidence, best_class, best_counted_instance
+from framework.mapping.evidence import Evidence, best_class, best_counted_instance, labeled_voxel
 from framework.mapping.meshing import Surface
 from framework.mapping.voxel_grid import BLOCK_VOXELS, UNSEEN, Grid, device, find_block, unpack_color
 from framework.mapping.voxel_walk import voxel_number
@@ -79,13 +79,12 @@ def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
     """
     keep_near(grid, blocks, numbers, shares)
     for c in range(CORNERS):
-        ids[c] = 0
-        if shares[c] > 0 and grid.label_row[blocks[c]] >= 0:
-            ids[c] = best_counted_instance(evidence, grid.label_row[blocks[c]], numbers[c], counts)
+        voxel = labeled_voxel(grid, evidence, blocks[c], numbers[c]) if shares[c] > 0 else np.int32(-1)
+        ids[c] = best_counted_instance(evidence, voxel, counts) if voxel >= 0 else np.int32(0)
     elected = majority(ids, shares)
     if elected < 0:
         return np.int32(0), np.int32(-1)
-    return ids[elected], best_class(evidence, grid.label_row[blocks[elected]], numbers[elected])
+    return ids[elected], best_class(evidence, labeled_voxel(grid, evidence, blocks[elected], numbers[elected]))
 
 
 @device

@@ -11,12 +11,13 @@ voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
 Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block. Beside its voxels a block takes 49 (neighbors 32,
 coordinates 12, label row 4, solid 1), and its region 2 KiB of block numbers, 12 of coordinates and 24 to 48 of the hash
 table for up to 512 blocks: measured 117 blocks a region in a dense room and 73 in a real kitchen, so 18 and 29 a block.
-Together 8.15 bytes a voxel. Labels take 56 more, only in blocks where something was detected (evidence.py).
+Together 8.15 bytes a voxel. Labels take 84 more in each that has some, and 4 in the others of its block (evidence.py).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple, TypeVar
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -26,6 +27,7 @@ from framework.data import Int32, UInt8
 from framework.errors import MapFullError
 
 Element = TypeVar("Element", bound=np.generic)
+Made = TypeVar("Made")
 
 BLOCK_SIDE = 8  # voxels
 BLOCK_VOXELS = BLOCK_SIDE**3
@@ -36,6 +38,7 @@ WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
 TSDF_MAX = 32767  # the stored value of the widest truncation distance
 UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
 NO_KEY = -1
+LEAST_RESERVED = 1024  # blocks or voxels
 
 # What kernels call in their innermost loops. Without reference counts (_nrt): threads that count the same arrays of the
 # Grid up and down at each call wait for each other.
@@ -245,6 +248,33 @@ def _rehash(old_keys, old_regions, keys, regions):
             regions[slot] = old_regions[i]
 
 
+def _free_blocks(count: int) -> tuple[npt.NDArray[Any], ...]:
+    """The arrays of so many blocks, as in a Grid."""
+    return (
+        np.empty((count, 3), np.int32),
+        np.empty((count, 8), np.int32),
+        np.empty((count, BLOCK_VOXELS), np.int16),
+        np.empty((count, BLOCK_VOXELS), np.uint16),
+        np.empty((count, BLOCK_VOXELS), np.uint32),
+        np.empty(count, np.uint8),
+        np.empty(count, np.int32),
+    )
+
+
+def reserved(most: int, make: Callable[[int], Made]) -> Made:
+    """What `make` gives for the length `most`, or where the system does not promise so much memory, for half or less.
+
+    It makes arrays without writing them: they cost no memory yet, and what need not grow is never copied.
+    """
+    while True:
+        try:
+            return make(most)
+        except MemoryError:
+            if most <= LEAST_RESERVED:
+                raise
+            most = max(most // 2, LEAST_RESERVED)
+
+
 class VoxelGrid:
     """Owns the arrays of the grid and makes them grow. The kernels work on `self.grid`."""
 
@@ -252,7 +282,7 @@ class VoxelGrid:
         self.max_blocks = max_blocks
         self.block_count = 0
         self.region_count = 0
-        first = min(1024, max_blocks)
+        block_coords, neighbors, tsdf, weight, color, solid, label_row = reserved(max_blocks, _free_blocks)
         self.grid = Grid(
             voxel_size=np.float32(voxel_size),
             tsdf_unit=np.float32(max_truncation / TSDF_MAX),
@@ -260,13 +290,13 @@ class VoxelGrid:
             table_regions=np.full(256, -1, np.int32),
             region_coords=np.empty((64, 3), np.int32),
             region_blocks=np.empty((64, REGION_BLOCKS), np.int32),
-            block_coords=np.empty((first, 3), np.int32),
-            neighbors=np.empty((first, 8), np.int32),
-            tsdf=np.empty((first, BLOCK_VOXELS), np.int16),
-            weight=np.empty((first, BLOCK_VOXELS), np.uint16),
-            color=np.empty((first, BLOCK_VOXELS), np.uint32),
-            solid=np.empty(first, np.uint8),
-            label_row=np.empty(first, np.int32),
+            block_coords=block_coords,
+            neighbors=neighbors,
+            tsdf=tsdf,
+            weight=weight,
+            color=color,
+            solid=solid,
+            label_row=label_row,
         )
 
     @property

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.errors import DataError
+from framework.mapping import evidence as evidence_module
 from framework.mapping.evidence import (
     CLASS_SLOTS,
     INSTANCE_SLOTS,
@@ -13,6 +14,7 @@ from framework.mapping.evidence import (
     MOST_UNITS,
     NEW_CLASSES,
     NO_CLASS,
+    SLOTS,
     Combine,
     Evidence,
     EvidenceRows,
@@ -25,18 +27,22 @@ from framework.mapping.evidence import (
     named_classes,
     update_voxel,
 )
+from framework.mapping.integration import SeenBlocks
 from framework.mapping.voxel_grid import VoxelGrid
+from tests.thread_counts import by_one_thread_and_two
 
 FLOOR = 0.05
 UNITS = 1 << 16  # as fine as in exact storage
 
 
 def blank() -> Evidence:
+    """Of one voxel with slots."""
     return Evidence(
-        np.zeros((1, 512, INSTANCE_SLOTS), np.int32),
-        np.zeros((1, 512, INSTANCE_SLOTS), np.float32),
-        np.full((1, 512, CLASS_SLOTS), NO_CLASS, np.uint8),
-        np.zeros((1, 512, CLASS_SLOTS), np.int64),
+        np.zeros((1, 512), np.int32),
+        np.zeros((1, INSTANCE_SLOTS), np.int32),
+        np.zeros((1, INSTANCE_SLOTS), np.float32),
+        np.full((1, CLASS_SLOTS), NO_CLASS, np.uint8),
+        np.zeros((1, CLASS_SLOTS), np.int64),
     )
 
 
@@ -102,23 +108,21 @@ def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) 
         instance = int(rng.integers(1, labels + 1))
         score = float(rng.uniform(0.2, 1))
         p = distribution(rng, classes)
-        evicted = update_voxel(evidence, 0, 3, measured([instance], [score], p[None], 1.0, labels), np.int32(0))
+        evicted = update_voxel(evidence, 0, measured([instance], [score], p[None], 1.0, labels), np.int32(0))
         assert evicted == 0
         # P(O = instance) = score, P(O = any other) = FLOOR
         instance_log += np.log(FLOOR)
         instance_log[instance] += np.log(score / FLOOR)
         class_log += np.log(p)
-    found = {
-        int(i): float(v) for i, v in zip(evidence.instance_ids[0, 3], evidence.instance_value[0, 3], strict=True) if i
-    }
+    found = {int(i): float(v) for i, v in zip(evidence.instance_ids[0], evidence.instance_value[0], strict=True) if i}
     for i, log in found.items():
         assert abs(log - (instance_log[i] - instance_log[0])) < 1e-3
-    assert best_instance(evidence, 0, 3) == 1 + np.argmax(instance_log[1:])
-    order = evidence.class_ids[0, 3][: min(classes, CLASS_SLOTS)]
-    ours = evidence.class_value[0, 3][: len(order)] / UNITS
+    assert best_instance(evidence, 0) == 1 + np.argmax(instance_log[1:])
+    order = evidence.class_ids[0][: min(classes, CLASS_SLOTS)]
+    ours = evidence.class_value[0][: len(order)] / UNITS
     exact = class_log[order]
     assert np.allclose(ours - ours[0], exact - exact[0], atol=2e-3)
-    assert best_class(evidence, 0, 3) == np.argmax(class_log)
+    assert best_class(evidence, 0) == np.argmax(class_log)
 
 
 def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
@@ -137,8 +141,8 @@ def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
             p = np.exp(logits) / np.exp(logits).sum()
             p = 0.9 * p + 0.1 / 80
             log += np.log(p)
-            evictions += update_voxel(evidence, 0, 0, measured([1], [0.9], p[None], 1.0, 1), np.int32(0))
-        agree += best_class(evidence, 0, 0) == np.argmax(log)
+            evictions += update_voxel(evidence, 0, measured([1], [0.9], p[None], 1.0, 1), np.int32(0))
+        agree += best_class(evidence, 0) == np.argmax(log)
     assert agree >= 0.97 * voxels
     assert evictions > 0
 
@@ -146,8 +150,8 @@ def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
 def test_a_voxel_under_two_masks_hears_both() -> None:
     evidence = blank()
     p = np.full((2, 3), 1 / 3)
-    update_voxel(evidence, 0, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), np.int32(0))
-    found = dict(zip(evidence.instance_ids[0, 0].tolist(), evidence.instance_value[0, 0].tolist(), strict=True))
+    update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), np.int32(0))
+    found = dict(zip(evidence.instance_ids[0].tolist(), evidence.instance_value[0].tolist(), strict=True))
     assert found[1] == np.float32(np.log(0.9 / FLOOR))
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
 
@@ -155,20 +159,20 @@ def test_a_voxel_under_two_masks_hears_both() -> None:
 def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
-    update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(0))
-    before = float(evidence.instance_value[0, 0, 0])
-    update_voxel(evidence, 0, 0, measured([2], [0.9], one, 0.5, 2), np.int32(-1))  # instance 2 found, not here
-    assert float(evidence.instance_value[0, 0, 0]) == before
-    update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))  # instance 1 found, not here
-    assert float(evidence.instance_value[0, 0, 0]) == np.float32(before + np.log(0.5))
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), np.int32(0))
+    before = float(evidence.instance_value[0, 0])
+    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), np.int32(-1))  # instance 2 found, not here
+    assert float(evidence.instance_value[0, 0]) == before
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))  # instance 1 found, not here
+    assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
-        update_voxel(evidence, 0, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))
-    assert best_instance(evidence, 0, 0) == 0, "the rest has become more likely"
+        update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))
+    assert best_instance(evidence, 0) == 0, "the rest has become more likely"
 
 
 def test_a_cluster_without_instance_says_nothing() -> None:
     evidence = blank()
-    update_voxel(evidence, 0, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), np.int32(0))
+    update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), np.int32(0))
     assert (evidence.instance_ids == 0).all()
     assert (evidence.class_ids == NO_CLASS).all()
 
@@ -196,15 +200,13 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
     ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
 ) -> None:
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
-    rows.row_count = 1
-    rows.evidence.instance_ids[0, 7], rows.evidence.instance_value[0, 7] = ids, logs
+    rows.voxel_count = 1
+    rows.evidence.instance_ids[0], rows.evidence.instance_value[0] = ids, logs
     rows.merge_instances(3, 2)
-    found = dict(
-        zip(rows.evidence.instance_ids[0, 7].tolist(), rows.evidence.instance_value[0, 7].tolist(), strict=True)
-    )
+    found = dict(zip(rows.evidence.instance_ids[0].tolist(), rows.evidence.instance_value[0].tolist(), strict=True))
     assert found == dict(zip(merged_ids, merged_logs, strict=True))
-    assert rows.evidence.instance_ids[0, 7, 0] == merged_ids[0]
-    assert ((rows.evidence.instance_ids[0, 7] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
+    assert rows.evidence.instance_ids[0, 0] == merged_ids[0]
+    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
 
 
 def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
@@ -217,13 +219,13 @@ def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None
 
 def test_the_likeliest_instance_that_counts_need_not_be_the_likeliest() -> None:
     evidence = blank()
-    evidence.instance_ids[0, 0], evidence.instance_value[0, 0] = [1, 5, 3, 2], [9, 4, 7, -1]
+    evidence.instance_ids[0], evidence.instance_value[0] = [1, 5, 3, 2], [9, 4, 7, -1]
     counts = np.ones(6, np.bool_)
-    assert best_counted_instance(evidence, 0, 0, counts) == 1
+    assert best_counted_instance(evidence, 0, counts) == 1
     counts[1] = False
-    assert best_counted_instance(evidence, 0, 0, counts) == 3
+    assert best_counted_instance(evidence, 0, counts) == 3
     counts[[3, 5]] = False
-    assert best_counted_instance(evidence, 0, 0, counts) == 0, "the rest is likelier than 2"
+    assert best_counted_instance(evidence, 0, counts) == 0, "the rest is likelier than 2"
 
 
 SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
@@ -241,37 +243,37 @@ SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2
 def test_the_other_rules(combine: Combine, weighed: bool, instance: int, label: int) -> None:
     evidence = blank()
     for ids, scores, classes in SEEN:
-        update_voxel(evidence, 0, 0, voted(ids, scores if weighed else [1.0], classes, combine), np.int32(0))
-    assert best_instance(evidence, 0, 0) == instance
-    assert best_class(evidence, 0, 0) == label
+        update_voxel(evidence, 0, voted(ids, scores if weighed else [1.0], classes, combine), np.int32(0))
+    assert best_instance(evidence, 0) == instance
+    assert best_class(evidence, 0) == label
 
 
 def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> None:
     evidence = blank()
-    update_voxel(evidence, 0, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), np.int32(0))
-    assert best_instance(evidence, 0, 0) == 2
-    assert best_class(evidence, 0, 0) == 5
-    assert (evidence.instance_ids[0, 0, 1:] == 0).all()
+    update_voxel(evidence, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), np.int32(0))
+    assert best_instance(evidence, 0) == 2
+    assert best_class(evidence, 0) == 5
+    assert (evidence.instance_ids[0, 1:] == 0).all()
 
 
 def test_counts_are_counts() -> None:
     evidence = blank()
     for _ in range(3):
-        assert update_voxel(evidence, 0, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0)) == 0
-    assert evidence.instance_value[0, 0].tolist() == [3, 0, 0, 0]
-    assert evidence.class_value[0, 0, 0] == 300, "units"
-    assert evidence.class_ids[0, 0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
+        assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0)) == 0
+    assert evidence.instance_value[0].tolist() == [3, 0, 0, 0]
+    assert evidence.class_value[0, 0] == 300, "units"
+    assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
 
 
 def test_small_numbers_saturate_and_do_not_wrap() -> None:
-    evidence = blank()._replace(class_value=np.zeros((1, 512, CLASS_SLOTS), np.int16))
+    evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(most_units=MOST_UNITS)
     gains = said.class_gain * 0
     gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
     for _ in range(40):
-        update_voxel(evidence, 0, 0, said._replace(class_gain=gains), np.int32(0))
-    assert evidence.class_value[0, 0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
-    assert best_class(evidence, 0, 0) == 2
+        update_voxel(evidence, 0, said._replace(class_gain=gains), np.int32(0))
+    assert evidence.class_value[0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
+    assert best_class(evidence, 0) == 2
 
 
 @pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
@@ -280,13 +282,13 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
     gains, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
-    evidence = blank()._replace(class_value=np.zeros((1, 512, CLASS_SLOTS), np.int16))
+    evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = measured([1], [0.9], p, 1.0, 1)._replace(
         class_gain=np.rint(64 * gains).astype(np.int64), named_classes=named, named_bit=bits, most_units=MOST_UNITS
     )
     for _ in range(1000):
-        update_voxel(evidence, 0, 0, said, np.int32(0))
-        assert best_class(evidence, 0, 0) == classes - 1
+        update_voxel(evidence, 0, said, np.int32(0))
+        assert best_class(evidence, 0) == classes - 1
 
 
 def test_too_many_classes_are_refused() -> None:
@@ -294,15 +296,74 @@ def test_too_many_classes_are_refused() -> None:
         EvidenceRows(VoxelGrid(0.01, 0.05, 10)).begin(256)
 
 
-def test_a_voxel_that_was_never_named_has_no_class_in_either_storage() -> None:
+def at_pixel(block: int, *voxels: int) -> SeenBlocks:
+    """A frame that sees these voxels of one block at the one pixel that there is."""
+    pixel = np.full((1, 512), -1, np.int32)
+    pixel[0, voxels] = 0
+    return SeenBlocks(np.array([block], np.int32), np.ones(1, np.bool_), pixel)
+
+
+def test_only_voxels_that_are_named_have_slots() -> None:
     for storage in Storage:
         rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
         rows.begin(6)
-        rows.voxels.allocate(np.zeros((1, 3), np.int32))
-        rows._add_rows(np.zeros(1, np.int32))
-        assert best_class(rows.evidence, 0, 0) == -1
-        update_voxel(rows.evidence, 0, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0))
-        assert best_class(rows.evidence, 0, 0) == 2
+        rows.voxels.allocate(np.array([[0, 0, 0], [1, 0, 0]], np.int32))
+        rows.update(at_pixel(1, 7), voted([0, 7], [1.0, 1.0], [3, 2], Combine.SUM))
+        labeled = np.flatnonzero(rows.evidence.labeled[0] >= 0)
+        assert labeled.tolist() == [7]
+        assert rows.voxels.grid.label_row[:2].tolist() == [-1, 0]
+        assert best_class(rows.evidence, rows.evidence.labeled[0, 7]) == 2
+        rows.update(at_pixel(0, 3), voted([0], [1.0], [3], Combine.SUM))
+        assert (rows.row_count, rows.voxel_count) == (1, 1), "nothing was said"
+        assert len(rows.in_use().class_ids) == 1
+
+
+@pytest.mark.parametrize("max_blocks", [4, 400])
+def test_many_blocks_are_updated_as_voxel_by_voxel(max_blocks: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pixels under no, one or several clusters, some without an instance; slots that have to grow, and some that need
+    not; whatever the order of the threads.
+    """
+    monkeypatch.setattr(evidence_module, "RESERVED", 1 if max_blocks == 4 else 128)
+    first, other = by_one_thread_and_two(lambda: _updated(max_blocks))
+    for one, two in zip(first, other, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def _updated(max_blocks: int) -> Evidence:
+    """The evidence of four blocks after a few frames, compared with each voxel's own."""
+    rng = np.random.default_rng(3)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, max_blocks))
+    rows.begin(6)
+    rows.voxels.allocate(np.array([[k, 0, 0] for k in range(4)], np.int32))
+    by_voxel: dict[tuple[int, int], Evidence] = {}
+    for _ in range(5):
+        instances = [0, 1, 2, int(rng.integers(3, 8))]
+        said = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
+        points = 12
+        cluster = rng.integers(0, 4, points).astype(np.int32)
+        pixel_of = rng.integers(0, 8, points)  # of 10 pixels, so that two are under none
+        first, following = np.full(10, -1, np.int32), np.full(points, -1, np.int32)
+        for p in reversed(range(points)):
+            following[p], first[pixel_of[p]] = first[pixel_of[p]], p
+        said = said._replace(first_point=first[None], next_point=following, cluster=cluster, absence=np.float32(-0.2))
+        blocks = rng.permutation(4)[:3].astype(np.int32)
+        seen = SeenBlocks(blocks, np.array([True, True, False]), rng.integers(-1, 10, (3, 512)).astype(np.int32))
+        rows.update(seen, said)
+        for a in range(2):
+            for n in range(512):
+                point = first[seen.near_pixel[a, n]] if seen.near_pixel[a, n] >= 0 else -1
+                key, p, named = (int(blocks[a]), n), point, False
+                while p >= 0:
+                    named, p = named or bool(said.instance_id[cluster[p]]), following[p]
+                if seen.near_pixel[a, n] >= 0 and (named or key in by_voxel):
+                    update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(point))
+    evidence = rows.in_use()
+    assert len(by_voxel) == rows.voxel_count > 100
+    for (block, n), own in by_voxel.items():
+        voxel = evidence.labeled[rows.voxels.grid.label_row[block], n]
+        for name in SLOTS:
+            np.testing.assert_array_equal(getattr(evidence, name)[voxel], getattr(own, name)[0], err_msg=name)
+    return evidence
 
 
 def test_exact_storage_never_forgets() -> None:
@@ -311,19 +372,17 @@ def test_exact_storage_never_forgets() -> None:
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
     rows.begin(30)
     rows.voxels.allocate(np.zeros((1, 3), np.int32))
-    rows._add_rows(np.zeros(1, np.int32))
     class_log, instance_log = np.zeros(30), np.zeros(21)
     for _ in range(100):
         ids = rng.choice(np.arange(1, 21), 3, replace=False)
         p = np.array([distribution(rng, 30) for _ in ids])
-        rows._make_room_for_instances(len(ids))
-        measurement = measured(ids.tolist(), [0.9] * 3, p, 1.0, 20)
-        assert update_voxel(rows.evidence, 0, 0, measurement, np.int32(0)) == 0
+        rows.update(at_pixel(0, 5), measured(ids.tolist(), [0.9] * 3, p, 1.0, 20))
+        assert rows.evicted == 0
         class_log += np.log(p).sum(axis=0)
         instance_log[ids] += np.log(0.9 / FLOOR)
-    labels, values = rows.evidence.class_ids[0, 0], rows.evidence.class_value[0, 0] / UNITS
+    labels, values = rows.evidence.class_ids[0], rows.evidence.class_value[0] / UNITS
     assert sorted(labels.tolist()) == list(range(30))
     assert np.allclose(values - values[0], class_log[labels] - class_log[labels[0]], atol=1e-2)
-    named = rows.evidence.instance_ids[0, 0] > 0
-    assert np.allclose(rows.evidence.instance_value[0, 0][named], instance_log[rows.evidence.instance_ids[0, 0][named]])
+    named = rows.evidence.instance_ids[0] > 0
+    assert np.allclose(rows.evidence.instance_value[0][named], instance_log[rows.evidence.instance_ids[0][named]])
     assert named.sum() == 20
