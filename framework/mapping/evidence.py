@@ -91,16 +91,15 @@ class Measurement(NamedTuple):
     instance_gain: Float32  # (N,) for that instance, over any other
     absence: np.float32  # not above 0, for an instance matched in this frame but not seen here
     matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
-    class_gain: Int64  # (N, C) units, for each class, over those that the cluster does not name
+    class_said: Int64  # (N, NO_CLASS + 1) for each class and for none, see class_said()
     named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
-    named_bit: UInt8  # (N, NO_CLASS) bit m of a cluster's m-th named class, 0 of the classes that it does not name
     combine: int  # Combine
     most_units: int  # that a class may have
 
 
 def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8, UInt8]:
-    """What clusters say of classes, evidence (N, C), as a Measurement has it: (class_gain (N, C), named_classes,
-    named_bit).
+    """What clusters say of classes, evidence (N, C): (gains (N, C), named_classes, named_bit), the latter two as a
+    Measurement has them.
 
     Of log-likelihoods a cluster names its NEW_CLASSES best classes, and the others share the mean of what is left;
     otherwise it names its best one, and for those that it does not name it says nothing.
@@ -117,10 +116,19 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
         else:  # none is left: what is common to all classes says nothing
             mean = rest.min(axis=1, keepdims=True, initial=1.0)
         gains = evidence - np.log(np.maximum(mean, 1e-6))
-    bits = np.zeros((len(evidence), NO_CLASS), np.uint8)
+    bits = np.zeros((len(evidence), NO_CLASS + 1), np.uint8)
     np.put_along_axis(bits, named, np.uint8(1) << np.arange(names, dtype=np.uint8)[None], axis=1)
     again = np.repeat(named[:, :1], NEW_CLASSES - names, axis=1)  # names the first one again, which changes nothing
     return gains, np.concatenate([named, again], axis=1).astype(np.uint8), bits
+
+
+def class_said(gains: Float64, units: int, named_bit: UInt8) -> Int64:
+    """What clusters say of each class in one number, so that a voxel looks up one: the `gains` (N, C) over those that
+    the cluster does not name, in whole units, times 2^NEW_CLASSES, and in the lowest bits the class's `named_bit`.
+    """
+    said = named_bit.astype(np.int64)
+    said[:, : gains.shape[1]] += np.rint(gains * units).astype(np.int64) << NEW_CLASSES
+    return said
 
 
 @device
@@ -204,6 +212,67 @@ def best_first(labels, values, free):
 
 
 @device
+def _rank(label, value):
+    """Orders classes by their units, those of as many by their number, and free slots behind all."""
+    return np.int64(value) * np.int64(NO_CLASS + 1) - np.int64(label) if label != NO_CLASS else np.int64(-(1 << 62))
+
+
+@device
+def best_class_first(classes, units):
+    """best_first() of class slots, which are many: without a branch, until one is found to be out of place."""
+    best = _rank(classes[0], units[0])
+    for s in range(1, len(classes)):
+        best = max(best, _rank(classes[s], units[s]))
+    for s in range(1, len(classes) if best != _rank(classes[0], units[0]) else 0):
+        if _rank(classes[s], units[s]) == best:
+            classes[0], classes[s] = classes[s], classes[0]
+            units[0], units[s] = units[s], units[0]
+            break
+
+
+@device
+def sum_classes(classes, units, measurement, k):
+    """Adds what cluster k says to the class slots of a voxel.
+
+    Returns the number of evictions.
+    """
+    most = measurement.most_units
+    known = 0  # bits of the named classes that have a slot
+    filled = 0
+    too_much = np.int64(0)
+    for s in range(len(classes)):  # without a branch, so that it is vectorised
+        said = measurement.class_said[k, classes[s]]
+        value = max(units[s] + (said >> NEW_CLASSES), -most)
+        units[s] = value
+        too_much = max(too_much, value - most)
+        known |= said & ALL_NAMED
+        filled += classes[s] != NO_CLASS
+    for s in range(filled if too_much > 0 else 0):  # the distances stay, and with them the likeliest class
+        units[s] = max(units[s] - too_much, -most)
+    evicted = 0
+    for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
+        label = measurement.named_classes[k, m]
+        if m > 0 and label == measurement.named_classes[k, 0]:
+            break
+        if (known >> m) & 1:
+            continue
+        gain = measurement.class_said[k, label] >> NEW_CLASSES
+        least = filled
+        if filled == len(classes):
+            evicted += 1
+            least = 0
+            for s in range(1, len(classes)):
+                least = s if units[s] < units[least] else least
+            if units[least] >= gain:
+                continue  # the newcomer is itself the least likely: it is the one that is dropped
+        else:
+            filled += 1
+        classes[least] = label
+        units[least] = gain
+    return evicted
+
+
+@device
 def update_voxel(evidence, voxel, measurement, point):
     """Both recursions for one labelled voxel, seen at a pixel whose list of cluster points starts at `point`, -1 =
     empty.
@@ -235,27 +304,17 @@ def update_voxel(evidence, voxel, measurement, point):
         evicted += add_evidence(
             ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
         )
-        known = 0  # bits of the named classes that have a slot
-        too_much = np.int64(0)
-        for s in range(len(classes) if combine == SUM else 0):
-            if classes[s] == NO_CLASS:
-                break  # slots are filled from the front
-            value = max(class_values[s] + measurement.class_gain[k, classes[s]], -measurement.most_units)
-            class_values[s] = value
-            too_much = max(too_much, value - measurement.most_units)
-            known |= measurement.named_bit[k, classes[s]]
-        for s in range(len(classes) if too_much > 0 else 0):  # the distances stay, and with them the likeliest class
-            if classes[s] != NO_CLASS:
-                class_values[s] = max(class_values[s] - too_much, -measurement.most_units)
-        for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
-            label = measurement.named_classes[k, m]
-            if m > 0 and label == measurement.named_classes[k, 0]:
-                break
-            if not (known >> m) & 1:
-                gain = measurement.class_gain[k, label]
+        if combine == SUM:
+            evicted += sum_classes(classes, class_values, measurement, k)
+        else:
+            for m in range(NEW_CLASSES):
+                label = measurement.named_classes[k, m]
+                if m > 0 and label == measurement.named_classes[k, 0]:
+                    break
+                gain = measurement.class_said[k, label] >> NEW_CLASSES
                 evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
     best_first(ids, id_values, 0)
-    best_first(classes, class_values, NO_CLASS)
+    best_class_first(classes, class_values)
     return evicted
 
 
@@ -286,13 +345,18 @@ def _count_new(grid, seen, evidence, measurement, first_point, new):
         new[a] = 0
         if seen.near[a]:
             pixels = seen.near_pixel[a]
+            labeled = evidence.labeled[max(grid.label_row[seen.blocks[a]], np.int32(0))]
+            none = grid.label_row[seen.blocks[a]] < 0
             under = np.int32(0)
-            for n in range(BLOCK_VOXELS):  # without a branch, so that it is vectorised: most blocks are under none
+            for n in range(
+                BLOCK_VOXELS
+            ):  # without a branch, so that it is vectorised: most have slots or are under none
                 pixel = pixels[n]
-                under = one_more(under, (pixel >= 0) & (first_point[max(pixel, np.int32(0))] >= 0))
+                over_points = (pixel >= 0) & (first_point[max(pixel, np.int32(0))] >= 0)
+                under = one_more(under, over_points & (none | (labeled[n] < 0)))
             for n in range(BLOCK_VOXELS if under > 0 else 0):
                 pixel = pixels[n]
-                if pixel >= 0 and labeled_voxel(grid, evidence, seen.blocks[a], n) < 0:
+                if pixel >= 0 and (none or labeled[n] < 0):
                     new[a] = one_more(new[a], _is_named(measurement, first_point[pixel]))
 
 

@@ -11,7 +11,7 @@ from framework.data import Bool, Float32, Float64, PointClusters
 from framework.errors import ConfigError
 from framework.interfaces import SceneMap
 from framework.mapping.association import Matches, class_agreement
-from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, named_classes
+from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, class_said, named_classes
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instance_table import InstanceTable
@@ -121,9 +121,8 @@ class LabeledVoxels:
             instance_gain=evidence.instances,
             absence=np.float32(evidence.absence),
             matched=matched,
-            class_gain=np.rint(class_gain * units).astype(np.int64),
+            class_said=class_said(class_gain, units, bits),
             named_classes=named,
-            named_bit=bits,
             combine=int(rule.combine),
             most_units=MOST_UNITS if compact else 1 << 62,
         )

@@ -56,7 +56,7 @@ class MaskClasses(NamedTuple):
     log_ratio: Float32  # (N, C) log P(class) / P(background)
     rest: Float32  # (N,) the same of the mean of the classes that a cluster does not name
     named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
-    named_bit: UInt8  # (N, NO_CLASS) bit m of a cluster's m-th named class, 0 of the classes that it does not name
+    named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 of the classes that it does not name
     frame: int  # its index
 
 

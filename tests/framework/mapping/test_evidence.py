@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 from framework.errors import DataError
 from framework.mapping import evidence as evidence_module
 from framework.mapping.evidence import (
+    ALL_NAMED,
     CLASS_SLOTS,
     INSTANCE_SLOTS,
     MOST_GAIN,
@@ -24,6 +25,7 @@ from framework.mapping.evidence import (
     best_class,
     best_counted_instance,
     best_instance,
+    class_said,
     named_classes,
     update_voxel,
 )
@@ -67,9 +69,8 @@ def measured(
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
         matched,
-        np.rint(gains * UNITS).astype(np.int64),
+        class_said(gains, UNITS, bits),
         named,
-        bits,
         int(Combine.SUM),
         1 << 62,
     )
@@ -83,9 +84,8 @@ def voted(ids: list[int], weights: list[float], classes: list[int], combine: Com
     every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
     return every._replace(
         instance_gain=np.array(weights, np.float32),
-        class_gain=np.rint(gains * 100).astype(np.int64),
+        class_said=class_said(gains, 100, bits),
         named_classes=named,
-        named_bit=bits,
         combine=int(combine),
     )
 
@@ -268,10 +268,11 @@ def test_counts_are_counts() -> None:
 def test_small_numbers_saturate_and_do_not_wrap() -> None:
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(most_units=MOST_UNITS)
-    gains = said.class_gain * 0
+    gains = np.zeros((2, 6))
     gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
+    bits = (said.class_said & ALL_NAMED).astype(np.uint8)
     for _ in range(40):
-        update_voxel(evidence, 0, said._replace(class_gain=gains), np.int32(0))
+        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits)), np.int32(0))
     assert evidence.class_value[0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
     assert best_class(evidence, 0) == 2
 
@@ -284,7 +285,7 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
     gains, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = measured([1], [0.9], p, 1.0, 1)._replace(
-        class_gain=np.rint(64 * gains).astype(np.int64), named_classes=named, named_bit=bits, most_units=MOST_UNITS
+        class_said=class_said(gains, 64, bits), named_classes=named, most_units=MOST_UNITS
     )
     for _ in range(1000):
         update_voxel(evidence, 0, said, np.int32(0))

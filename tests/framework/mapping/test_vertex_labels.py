@@ -54,9 +54,10 @@ def slow_election(fuser: BayesianTsdf, counts: np.ndarray, vertex: np.ndarray) -
         if abs(float(grid.tsdf[block, n]) * grid.tsdf_unit) > REACH * scene.volume.voxel_size:
             continue
         best, most, label, row = 0, 0.0, -1, int(grid.label_row[block])
-        if row >= 0:
-            label = int(evidence.class_ids[row, n, 0])
-            for instance, value in zip(evidence.instance_ids[row, n], evidence.instance_value[row, n], strict=True):
+        labeled = int(evidence.labeled[row, n]) if row >= 0 else -1
+        if labeled >= 0:
+            label = int(evidence.class_ids[labeled, 0])
+            for instance, value in zip(evidence.instance_ids[labeled], evidence.instance_value[labeled], strict=True):
                 if instance > 0 and counts[instance] and value > most:
                     best, most = int(instance), float(value)
         votes[best] = votes.get(best, 0.0) + share
