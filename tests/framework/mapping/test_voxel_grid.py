@@ -5,7 +5,8 @@ import pytest
 from numba import njit
 
 from framework.errors import MapFullError
-from framework.mapping.voxel_grid import UNSEEN, VoxelGrid, find_block
+from framework.mapping import voxel_grid
+from framework.mapping.voxel_grid import UNSEEN, VoxelGrid, find_block, reserved
 
 
 @njit
@@ -32,7 +33,10 @@ def test_every_block_is_found_by_its_coordinates_and_no_other() -> None:
     assert (look_up(voxels.grid, absent) == -1).all()
 
 
-def test_growing_keeps_what_is_stored() -> None:
+@pytest.mark.parametrize("promised", [64, 100_000])
+def test_growing_keeps_what_is_stored(promised: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system promises memory for all blocks, nothing need be copied; some promise less."""
+    monkeypatch.setattr(voxel_grid, "reserved", lambda most, make: make(min(most, promised)))
     voxels = VoxelGrid(0.01, 0.05, 100_000)
     voxels.allocate(np.zeros((1, 3), np.int32))
     voxels.grid.tsdf[0, 7] = 123
@@ -40,6 +44,18 @@ def test_growing_keeps_what_is_stored() -> None:
     assert voxels.block_count == 8000
     assert voxels.grid.tsdf[0, 7] == 123
     assert (voxels.grid.tsdf[1:8000] == UNSEEN).all()
+
+
+def test_less_is_reserved_where_less_is_promised() -> None:
+    def make(length: int) -> int:
+        if length > 3000:
+            raise MemoryError
+        return length
+
+    assert reserved(2000, make) == 2000
+    assert reserved(10_000, make) == 2500
+    with pytest.raises(MemoryError):
+        reserved(10_000, lambda _: make(3001))
 
 
 def test_the_budget_is_an_error_that_names_the_setting() -> None:

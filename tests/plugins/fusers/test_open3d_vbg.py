@@ -335,7 +335,7 @@ def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path)
         with pytest.raises(DataError, match=r"map\.npz"):
             Open3DMap.load(path)
     BayesianTsdf().scene.save(path)
-    with pytest.raises(DataError, match="map format 6, this version reads open3d_vbg"):
+    with pytest.raises(DataError, match="map format 7, this version reads open3d_vbg"):
         Open3DMap.load(path)
     with pytest.raises(DataError, match=r"none\.npz"):
         Open3DMap.load(tmp_path / "none.npz")
