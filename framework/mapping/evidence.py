@@ -424,6 +424,7 @@ class EvidenceRows:
         self.row_count = 0
         self.voxel_count = 0  # with slots
         self.evicted = 0  # slots given to another label so far
+        self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
         self.evidence = self._free()
 
@@ -438,9 +439,16 @@ class EvidenceRows:
         return Evidence(self.evidence.labeled[: self.row_count], **slots)
 
     def fill(self, saved: Evidence) -> None:
-        """Takes the evidence of a saved map for its own."""
-        self.evidence = saved
-        self.row_count, self.voxel_count = len(saved.labeled), len(saved.instance_ids)
+        """Takes over the evidence of a saved map, or its own with fewer slots for instances."""
+        self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
+        self.evidence = self._free()
+        self._reserve(len(saved.labeled), len(saved.instance_ids))
+        own = self.in_use()
+        own.labeled[:] = saved.labeled
+        for name in SLOTS:
+            array, given = getattr(own, name), getattr(saved, name)
+            array[:, : given.shape[1]] = given
+            array[:, given.shape[1] :] = 0
 
     def begin(self, classes: int) -> None:
         """Says how many classes there are, before the first update. Raises DataError when they are too many."""
@@ -478,8 +486,8 @@ class EvidenceRows:
 
     def _free_slots(self, voxels: int) -> dict[str, Any]:
         return {
-            "instance_ids": np.empty((voxels, INSTANCE_SLOTS), np.int32),
-            "instance_value": np.empty((voxels, INSTANCE_SLOTS), np.float32),
+            "instance_ids": np.empty((voxels, self._instance_slots), np.int32),
+            "instance_value": np.empty((voxels, self._instance_slots), np.float32),
             "class_ids": np.empty((voxels, self._class_slots), np.uint8),
             "class_value": np.empty(
                 (voxels, self._class_slots), np.int16 if self.storage is Storage.COMPACT else np.int64
@@ -497,8 +505,14 @@ class EvidenceRows:
         Returns (A,) the number of each block's first new voxel.
         """
         without = blocks[(new > 0) & (self.voxels.grid.label_row[blocks] < 0)]
-        last_new = self.voxel_count + np.cumsum(new)
-        rows, voxels = self.row_count + len(without), int(last_new[-1]) if len(last_new) else self.voxel_count
+        rows, first_new = self.row_count, self.voxel_count + np.cumsum(new) - new
+        self._reserve(rows + len(without), self.voxel_count + int(new.sum()))
+        self.evidence.labeled[rows : self.row_count] = -1
+        self.voxels.grid.label_row[without] = np.arange(rows, self.row_count, dtype=np.int32)
+        return np.asarray(first_new, np.int32)
+
+    def _reserve(self, rows: int, voxels: int) -> None:
+        """Has so many rows and voxels in use; the new ones hold anything."""
         if rows > len(self.evidence.labeled):
             longer = grown(self.evidence.labeled, max(rows, 2 * len(self.evidence.labeled)))
             self.evidence = self.evidence._replace(labeled=longer)
@@ -506,21 +520,15 @@ class EvidenceRows:
             capacity = max(voxels, 2 * len(self.evidence.instance_ids))
             slots = {name: grown(getattr(self.evidence, name), capacity) for name in SLOTS}
             self.evidence = self.evidence._replace(**slots)
-        self.evidence.labeled[self.row_count : rows] = -1
-        self.voxels.grid.label_row[without] = np.arange(self.row_count, rows, dtype=np.int32)
         self.row_count, self.voxel_count = rows, voxels
-        return np.asarray(last_new - new, np.int32)
 
     def _make_room_for_instances(self, new: int) -> None:
         """Doubles the slots until every voxel has `new` free ones."""
-        slots = self.evidence.instance_ids.shape[1]
-        missing = new - int(_fewest_free(self.evidence.instance_ids[: self.voxel_count]))
+        slots = self._instance_slots
+        missing = new - int(_fewest_free(self.in_use().instance_ids))
         while missing > 0:
             missing -= slots
             slots *= 2
-        added = ((0, 0), (0, slots - self.evidence.instance_ids.shape[1]))
-        if added[1][1]:
-            self.evidence = self.evidence._replace(
-                instance_ids=np.pad(self.evidence.instance_ids, added),
-                instance_value=np.pad(self.evidence.instance_value, added),
-            )
+        if slots > self._instance_slots:
+            self._instance_slots = slots
+            self.fill(self.in_use())
