@@ -111,6 +111,7 @@ class Recording(RGBDSequence):
             camera=self.camera,
             T_world_camera=recorded.T_world_camera,
             truth=self.truth_in(index),
+            up=recorded.up,
         )
 
     def metric_depth(self, index: int) -> Float32:
