@@ -1,9 +1,11 @@
 """Which way is up, by sensors or else by the surface of a room and how the camera was held; how high the floor is.
 
 What sensors told is up, whatever the surface is: the mean over all frames, in which an accelerometer's changes of
-velocity are none. With noise of 0.5 to 3 degrees in each frame it is 0.05 to 0.8 degrees off in the videos below, of 40
-to 123 frames; with noise and a constant bias of 1 degree each 0.1 to 0.9; with one of 2 degrees up to 1.6. Refined by
-surfaces nearby, it would be as far off as they are alone: better in made-up rooms, and worse in most real ones.
+velocity are none. Simulated from the true poses, with noise of 0.5 to 3 degrees in each frame, it is 0.05 to 0.8
+degrees off in the videos below, of 40 to 123 frames; with noise and a constant bias of 1 degree each 0.1 to 0.9; with
+one of 2 degrees up to 1.6. Surfaces do not refine it: in made-up rooms they would make good a bias of half a degree
+and more, in real ones nobody can tell, where floor and ceiling themselves are 1 degree off the world's axis (flat),
+and over a slanted table they would do harm.
 
 Rooms have floors, tables and walls: up is the direction that most of the surface is perpendicular to or along, near to
 where the images' upper edges pointed on average, for these tell walls from floors, as does what faces up. Angles to the
