@@ -155,19 +155,21 @@ class Mapper(Map):
         pose: Float64 | None = None,
         camera: Camera | None = None,
         timestamp: float | None = None,
+        up: Float64 | None = None,
     ) -> Added:
         """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
 
         `color` (H, W, 3) is uint8 RGB, `depth` (H, W) float32 m along z, 0 = no reading, `pose` (4, 4) T_world_camera
         where it is known, `camera` that of the last frame where none is given, `timestamp` s, 30 frames a second where
-        none is given; or `color` is a Frame, with all of that.
+        none is given, `up` (3,) the unit vector against gravity in the camera where a sensor tells it; or `color` is a
+        Frame, with all of that.
 
         A frame that is lost was not fused, and the next ones may be found again. Raises FrameError when the frame
         cannot be used, as one without a pose where poses are given, which leaves the map as it was, DataError for
         arrays that are no frame, and MapFullError at the end of `fuser.max_blocks`.
         """
         with self.lock:
-            frame = color if isinstance(color, Frame) else self._frame(color, depth, pose, camera, timestamp)
+            frame = color if isinstance(color, Frame) else self._frame(color, depth, pose, camera, timestamp, up)
             self._camera = frame.camera
             self._frames += 1
             self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
@@ -187,6 +189,7 @@ class Mapper(Map):
         pose: Float64 | None,
         camera: Camera | None,
         timestamp: float | None,
+        up: Float64 | None,
     ) -> Frame:
         camera = camera or self._camera
         if depth is None:
@@ -194,7 +197,7 @@ class Mapper(Map):
         if camera is None:
             raise DataError("Mapper.add needs the camera once: camera=Camera(width, height, fx, fy, cx, cy)")
         when = self._frames / FRAME_RATE if timestamp is None else timestamp
-        return Frame(self._frames, when, color, depth, camera, pose)
+        return Frame(self._frames, when, color, depth, camera, pose, up=up)
 
     def at_pixel(
         self, u: int, v: int, camera: Camera | None = None, T_world_camera: Float64 | None = None

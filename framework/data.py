@@ -43,6 +43,7 @@ ROTATION_TOLERANCE = 1e-3  # largest entry of |R R^T - I| that still counts as r
 MOST_PIXELS = 2**25  # of an image: 8K video
 WIDEST = 10.0  # m sideways for each m of depth, that a camera sees: 168 degrees; no lens without distortion has more
 LONGEST_FOCAL_LENGTH = 1e6  # px
+UNIT_TOLERANCE = 1e-3  # largest | |v| - 1 | of a unit vector
 PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
 
 
@@ -160,6 +161,7 @@ class Frame:
     camera: Camera
     T_world_camera: Float64 | None = None  # (4, 4) ground truth
     truth: FrameTruth | None = None
+    up: Float64 | None = None  # (3,) unit vector against gravity, in the camera, by a sensor; None = none tells
 
     def __post_init__(self) -> None:
         index, camera = cast(object, self.index), cast(object, self.camera)  # whatever a caller gave
@@ -176,6 +178,10 @@ class Frame:
             raise DataError(f"{where}depth must be 0 or positive, found {self.depth.min()} m")
         if self.T_world_camera is not None:
             check_rigid(where + "T_world_camera", self.T_world_camera)
+        if self.up is not None:
+            check_array(where + "up", self.up, (3,), np.float64)
+            if abs(np.linalg.norm(self.up) - 1) > UNIT_TOLERANCE:
+                raise DataError(f"{where}up must be a unit vector, found one of length {np.linalg.norm(self.up):.4g}")
         # the kernels are compiled for this; a view such as bgr[..., ::-1], or what is read only, is copied
         object.__setattr__(self, "color", np.require(self.color, requirements=("C", "W")))
         object.__setattr__(self, "depth", np.require(self.depth, requirements=("C", "W")))

@@ -211,6 +211,17 @@ class SceneMap(ABC):
         """The unit vector (3,) against gravity in the world, None where the map does not tell."""
         return None
 
+    @property
+    def up_is_sensed(self) -> bool:
+        """Whether `up` is what a sensor told of the frames, and not found in the surface."""
+        return False
+
+    def up_from(self) -> str:
+        """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
+        if self.up() is None:
+            return ""
+        return "sensor" if self.up_is_sensed else "surfaces"
+
     @abstractmethod
     def instances(self) -> Mapping[int, Instance]:
         """The objects found so far, by id. Vertex indices refer to `mesh()` of the same map."""

@@ -97,11 +97,16 @@ class Map:
             return self.scene.instances().get(seen)
 
     def up(self) -> Float64 | None:
-        """The unit vector (3,) against gravity in the world, by floor, walls and how the camera was held; boxes (`obb`)
-        stand along it. None where the map does not tell.
+        """The unit vector (3,) against gravity in the world, by a sensor where frames have `up`, else by floor, walls
+        and how the camera was held; boxes (`obb`) stand along it. None where the map does not tell.
         """
         with self.lock:
             return self.scene.up()
+
+    def up_from(self) -> str:
+        """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
+        with self.lock:
+            return self.scene.up_from()
 
     def floor(self) -> float | None:
         """m along `up`, how high the floor is: a point is `point @ up - floor` above it. None where it was not seen."""

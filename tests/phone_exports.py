@@ -122,14 +122,18 @@ def room_frames(count: int = 4) -> list[PhoneFrame]:
     return frames
 
 
-def check_imported(folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1) -> None:
-    """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, colour and depth."""
+def check_imported(
+    folder: Path, frames: Sequence[PhoneFrame], scale: float = 1.0, least: int = 1, tells_up: bool = True
+) -> None:
+    """The folder, read as it is mapped, shows the room where it is: size, intrinsics, poses, up, colour and depth."""
     sequence = RgbdFolder(folder)
     assert sequence.camera == frames[0].camera.scaled(scale)
     assert len(sequence) == len(frames)
     for frame, seen in zip(frames, sequence, strict=True):
         assert seen.timestamp == pytest.approx(frame.timestamp, abs=1e-6)
         np.testing.assert_allclose(seen.T_world_camera, frame.T_world_camera, atol=1e-6)
+        if tells_up:
+            np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)  # ARKit's
         depth, _, color, ids = look(sequence.camera, frame.T_world_camera)
         rows = 240 * scale * np.array([0, 10, 20]) / 60
         unsure = np.zeros(depth.shape, bool)

@@ -13,7 +13,7 @@ import numpy as np
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float64
@@ -22,6 +22,7 @@ from tests.phone_exports import ROOM, T_COLOR_DEPTH
 from tests.scenes.corner_room import look, pose_at
 
 START = 1_600_000_000  # s
+TF_MESSAGE = "tf2_msgs/msg/TFMessage"
 COUNT = 4
 DEPTH_LATE = 0.004  # s, of each depth image after its colour image
 
@@ -35,6 +36,8 @@ class BagWriter:
 
     def __post_init__(self) -> None:
         self.types = get_typestore(Stores.ROS1_NOETIC if self.ros1 else Stores.ROS2_HUMBLE)
+        if self.ros1:  # tf2_msgs is in no distribution's store
+            self.types.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_MESSAGE))
 
     def made(self, name: str, **fields: Any) -> Any:
         return self.types.types[name](**fields)
@@ -120,14 +123,43 @@ class BagWriter:
             twist=self.made("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
         )
 
-    def add_transform(self, topic: str, T: Float64) -> None:
+    def vector(self, values: Float64) -> Any:
+        return self.made("geometry_msgs/msg/Vector3", **dict(zip("xyz", values.tolist(), strict=True)))
+
+    def transform(self, T: Float64) -> dict[str, Any]:
         q = Rotation.from_matrix(T[:3, :3]).as_quat()
+        rotation = self.made("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q.tolist(), strict=True)))
+        return {"translation": self.vector(T[:3, 3]), "rotation": rotation}
+
+    def add_transform(self, topic: str, T: Float64) -> None:
+        self.add(START, topic, "geometry_msgs/msg/Transform", **self.transform(T))
+
+    def add_static(self, *transforms: tuple[str, str, Float64]) -> None:
+        """Parent, child and T_parent_child of each."""
+        stamped = [
+            self.made(
+                "geometry_msgs/msg/TransformStamped",
+                header=self.header(START, parent),
+                child_frame_id=child,
+                transform=self.made("geometry_msgs/msg/Transform", **self.transform(T)),
+            )
+            for parent, child, T in transforms
+        ]
+        self.add(START, "/tf_static", TF_MESSAGE, transforms=stamped)
+
+    def add_imu(self, time: float, topic: str, acceleration: Float64, frame_id: str) -> None:
+        unknown = np.zeros(9)
         self.add(
-            START,
+            time,
             topic,
-            "geometry_msgs/msg/Transform",
-            translation=self.made("geometry_msgs/msg/Vector3", **dict(zip("xyz", T[:3, 3].tolist(), strict=True))),
-            rotation=self.made("geometry_msgs/msg/Quaternion", **dict(zip("xyzw", q.tolist(), strict=True))),
+            "sensor_msgs/msg/Imu",
+            header=self.header(time, frame_id),
+            orientation=self.made("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=0.0, w=1.0),
+            orientation_covariance=unknown,
+            angular_velocity=self.vector(np.zeros(3)),
+            angular_velocity_covariance=unknown,
+            linear_acceleration=self.vector(acceleration),
+            linear_acceleration_covariance=unknown,
         )
 
     def write(self, path: Path) -> Path:

@@ -53,7 +53,7 @@ def fit(pairs: Sequence[MatchedPair], reading: PoseReading, depth_factor: float 
     """The error of a reading of the pairs' poses, which are known; without a factor, with the one that fits best."""
     moves = [motion_of(pair, reading) for pair in pairs]
     factor, within = (depth_factor, 1.0) if depth_factor else _depth_factor(pairs, moves)
-    errors = np.array([_error(pair, move, factor) for pair, move in zip(pairs, moves, strict=True)])
+    errors = np.array([error_of(pair, move, factor) for pair, move in zip(pairs, moves, strict=True)])
     return PoseFit(reading, factor, errors, within)
 
 
@@ -62,6 +62,11 @@ def motion_of(pair: MatchedPair, reading: PoseReading) -> Float64:
     T_world_first, T_world_second = pair.first.T_world_camera, pair.second.T_world_camera
     assert T_world_first is not None
     assert T_world_second is not None
+    return motion_between(T_world_first, T_world_second, reading)
+
+
+def motion_between(T_world_first: Float64, T_world_second: Float64, reading: PoseReading) -> Float64:
+    """T_second_first (4, 4) by two stored poses."""
     return inverse(reading.pose(T_world_second)) @ reading.pose(T_world_first)
 
 
@@ -79,8 +84,8 @@ def _depth_factor(pairs: Sequence[MatchedPair], moves: Sequence[Float64]) -> tup
     return float(np.exp(middle)), float(np.exp(UNCERTAIN + 3 * spread / np.sqrt(len(ratios))))
 
 
-def _error(pair: MatchedPair, T_second_first: Float64, factor: float) -> float:
-    """px"""
+def error_of(pair: MatchedPair, T_second_first: Float64, factor: float) -> float:
+    """px that a motion (4, 4) leaves, the median over the points, where all depths are multiplied by a factor."""
     moved = transform(T_second_first, pair.points_first.astype(np.float64) * factor)
     farthest = UNSEEN * pair.second.camera.width
     with np.errstate(all="ignore"):

@@ -12,6 +12,7 @@ import numpy as np
 from framework.checking import pose_fit, registration
 from framework.checking.finding import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair, Matcher
+from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgement
 from framework.checking.registration import Agreement, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
@@ -44,6 +45,7 @@ class RecordingCheck:
     by_delay: tuple[Agreement, ...]
     poses: PoseJudgement
     pair: MatchedPair | None  # of stored poses, which a picture shows
+    meant: MatchedPair | None  # the same with the poses that belong to its frames
 
     @property
     def faults(self) -> tuple[Finding, ...]:
@@ -59,7 +61,7 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     delay = sequence.depth_reading.depth_delay if isinstance(sequence, Recording) else 0
     if isinstance(sequence, Recording):
         # as it is stored: readings that are too far, and poses that another reading turns
-        sequence = replace(sequence, pose_reading=PoseReading(), max_depth=0.0)
+        sequence = replace(sequence, pose_reading=PoseReading(pose_delay=asked.pose_delay), max_depth=0.0)
     count = len(sequence)
     chosen = [int(k) for k in np.unique(np.linspace(0, count - 1, LOOKED_AT).round())]
     frames, unreadable = _read(sequence, chosen)
@@ -74,18 +76,53 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     pairs = list(matcher.pairs(starts))
     posed = [pair for pair in pairs if _posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
-        judgement = pose_fit.judge(posed, asked, _scale_of(sequence), median_depth)
+        judgement, pose_delay = _judge_poses(sequence, posed, asked, median_depth)
     else:
         judgement = PoseJudgement(
             (Finding(Verdict.FINE, "poses", "none are given: the camera is tracked"),), None, None
         )
+        pose_delay = 0
     if not any(finding.subject == "depth" for finding in judgement.findings):  # poses know it better
         findings.append(of_depth)
     findings += [*judgement.findings, of_registration, _steps(matcher, starts), _sharpness(frames), *_times(sequence)]
     shown = min(
         posed or pairs, key=lambda pair: abs(pair.motion - SHOWN_MOTION * pair.first.camera.width), default=None
     )
-    return RecordingCheck(tuple(findings), _summary(sequence, frames), tuple(frames), tuple(by_delay), judgement, shown)
+    meant = delayed(shown, _stored_poses(sequence), pose_delay) if shown is not None and pose_delay else shown
+    return RecordingCheck(
+        tuple(findings), _summary(sequence, frames), tuple(frames), tuple(by_delay), judgement, shown, meant
+    )
+
+
+def _judge_poses(
+    sequence: RGBDSequence, pairs: Sequence[MatchedPair], asked: PoseReading, median_depth: float
+) -> tuple[PoseJudgement, int]:
+    """What the pairs say of the poses, and by how many frames these are late."""
+    given, scale = replace(asked, pose_delay=0), _scale_of(sequence)
+    judgement = pose_fit.judge(pairs, given, scale, median_depth)
+    if judgement.given is None or judgement.best is None:
+        return judgement, 0
+    poses = _stored_poses(sequence)
+    fits = [judgement.given, judgement.best, replace(judgement.given, depth_factor=judgement.best.depth_factor)]
+    late = find_delay(pairs, poses, fits)
+    if late is None:
+        return judgement, 0
+    meant = [delayed(pair, poses, late.frames) for pair in pairs]
+    then = pose_fit.judge([pair for pair in meant if _posed(pair)], given, scale, median_depth)
+    others = [finding for finding in then.findings if finding.verdict is not Verdict.FINE]
+    findings = (late.finding(asked.pose_delay, _step(sequence)), *others)
+    return replace(then, findings=findings, given=judgement.given), late.frames
+
+
+def _step(sequence: RGBDSequence) -> float:
+    """s, from one frame of a recording to the next, chosen or not."""
+    assert isinstance(sequence, Recording)
+    return float(np.median(np.diff([recorded.timestamp for recorded in sequence.contents.frames])))
+
+
+def _stored_poses(sequence: RGBDSequence) -> Sequence[Float64 | None]:
+    """Those of all frames of a recording, chosen or not."""
+    return [recorded.T_world_camera for recorded in sequence.contents.frames] if isinstance(sequence, Recording) else []
 
 
 def warn_of_poses(sequence: RGBDVideo) -> None:

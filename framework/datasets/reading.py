@@ -63,9 +63,11 @@ class PoseReading:
     camera_axes: CameraAxes = CameraAxes.OPENCV
     quaternion_order: QuaternionOrder = QuaternionOrder.XYZW
     pose_unit: float = 1.0  # m, in [1e-6, 1e6], of the poses' translations
+    pose_delay: int = 0  # frames, in [-1000, 1000]: the images k belong to the pose k + delay
 
     def __post_init__(self) -> None:
         require(1e-6 <= self.pose_unit <= 1e6, "dataset.pose_unit", self.pose_unit, "in [1e-6, 1e6] m")
+        require(abs(self.pose_delay) <= LONGEST_DELAY, "dataset.pose_delay", self.pose_delay, "in [-1000, 1000]")
 
     def pose(self, stored: Float64) -> Float64:
         """T_world_camera (4, 4) that the stored rigid motion (4, 4) means."""
@@ -79,6 +81,20 @@ class PoseReading:
             T = inverse(T)
         T[:3, :3] = T[:3, :3] @ self.camera_axes.R_axes_camera
         return T
+
+    def frames(self, stored: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
+        """The frames, each with the stored pose that belongs to it; one has a fault where that has, or is not there."""
+        if not self.pose_delay:
+            return stored
+        return [self._delayed(stored, k) for k in range(len(stored))]
+
+    def _delayed(self, stored: Sequence[RecordedFrame], k: int) -> RecordedFrame:
+        partner = k + self.pose_delay
+        if not 0 <= partner < len(stored):
+            fault = stored[k].fault or f"no pose is {self.pose_delay} frames away"
+            return replace(stored[k], T_world_camera=None, fault=fault)
+        fault = stored[k].fault or stored[partner].fault
+        return replace(stored[k], T_world_camera=stored[partner].T_world_camera, fault=fault)
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,7 @@ class Recording(RGBDSequence):
 
     def _read(self, stored: Contents) -> Contents:
         """What is stored, as it is meant."""
-        posed = [_posed(recorded, self.pose_reading) for recorded in stored.frames]
+        posed = [_posed(recorded, self.pose_reading) for recorded in self.pose_reading.frames(stored.frames)]
         frames = self.depth_reading.frames(_in_order_of_time(self.name, posed))
         return replace(stored, frames=frames, depth_scale=self.depth_reading.depth_scale or stored.depth_scale)
 
@@ -111,6 +111,7 @@ class Recording(RGBDSequence):
             camera=self.camera,
             T_world_camera=recorded.T_world_camera,
             truth=self.truth_in(index),
+            up=recorded.up,
         )
 
     def metric_depth(self, index: int) -> Float32:

@@ -5,26 +5,27 @@
     color/000000.jpg    JPEG or PNG, 8-bit
     depth/000000.png    uint16, registered to colour, along z; 0 or 65535 = no reading
     poses.txt           optional; TUM format, T_world_camera, one line a frame: timestamp tx ty tz qx qy qz qw
+    gravity.txt         optional; x y z, a line a frame: up in its camera, as a sensor told; nan nan nan = not known
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is one
                                             of COCO's names, or null = not known
 
 Files belong together by the number in their names; the numbers may start anywhere and have gaps. Times are no such
-numbers: 1305031102.175304.png is refused. Line k of poses.txt (comments and empty lines not counted) is the k-th frame
-in the order of these numbers.
+numbers: 1305031102.175304.png is refused. Line k of poses.txt and of gravity.txt (comments and empty lines not counted)
+is the k-th frame in the order of these numbers.
 """
 
 from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from framework.data import FrameTruth, Int32, SceneTruth
+from framework.data import Float64, FrameTruth, Int32, SceneTruth
 from framework.datasets.camera_json import (
     CAMERA_KEYS,
     DISTORTION,
@@ -37,6 +38,7 @@ from framework.datasets.recording import FRAME_RATE, Contents, Recording, number
 from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import DataError, FrameError
+from framework.files.gravity_file import read_gravity
 from framework.files.image_files import read_uint16
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import TumLine, read_tum_lines
@@ -70,8 +72,9 @@ class RgbdFolder(Recording):
         self._class_names, self._instances = self._read_instances(color)
         lines = _read_poses(self.folder / "poses.txt", len(color))
         self._has_poses = lines is not None
+        ups = _read_gravity(self.folder / "gravity.txt", len(color))
         frames = [
-            _recorded(ImageFiles(color[number], depth[number]), k, lines[k] if lines else None)
+            _recorded(ImageFiles(color[number], depth[number]), k, lines[k] if lines else None, ups[k])
             for k, number in enumerate(color)
         ]
         return Contents(camera, path, depth_scale, frames, distortion_of(path, content))
@@ -121,10 +124,10 @@ class RgbdFolder(Recording):
         return class_names, list(images.values())
 
 
-def _recorded(images: ImageFiles, index: int, line: TumLine | None) -> RecordedFrame:
+def _recorded(images: ImageFiles, index: int, line: TumLine | None, up: Float64 | None) -> RecordedFrame:
     if line is None:
-        return RecordedFrame(images, index / FRAME_RATE)
-    return RecordedFrame.posed(images, line.timestamp, line.pose)
+        return RecordedFrame(images, index / FRAME_RATE, up=up)
+    return replace(RecordedFrame.posed(images, line.timestamp, line.pose), up=up)
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -157,6 +160,18 @@ def _read_poses(path: Path, frames: int) -> list[TumLine] | None:
             f"{path} holds {len(poses)} poses, but color/ holds {frames} frames: one line a frame is needed"
         )
     return poses
+
+
+def _read_gravity(path: Path, frames: int) -> list[Float64 | None]:
+    """Which way is up in each frame; None of all without the file."""
+    if not is_there(path):
+        return [None] * frames
+    ups = read_gravity(path)
+    if len(ups) != frames:
+        raise DataError(
+            f"{path} holds {len(ups)} directions, but color/ holds {frames} frames: one line a frame is needed"
+        )
+    return ups
 
 
 def _read_class_names(path: Path) -> dict[int, str | None]:

@@ -52,6 +52,7 @@ class RecordedFrame:
     timestamp: float  # s
     T_world_camera: Float64 | None = None  # (4, 4), None = not known
     fault: str = ""  # why the frame cannot be used, as where its pose is no pose; "" = it can
+    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, by a sensor; None = none tells
 
     @classmethod
     def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:

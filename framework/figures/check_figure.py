@@ -41,7 +41,7 @@ def write_check(path: Path, check: RecordingCheck) -> None:
     _delays(figure.add_subplot(grid[0, 3]), check)
     _warped(figure.add_subplot(grid[1, 0]), "as it is read", check.pair, check.poses.given)
     if check.poses.best is not None:
-        _warped(figure.add_subplot(grid[1, 1]), "as it fits best", check.pair, check.poses.best)
+        _warped(figure.add_subplot(grid[1, 1]), "as it fits best", check.meant, check.poses.best)
     _readings(figure.add_subplot(grid[1, 2:]), check.poses)
     _findings(figure.add_subplot(grid[2, :]), check)
     with written_whole(path) as temporary:

@@ -15,6 +15,7 @@ from framework.data import MOST_PIXELS, Array, Camera, Float32, Float64, UInt16
 from framework.datasets.camera_json import DISTORTION
 from framework.datasets.color_registration import ColorRegistration
 from framework.errors import DataError
+from framework.files.gravity_file import write_gravity
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
 from framework.files.whole_files import written_whole
@@ -61,7 +62,7 @@ class Written:
     timestamps: list[float] = field(default_factory=list)  # s, of the frames that were written
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of them, none without poses
     faults: list[str] = field(default_factory=list)  # of each frame that was left out
-    ups: list[Float64] = field(default_factory=list)  # (3,) the world's up in the camera as it was stored, where known
+    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera of each as it was stored
 
     def __str__(self) -> str:
         said = f"{len(self.timestamps)} frames"
@@ -77,7 +78,7 @@ def check_new(directory: Path) -> None:
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
-    """Writes the frames, then their poses and the camera: a folder without camera.json is not finished.
+    """Writes the frames, then their poses, up and the camera: a folder without camera.json is not finished.
 
     A frame that cannot be used is left out. Raises DataError when `directory` holds something, none can be used, or the
     disk does not take a file.
@@ -99,12 +100,14 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
         written.timestamps.append(frame.timestamp)
         if frame.T_world_camera is not None:
             written.poses.append(turn.pose(frame.T_world_camera))
-            if source.up_world is not None:
-                written.ups.append(frame.T_world_camera[:3, :3].T @ source.up_world)
+        written.ups.append(frame.up)
     if camera is None:
         raise DataError(f"no frame can be used; the first: {written.faults[0] if written.faults else 'there is none'}")
     if source.posed:
         write_tum(directory / "poses.txt", written.timestamps, written.poses)
+    if any(up is not None for up in written.ups):
+        ups = [None if up is None else turn.R_turned_camera @ up for up in written.ups]
+        write_gravity(directory / "gravity.txt", ups)
     lens = {DISTORTION: list(astuple(turn.lens(source.distortion)))} if source.distortion else {}
     write_json(directory / "camera.json", asdict(turn.camera(camera)) | {"depth_scale": DEPTH_SCALE} | lens)
     return written

@@ -8,28 +8,31 @@
     keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, between them medium (127 by the description, 54
                                                 in exports)
 
-What is corrected is taken where it is there.
+What is corrected is taken where it is there. Up is told by the pose as it was recorded: nobody says whether y is up in
+the world of optimised ones.
 """
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from framework.data import Float64
 from framework.datasets.camera_json import read_json_object
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing import json_numbers
 from framework.importing.source import (
-    ARKIT_UP,
     FAIRLY_SURE,
     SURE,
     UNSURE,
     DeviceFrame,
     Source,
     arkit_pose,
+    arkit_up,
     metres,
 )
 
@@ -56,7 +59,7 @@ def open_source(path: Path) -> Source:
     if not (folder / "depth").is_dir() or not stems:
         raise DataError(f"{path} has no depth/ or no cameras: Polycam keeps them with a LiDAR and in developer mode")
     frames = [partial(_read, folder, stem) for stem in stems]
-    return Source("Polycam", frames, len(frames), posed=True, up_world=ARKIT_UP)
+    return Source("Polycam", frames, len(frames), posed=True)
 
 
 def _read(folder: Path, stem: str) -> DeviceFrame:
@@ -70,7 +73,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
     depth = corrected_depth if undistorted and corrected_depth.exists() else folder / f"depth/{stem}.png"
     confidence = folder / f"confidence/{stem}.png"
     height, width = color.shape[:2]
-    T_world_arkit = np.vstack([np.reshape(json_numbers.named(posed, pose, *ROWS), (3, 4)), [[0, 0, 0, 1]]])
+    recorded = pose if posed == as_recorded else read_json_object(as_recorded)
     return DeviceFrame(
         name=depth,
         timestamp=int(stem) / MICROSECONDS,
@@ -78,8 +81,15 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
         color=color,
         depth=metres(read_uint16(depth)),
         confidence=_levels(read_uint8(confidence)) if confidence.exists() else None,
-        T_world_camera=arkit_pose(posed, T_world_arkit),
+        T_world_camera=_pose(posed, pose),
+        up=arkit_up(_pose(as_recorded, recorded)),
     )
+
+
+def _pose(path: Path, content: dict[str, Any]) -> Float64:
+    """T_world_camera (4, 4). Raises DataError, naming the file."""
+    rows = np.reshape(json_numbers.named(path, content, *ROWS), (3, 4))
+    return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 
 
 def _levels(stored: np.typing.NDArray[np.uint8]) -> np.typing.NDArray[np.uint8]:

@@ -7,7 +7,9 @@
 
 An .r3d file is a zip: metadata (the same JSON), rgbd/0.jpg, rgbd/0.depth (float32, m) and rgbd/0.conf (uint8, 0 to 2,
 only with a LiDAR), the last two compressed by LZFSE. Images stand upright in both, and poses are T_world_camera of the
-upright camera in ARKit's axes: in a real export, which looks down at a door handle, they say 50 degrees down.
+upright camera in ARKit's axes: in a real export, which looks down at a door handle, they say 50 degrees down. Older
+versions began with the identity and do not tell up, newer ones have `arframe.camera.transform`, by the app's author in
+marek-simonik/record3d, issues 27 and 64: up is told where the first pose is turned.
 """
 
 from __future__ import annotations
@@ -33,11 +35,12 @@ from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
 from framework.files.whole_files import MOST_TEXT, read_bytes
 from framework.importing import json_numbers
-from framework.importing.source import ARKIT_UP, DeviceFrame, Source, arkit_pose, readings
+from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, readings
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
 BYTES_A_BLOCK = 20_000  # of an image, at least; the compressor ends a block after 40,000 bytes without repetitions
+UNTURNED = 1e-3  # sine of half the angle: nobody holds a phone so exactly along the axes of the world
 MOST_BLOCKS = 8  # beside these: each may unpack to 27 MB, whatever it says
 
 _MISSING = "{} is not there: pip install instancemap[phone]"
@@ -171,16 +174,25 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
     cameras = [json_numbers.camera(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])
     times = _times(where, content, len(poses))
+    tells_up = not _is_unturned(poses[0])
     frames = [
-        partial(_read, files, k, times[k], camera, shape, f"{where}: pose {k}", poses[k])
+        partial(_read, files, k, times[k], camera, shape, f"{where}: pose {k}", poses[k], tells_up)
         for k, camera in enumerate(cameras)
     ]
-    return Source("Record3D", frames, len(frames), posed=True, up_world=ARKIT_UP)
+    return Source("Record3D", frames, len(frames), posed=True)
 
 
 def _read(
-    files: Record3DFiles, number: int, timestamp: float, camera: Camera, shape: tuple[int, int], where: str, pose: Any
+    files: Record3DFiles,
+    number: int,
+    timestamp: float,
+    camera: Camera,
+    shape: tuple[int, int],
+    where: str,
+    pose: Any,
+    tells_up: bool,
 ) -> DeviceFrame:
+    T_world_camera = _pose(where, pose)
     return DeviceFrame(
         name=files.name(number),
         timestamp=timestamp,
@@ -188,7 +200,8 @@ def _read(
         color=files.color(number),
         depth=files.depth(number, shape),
         confidence=files.confidence(number, shape),
-        T_world_camera=_pose(where, pose),
+        T_world_camera=T_world_camera,
+        up=arkit_up(T_world_camera) if tells_up else None,
     )
 
 
@@ -201,6 +214,15 @@ def _pose(where: str, values: Any) -> Float64:
     T_world_arkit[:3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
     T_world_arkit[:3, 3] = position
     return arkit_pose(where, T_world_arkit)
+
+
+def _is_unturned(pose: Any) -> bool:
+    """Whether a stored pose has the rotation of the identity, or is none."""
+    try:
+        quat_xyzw = json_numbers.finite("pose", pose, 7)[:4]
+    except DataError:
+        return True
+    return bool(np.linalg.norm(quat_xyzw[:3]) < UNTURNED)
 
 
 def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> list[tuple[float, ...]]:

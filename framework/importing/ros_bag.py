@@ -4,6 +4,7 @@
     sensor_msgs/CameraInfo                  intrinsics of colour, and of depth where it is not registered
     nav_msgs/Odometry, geometry_msgs/PoseStamped    poses of the camera, optional; in its optical axes where the name of
                                             the frame says so or there is none, else in ROS' (x forward)
+    sensor_msgs/Imu, tf2_msgs/TFMessage     which way is up, optional: by the accelerometer and /tf_static
     /device_0/sensor_1/Color_0/image/data   RealSense's, likewise Depth_0; their .../tf/0 is T_stream_depth, with the
                                             rotation as the recorder's own player reads it, and .../option/Depth Units
                                             the metres of a unit. Depth is registered to colour here
@@ -21,7 +22,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from framework.data import Camera, Float64
 from framework.datasets.reading import CameraAxes, PoseReading
@@ -30,9 +30,11 @@ from framework.datasets.undistortion import Distortion
 from framework.errors import DataError, FrameError
 from framework.files.tum_trajectory import TumLine
 from framework.importing import json_numbers
+from framework.importing.accelerometer import Accelerometer, find_accelerometer
 from framework.importing.depth_registration import DepthRegistration
 from framework.importing.ros_messages import NANOSECONDS, ODOMETRY, Message, RosBag, color_of, depth_of
 from framework.importing.ros_topics import Topics, camera_info_of, found_topics
+from framework.importing.ros_transforms import REALSENSE, stream_motion
 from framework.importing.source import DeviceFrame, Source, StoredFrame
 
 APART = 0.02  # s, at most, of a colour image and its depth
@@ -42,7 +44,6 @@ SAME_CAMERA = 0.01  # of the focal length and of the image's width: intrinsics t
 MOST_WAITING = 64  # images whose partner has not come yet
 BROWN = ("plumb_bob", "Brown Conrady", "")  # models of a lens with k1, k2, p1, p2, k3
 DEPTH_STREAM = "/Depth_"  # in RealSense's names
-REALSENSE = "/device_"
 
 log = logging.getLogger(__name__)
 
@@ -60,8 +61,15 @@ def open_source(path: Path, given: Topics) -> Source:
     if info is None:
         raise DataError(f"{path}: {topics.camera_info} has no message")
     camera = _camera(f"{path}: {topics.camera_info}", info)
-    device = Device(bag, topics, camera, _registration(bag, topics, camera), _depth_unit(bag, topics))
     pairs = _pairs(bag, topics)
+    device = Device(
+        bag,
+        topics,
+        camera,
+        _registration(bag, topics, camera),
+        _depth_unit(bag, topics),
+        find_accelerometer(bag, topics.color, [pair.timestamp for pair in pairs]),
+    )
     trajectory, axes = _trajectory(bag, topics.poses)
     frames = _frames(device, pairs, trajectory, PoseReading(camera_axes=axes))
     lens = _distortion(topics, info)
@@ -78,6 +86,7 @@ class Device:
     camera: Camera  # of colour
     registration: DepthRegistration | None  # None: depth is colour's, perhaps in another size
     depth_unit: float  # m
+    accelerometer: Accelerometer | None  # that tells which way is up
 
     def frame(self, color: Message, depth: Message, timestamp: float, pose: Float64 | None) -> DeviceFrame:
         """One frame from its messages. Raises DataError when they cannot be used."""
@@ -94,6 +103,7 @@ class Device:
             color=color_of(f"{where}: {color.topic}", self.bag.decoded(color)),
             depth=metric,
             T_world_camera=pose,
+            up=self.accelerometer.up(timestamp) if self.accelerometer else None,
         )
 
 
@@ -242,21 +252,11 @@ def _is_same(depth: Camera, color: Camera) -> bool:
 
 def _extrinsics(bag: RosBag, topics: Topics) -> Float64 | None:
     """T_color_depth (4, 4) of a RealSense recording, None of others."""
-    motions = []
-    for topic in (topics.color, topics.depth):
-        if not topic.startswith(REALSENSE):
-            return None
-        stored = bag.first(f"{topic.removesuffix('/image/data')}/tf/0")
-        if stored is None:
-            return None
-        T_stream_reference = np.eye(4)
-        quat_xyzw = [getattr(stored.rotation, name) for name in "xyzw"]
-        if not np.isfinite(quat_xyzw).all() or np.linalg.norm(quat_xyzw) < 0.5:
-            raise DataError(f"{bag.path}: the rotation of {topic} is none")
-        T_stream_reference[:3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
-        T_stream_reference[:3, 3] = [getattr(stored.translation, name) for name in "xyz"]
-        motions.append(T_stream_reference)
-    T_color_reference, T_depth_reference = motions
+    T_color_reference, T_depth_reference = (
+        stream_motion(bag, topic.removesuffix("/image/data")) for topic in (topics.color, topics.depth)
+    )
+    if T_color_reference is None or T_depth_reference is None:
+        return None
     return np.asarray(T_color_reference @ np.linalg.inv(T_depth_reference))
 
 

@@ -23,7 +23,10 @@ from framework.importing.source import readings
 NANOSECONDS = 1e-9  # s
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+IMU, TRANSFORMS = "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
+
+TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 
 COLOR_CHANNELS = {  # of 8 bits, as indices of R, G, B
     "rgb8": (3, (0, 1, 2)),
@@ -58,6 +61,8 @@ class RosBag:
         rosbag1, rosbag2, typesys = _load_rosbags()
         self._is_ros1 = path.suffix.lower() == ".bag"
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
+        if TRANSFORMS not in self._types.types:  # rosbags does not know it in ROS 1
+            self._types.register(typesys.get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS))
         try:
             self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()

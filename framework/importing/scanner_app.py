@@ -20,7 +20,7 @@ from framework.datasets.recording import FRAME_RATE
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
 from framework.importing import json_numbers
-from framework.importing.source import ARKIT_UP, DeviceFrame, Source, arkit_pose, metres
+from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, metres
 
 _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
 
@@ -41,7 +41,7 @@ def open_source(path: Path) -> Source:
             'scan, which keeps depth, and export "All Data"'
         )
     frames = [partial(_read, path, number) for number in whole]
-    return Source("3D Scanner App", frames, len(frames), posed=True, up_world=ARKIT_UP)
+    return Source("3D Scanner App", frames, len(frames), posed=True)
 
 
 def _read(folder: Path, number: str) -> DeviceFrame:
@@ -51,6 +51,7 @@ def _read(folder: Path, number: str) -> DeviceFrame:
     confidence = folder / f"conf_{number}.png"
     fx, _, cx, _, fy, cy, _, _, _ = json_numbers.listed(path, content, "intrinsics", 9)
     pose = np.reshape(json_numbers.listed(path, content, "cameraPoseARFrame", 16), (4, 4))
+    T_world_camera = arkit_pose(path, pose)
     height, width = color.shape[:2]
     return DeviceFrame(
         name=path,
@@ -59,5 +60,6 @@ def _read(folder: Path, number: str) -> DeviceFrame:
         color=color,
         depth=metres(read_uint16(folder / f"depth_{number}.png")),
         confidence=read_uint8(confidence) if confidence.exists() else None,
-        T_world_camera=arkit_pose(path, pose),
+        T_world_camera=T_world_camera,
+        up=arkit_up(T_world_camera),
     )

@@ -17,7 +17,6 @@ from framework.geometry import nearest_rigid
 SMALLEST_SIDE = 2  # px, of a depth image that can be brought to another size
 UNSURE, FAIRLY_SURE, SURE = 0, 1, 2  # confidence, as ARKit's low, medium and high
 
-ARKIT_UP = (0.0, 1.0, 0.0)  # in its world
 _ARKIT = PoseReading(camera_axes=CameraAxes.OPENGL)
 
 
@@ -32,6 +31,7 @@ class DeviceFrame:
     depth: Float32  # (h, w) m along z, 0 = no reading; of the same field of view as colour
     confidence: UInt8 | None = None  # (h, w), UNSURE to SURE, of the depth; None = not told
     T_world_camera: Float64 | None = None  # (4, 4), None = not known
+    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, by a sensor; None = none tells
 
     def __post_init__(self) -> None:
         if not np.isfinite(self.timestamp):
@@ -59,7 +59,6 @@ class Source:
     count: int  # of the frames
     posed: bool  # whether poses come with it; a frame without one is then left out
     distortion: Distortion | None = None  # of the lens, in colour and depth alike; None = a pinhole
-    up_world: tuple[float, float, float] | None = None  # where up is in the world of the poses; None = not known
 
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
@@ -68,6 +67,14 @@ def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
     except DataError as error:
         raise DataError(f"{where}: {error}") from error
+
+
+def arkit_up(T_world_camera: Float64) -> Float64:
+    """(3,) up in the camera, by a pose in ARKit's own world: its y is against gravity as motion sensors tell it.
+
+    That is ARConfiguration.WorldAlignment.gravity, which is the default.
+    """
+    return np.array(T_world_camera[1, :3])
 
 
 def metres(raw: np.typing.NDArray[np.uint16]) -> Float32:

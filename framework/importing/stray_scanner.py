@@ -23,7 +23,7 @@ from framework.errors import DataError
 from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
-from framework.importing.source import ARKIT_UP, DeviceFrame, Source, metres
+from framework.importing.source import DeviceFrame, Source, arkit_up, metres
 from framework.importing.video import Video
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
@@ -51,13 +51,13 @@ def open_source(path: Path) -> Source:
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
     frames = [partial(_read, path, row, video, confident) for row in rows]
-    return Source("Stray Scanner", frames, len(frames), posed=True, up_world=ARKIT_UP)
+    return Source("Stray Scanner", frames, len(frames), posed=True)
 
 
 def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: bool) -> DeviceFrame:
     if isinstance(row, DataError):
         raise row
-    name = f"{row.frame:06d}.png"
+    name, T_world_camera = f"{row.frame:06d}.png", row.line.pose()
     return DeviceFrame(
         name=folder / "depth" / name,
         timestamp=row.line.timestamp,
@@ -65,7 +65,8 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
         color=video.frame(row.frame),
         depth=metres(read_uint16(folder / "depth" / name)),
         confidence=read_uint8(folder / "confidence" / name) if confident else None,
-        T_world_camera=row.line.pose(),
+        T_world_camera=T_world_camera,
+        up=arkit_up(T_world_camera),
     )
 
 

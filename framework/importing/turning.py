@@ -55,11 +55,12 @@ class Turn:
         return lens
 
 
-def upright(ups_camera: Sequence[Float64]) -> Turn | None:
-    """The turn after which the world's up, (3,) in the camera of each frame, points up; None where none can tell."""
-    if not ups_camera:
+def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
+    """The turn after which up, (3,) in the camera of each frame, None = not known, points up; None = none can tell."""
+    known = [up for up in ups_camera if up is not None]
+    if not known:
         return None
-    x, y, _ = np.mean(ups_camera, axis=0)
+    x, y, _ = np.mean(known, axis=0)
     if np.hypot(x, y) < SIDEWAYS:
         return None
     turned = [Turn(quarters).R_turned_camera @ (x, y, 0.0) for quarters in range(4)]

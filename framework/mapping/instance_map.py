@@ -121,6 +121,10 @@ class InstanceMap(SceneMap):
     def up(self) -> Float64 | None:
         return self.volume.up()
 
+    @property
+    def up_is_sensed(self) -> bool:
+        return self.volume.gravity.sensed() is not None
+
     def save(self, path: Path | str) -> None:
         voxels, arrays = self.volume.saved()
         header = {

@@ -48,7 +48,7 @@ class TsdfVolume:
         Raises MapFullError when the block budget is reached; the frame is then not integrated.
         """
         seen = self.integrator.integrate(frame, T_world_camera, near)
-        self.gravity.held(T_world_camera)
+        self.gravity.held(T_world_camera, frame.up)
         self.changed(seen.blocks)
         return seen
 
@@ -95,7 +95,7 @@ class TsdfVolume:
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
             "max_blocks": self.voxels.max_blocks,
             "frames": self.integrator.frames,
-            "camera_up": self.gravity.camera_up.tolist(),
+            **self.gravity.saved(),
         }
         return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
 
@@ -108,7 +108,7 @@ class TsdfVolume:
             header.number("voxel_size", BOUNDS["voxel_size"]), sensor, header.whole("max_blocks", 1, MOST_BLOCKS)
         )
         volume.integrator.frames = header.whole("frames")  # rounding goes on from there
-        volume.gravity = Gravity.of(header.items("camera_up"))
+        volume.gravity = Gravity.of(header)
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
         check_numbers("label_row", arrays["label_row"], rows)
         volume.fill(arrays)

@@ -57,11 +57,12 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
-    """Which way is up in the world, and how high the floor is along that; nothing where the map does not tell."""
+    """Which way is up in the world, what tells it, and how high the floor is; nothing where the map does not tell."""
     up = scene.up()
     if up is None:
         return {}
     figures: Metrics = {f"map.up.{axis}": float(value) for axis, value in zip("xyz", up, strict=True)}
+    figures["up_from"] = scene.up_from()
     return figures | {"map.floor_m": floor_height(mesh.vertices, mesh.triangles, up)}
 
 

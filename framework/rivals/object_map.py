@@ -215,6 +215,10 @@ class ObjectMap(SceneMap):
     def up(self) -> Float64 | None:
         return self.background.up()
 
+    @property
+    def up_is_sensed(self) -> bool:
+        return self.background.gravity.sensed() is not None
+
     def save(self, path: Path | str) -> None:
         voxels, arrays = self.background.saved()
         header = {

@@ -63,7 +63,7 @@ class Open3DMap(SceneMap):
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
         """Adds the depth and the colour of `frame`. Raises MapFullError, and adds nothing, at the end of the budget."""
         self.grid.integrate(frame, T_world_camera)
-        self.gravity.held(T_world_camera)
+        self.gravity.held(T_world_camera, frame.up)
         self.changed()
 
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
@@ -136,6 +136,10 @@ class Open3DMap(SceneMap):
         mesh = self.mesh()
         return self.gravity.up(mesh.vertices, mesh.triangles)
 
+    @property
+    def up_is_sensed(self) -> bool:
+        return self.gravity.sensed() is not None
+
     def save(self, path: Path | str) -> None:
         header = {
             "format": FORMAT,
@@ -143,7 +147,7 @@ class Open3DMap(SceneMap):
             "confirmation": asdict(self.confirmation),
             "classes": self.classes,
             "frames": self.grid.frames,
-            "camera_up": self.gravity.camera_up.tolist(),
+            **self.gravity.saved(),
             "table": plain_table(self.table),
         }
         write_map(path, header, self.grid.arrays())
@@ -157,7 +161,7 @@ class Open3DMap(SceneMap):
             scene.classes = header.classes()
             scene.table = table_of(header.part("table"), len(scene.classes))
             scene.grid.frames = header.whole("frames")
-            scene.gravity = Gravity.of(header.items("camera_up"))
+            scene.gravity = Gravity.of(header)
             scene.grid.fill(arrays)
             check_known("instance", arrays["instance"], [0, *scene.table.records])
         return scene

@@ -140,6 +140,10 @@ class SemanticMap(SceneMap):
     def up(self) -> Float64 | None:
         return self.volume.up()
 
+    @property
+    def up_is_sensed(self) -> bool:
+        return self.volume.gravity.sensed() is not None
+
     def save(self, path: Path | str) -> None:
         header, arrays = self.volume.saved()
         header |= {

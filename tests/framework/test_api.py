@@ -23,8 +23,10 @@ from framework.files.search_paths import CONF
 from framework.geometry import lift
 from framework.interfaces import MapFuser
 from framework.pipeline import Pipeline
+from framework.records.metrics import room_metrics
 from framework.registry import build
 from tests import registered
+from tests.scenes.analytic_scene import Scene
 from tests.scenes.corner_room import CornerRoom, pose_at
 
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
@@ -54,6 +56,31 @@ def test_a_frame_that_cannot_be_used_leaves_the_map_as_it_was(room: CornerRoom) 
         mapper.add(replace(room[1], T_world_camera=None))
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, before)
     assert not mapper.add(room[2]).lost
+
+
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "open3d_vbg", "object_volumes", "semantic_components"])
+def test_what_a_sensor_tells_is_up_in_the_map_and_in_its_file(fuser: str, tmp_path: Path) -> None:
+    """A camera over a slanted table alone, which surfaces take for level; the tracker's world is the first frame."""
+    tilt = np.radians(20)
+    up = np.array([np.sin(tilt), -np.cos(tilt) * np.sin(1.0), -np.cos(tilt) * np.cos(1.0)])  # in the first camera
+    table = Scene(planes=[(np.array([0.0, -np.sin(1.0), -np.cos(1.0)]), -0.8)])
+    stages = ("detector=none", "tracker=ground_truth", "refiner=identity", f"fuser={fuser}", "fuser.voxel_size=0.04")
+    sensed, unsensed = Mapper(*stages), Mapper(*stages)
+    for k in range(3):
+        frame = table.frame(pose_at(k), k)
+        unsensed.add(frame)
+        sensed.add(frame.color, frame.depth, pose_at(k), frame.camera, up=pose_at(k)[:3, :3].T @ up)
+    wrong, found = unsensed.up(), sensed.up()
+    assert wrong is not None
+    assert found is not None
+    assert np.degrees(np.arccos(wrong @ up)) == pytest.approx(20, abs=1)
+    assert np.degrees(np.arccos(min(found @ up, 1.0))) < 0.01
+    assert (sensed.up_from(), unsensed.up_from(), Mapper(*stages).up_from()) == ("sensor", "surfaces", "")
+    assert room_metrics(sensed.scene, sensed.mesh())["up_from"] == "sensor"
+    sensed.save(tmp_path / "map.npz")
+    again = load_map(tmp_path / "map.npz")
+    np.testing.assert_array_equal(again.up(), found)
+    assert again.up_from() == "sensor"
 
 
 def test_several_threads_share_a_mapper(room: CornerRoom) -> None:

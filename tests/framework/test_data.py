@@ -53,6 +53,17 @@ def test_numpys_numbers_are_numbers() -> None:
     assert frame(index=np.int64(3), timestamp=np.float32(1), camera=camera).index == 3
 
 
+def test_up_in_a_frame_is_a_unit_vector() -> None:
+    np.testing.assert_array_equal(frame(up=np.array([0.6, -0.8, 0.0])).up, [0.6, -0.8, 0.0])
+    for wrong, said in (
+        ([0.0, -9.81, 0.0], "a unit vector, found one of length 9.81"),
+        ([0.0, -1.0], r"shape \(3\)"),
+        ([0.0, np.nan, 0.0], "not finite"),
+    ):
+        with pytest.raises(DataError, match=f"frame 7: up .*{said}"):
+            frame(up=np.array(wrong))
+
+
 @pytest.mark.parametrize("camera", [None, (4, 3, 5.0, 5.0, 1.5, 1.0)])
 def test_a_frames_camera_is_a_camera(camera: object) -> None:
     with pytest.raises(DataError, match="frame 7: camera must be a Camera, found"):

@@ -22,11 +22,12 @@ def write_damaged(
     pose: Callable[[Float64], Float64] = lambda T: T,
     scale: float = 1.0,
     depth_late: int = 0,
+    poses_late: int = 0,
     frames: int = 10_000,
 ) -> Path:
-    """An RGB-D folder of `sound`'s images, linked, with damaged poses, depth scale or order of the depth images."""
+    """An RGB-D folder of `sound`'s images, linked, with damaged poses, depth scale or order of poses or depth."""
     recorded = sound.contents.frames[:frames]
-    usable = range(max(depth_late, 0), len(recorded) + min(depth_late, 0))
+    usable = range(max(depth_late, poses_late, 0), len(recorded) + min(depth_late, poses_late, 0))
     for name in ("color", "depth"):
         (place / name).mkdir(parents=True)
     for k in usable:
@@ -39,7 +40,7 @@ def write_damaged(
     if sound.contents.distortion is not None:
         content["distortion"] = list(astuple(sound.contents.distortion))
     (place / "camera.json").write_text(json.dumps(content))
-    poses = [recorded[k].T_world_camera for k in usable]
+    poses = [recorded[k - poses_late].T_world_camera for k in usable]
     known = [IDENTITY if T is None else T for T in poses]
     write_tum(place / "poses.txt", [recorded[k].timestamp for k in usable], [pose(T) for T in known])
     return place

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import shutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -61,8 +62,10 @@ def both(T: Float64) -> Float64:
 INVERTED = {"pose": inverse}
 OPENGL = {"pose": in_axes(CameraAxes.OPENGL)}
 ROS = {"pose": in_axes(CameraAxes.ROS)}
-KIND, AXES, SCALE, DELAY = (f"dataset.{name}=" for name in ("pose_kind", "camera_axes", "depth_scale", "depth_delay"))
-TEN: list[tuple[str, Mapping[str, Any], str]] = [
+KIND, AXES, SCALE, DELAY, POSES = (
+    f"dataset.{name}=" for name in ("pose_kind", "camera_axes", "depth_scale", "depth_delay", "pose_delay")
+)
+ELEVEN: list[tuple[str, Mapping[str, Any], str]] = [
     ("redkitchen", INVERTED, KIND + "T_CAMERA_WORLD"),
     ("redkitchen", ROS, AXES + "ROS"),
     ("redkitchen", {"depth_late": 3}, DELAY + "3"),
@@ -73,6 +76,7 @@ TEN: list[tuple[str, Mapping[str, Any], str]] = [
     ("freiburg1", {"scale": 0.2}, SCALE + "5000"),
     ("freiburg1", {"pose": both}, f"{KIND}T_CAMERA_WORLD {AXES}OPENGL"),
     ("freiburg1", {"scale": 0.1}, SCALE + "5000"),
+    ("replica_floor2", {"poses_late": 3}, POSES + "3"),
 ]
 
 
@@ -86,8 +90,8 @@ def settings(findings: tuple[Finding, ...]) -> list[str]:
     return [finding.setting for finding in findings if finding.verdict is Verdict.FAULT]
 
 
-@pytest.mark.parametrize(("name", "damage", "setting"), TEN)
-def test_ten_damaged_recordings(
+@pytest.mark.parametrize(("name", "damage", "setting"), ELEVEN)
+def test_eleven_damaged_recordings(
     shared_data: Path, tmp_path: Path, name: str, damage: Mapping[str, Any], setting: str
 ) -> None:
     place = write_damaged(tmp_path / "damaged", shared_recording(shared_data, name), **damage)
@@ -102,11 +106,13 @@ def test_ten_damaged_recordings(
         ({"depth_late": 2}, DELAY + "2"),
         ({"depth_late": -1}, DELAY + "-1"),
         ({"scale": 0.01}, SCALE + "5000"),
+        ({"poses_late": 3, "pose": both}, f"{POSES}3 {KIND}T_CAMERA_WORLD {AXES}OPENGL"),
+        ({"poses_late": -3, "depth_late": -3}, f"{POSES}-3 {DELAY}-3"),
     ],
 )
 def test_the_desk_with_one_convention_changed(tmp_path: Path, damage: Mapping[str, Any], setting: str) -> None:
     place = write_damaged(tmp_path / "damaged", DESK, **damage)
-    assert settings(check(RgbdFolder(place), FARTHEST).findings) == [setting]
+    assert " ".join(settings(check(RgbdFolder(place), FARTHEST).findings)) == setting
 
 
 def test_the_originals_are_sound(shared_data: Path) -> None:
@@ -129,13 +135,25 @@ def test_the_originals_are_sound(shared_data: Path) -> None:
 
 def test_what_is_asked_for_is_what_is_checked(tmp_path: Path) -> None:
     """The parameter that was named makes the recording sound; one more is a fault again."""
-    place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1)
-    reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL)
+    place = write_damaged(tmp_path / "damaged", DESK, pose=both, scale=2.0, depth_late=1, poses_late=-2)
+    reading = PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=-2)
     depth = DepthReading(depth_scale=5000, depth_delay=1)
     assert not check(RgbdFolder(place, pose_reading=reading, depth_reading=depth), FARTHEST).faults
-    wrong = replace(reading, quaternion_order=QuaternionOrder.WXYZ)
+    wrong = replace(reading, quaternion_order=QuaternionOrder.WXYZ, pose_delay=1)
     found = check(RgbdFolder(place, pose_reading=wrong, depth_reading=replace(depth, depth_delay=3)), FARTHEST)
-    assert settings(found.findings) == ["dataset.quaternion_order=XYZW", DELAY + "1"]
+    assert settings(found.findings) == [POSES + "-2", "dataset.quaternion_order=XYZW", DELAY + "1"]
+    assert "they come 3 frames early (0.0" in found.faults[0].text
+
+
+def test_a_clock_of_the_poses_that_goes_after_is_told_in_frames_and_seconds(tmp_path: Path) -> None:
+    """The desk in TUM's own files, the poses' times 0.1 s late."""
+    shutil.copytree(DESK.folder, tmp_path / DESK.name)
+    path = tmp_path / DESK.name / "groundtruth.txt"
+    words = [line.split() for line in path.read_text().splitlines() if not line.startswith("#")]
+    path.write_text("".join(f"{float(time) + 0.1:.4f} {' '.join(pose)}\n" for time, *pose in words))
+    [fault] = check(TumRgbd(tmp_path, scene=DESK.name), FARTHEST).faults
+    assert fault.setting == POSES + "3"
+    assert "they come 3 frames late (0.096 s)" in fault.text
 
 
 def test_poses_of_another_walk_fit_in_no_axes(tmp_path: Path) -> None:

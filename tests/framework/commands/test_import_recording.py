@@ -54,6 +54,7 @@ def test_turned_images_have_turned_poses(
         assert np.abs(seen.color.astype(int) - color).mean() < 12
         assert np.median(np.abs(seen.depth - depth)[(ids == 0) & (seen.depth > 0)]) < 1e-3
         np.testing.assert_allclose(seen.T_world_camera[:3, 1], -frame.T_world_camera[:3, 1], atol=1e-6)
+        np.testing.assert_allclose(seen.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
 
 
 def test_a_place_that_is_taken_is_told_before_anything_is_read(

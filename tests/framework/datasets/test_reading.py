@@ -69,6 +69,8 @@ def test_impossible_readings_are_refused(wrong: dict[str, float], said: str) -> 
         DepthReading(**wrong)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="pose_unit"):
         PoseReading(pose_unit=0.0)
+    with pytest.raises(ConfigError, match="pose_delay"):
+        PoseReading(pose_delay=-1001)
 
 
 class Image:
@@ -98,19 +100,36 @@ def test_a_delay_pairs_colour_with_the_depth_that_belongs_to_it(delay: int) -> N
             assert f"{delay} frames away" in frame.fault
 
 
+@pytest.mark.parametrize("delay", [-2, 0, 1])
+def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
+    stored = [RecordedFrame(Image(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
+    stored[3] = RecordedFrame(Image(3), 3 / 30, fault="line 3 is no pose")
+    for k, frame in enumerate(PoseReading(pose_delay=delay).frames(stored)):
+        assert (frame.images.color()[0, 0, 0], frame.timestamp) == (k, k / 30)
+        if not 0 <= k + delay < 5:
+            assert frame.fault == f"no pose is {delay} frames away"
+            assert frame.T_world_camera is None
+        elif 3 in (k, k + delay):
+            assert frame.fault == "line 3 is no pose"
+        else:
+            assert not frame.fault
+            np.testing.assert_array_equal(frame.T_world_camera, some_pose(k + delay))
+            assert frame.up is stored[k].up
+
+
 def test_a_recording_is_read_as_it_is_meant() -> None:
     desk = {"root": Path("data/desk"), "scene": "rgbd_dataset_freiburg1_rpy"}
     plain = TumRgbd(**desk)  # type: ignore[arg-type]
     meant = TumRgbd(
         **desk,  # type: ignore[arg-type]
-        pose_reading=PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL),
+        pose_reading=PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=2),
         depth_reading=DepthReading(depth_scale=10_000, depth_delay=1),
     )
-    first, then = plain[0], meant[0]
+    first, then = plain[2], meant[0]
     assert first.T_world_camera is not None
     assert then.T_world_camera is not None
     np.testing.assert_allclose(then.T_world_camera, inverse(first.T_world_camera) @ np.diag([1.0, -1.0, -1.0, 1.0]))
-    np.testing.assert_array_equal(then.color, first.color)
+    np.testing.assert_array_equal(then.color, plain[0].color)
     np.testing.assert_allclose(then.depth, plain[1].depth / 2, rtol=1e-6)
-    with pytest.raises(FrameError, match="no depth image"):
+    with pytest.raises(FrameError, match="no pose is 2 frames away"):
         meant[len(meant) - 1]

@@ -491,3 +491,27 @@ def test_a_lens_is_undone_in_colour_depth_and_instances_alike(folder):
     depth = cv2.remap(depth_mm(0), u, v, cv2.INTER_NEAREST) / 1000
     np.testing.assert_allclose(frame.depth, depth, atol=1e-6)
     assert not np.array_equal(frame.color, picture(0))
+
+
+def test_what_a_sensor_told_of_gravity_is_in_the_frames(folder):
+    (folder / "gravity.txt").write_text("0 -9.81 0\nnan nan nan\n0 0 -2\n# the last one\n0.6 -0.8 0\n")
+    ups = [frame.up for frame in RgbdFolder(folder, start=1)]
+    assert ups[0] is None
+    np.testing.assert_allclose(ups[1:], [[0, 0, -1], [0.6, -0.8, 0]])
+    (folder / "poses.txt").unlink()
+    np.testing.assert_allclose(RgbdFolder(folder)[0].up, [0, -1, 0])
+    (folder / "gravity.txt").unlink()
+    assert all(frame.up is None for frame in RgbdFolder(folder))
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("0 -1 0\n" * 3, r"gravity\.txt holds 3 directions, but color/ holds 4 frames: one line a frame is needed"),
+        ("0 -1 0\n" * 3 + "0 0 0\n", r"gravity\.txt, line 4: expected a direction"),
+    ],
+)
+def test_damaged_directions_of_gravity_are_said(folder, content, said):
+    (folder / "gravity.txt").write_text(content)
+    with pytest.raises(DataError, match=said):
+        RgbdFolder(folder)

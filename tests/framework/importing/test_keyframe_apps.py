@@ -9,6 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from framework.datasets.rgbd_folder import RgbdFolder
@@ -47,7 +48,9 @@ def test_optimised_poses_and_undistorted_images_of_polycam_are_taken(tmp_path: P
     write_polycam(tmp_path / "export", drifted)
     write_polycam(tmp_path / "export", FRAMES, "corrected_")
     assert not write(tmp_path / "export/keyframes", tmp_path)
-    check_imported(tmp_path / "out", FRAMES)
+    check_imported(tmp_path / "out", FRAMES, tells_up=False)
+    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # of ARKit's own world
+        np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
 
 
 def test_optimised_poses_of_polycam_without_such_images(tmp_path: Path) -> None:
@@ -61,7 +64,7 @@ def test_optimised_poses_of_polycam_without_such_images(tmp_path: Path) -> None:
         content = json.loads(path.read_text())
         path.write_text(json.dumps({key: value for key, value in content.items() if key.startswith("t_")}))
     assert not write(tmp_path / "export", tmp_path)
-    check_imported(tmp_path / "out", FRAMES)
+    check_imported(tmp_path / "out", FRAMES, tells_up=False)
 
 
 def test_frames_of_the_scanner_app_without_colour_are_none(tmp_path: Path) -> None:

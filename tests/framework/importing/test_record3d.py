@@ -66,6 +66,14 @@ def test_older_exports_have_one_camera_and_a_frame_rate(export: Path, tmp_path: 
     assert [frame.timestamp for frame in sequence] == pytest.approx([k / 30 for k in range(4)])
 
 
+def test_poses_that_begin_with_the_identity_do_not_tell_up(export: Path, tmp_path: Path) -> None:
+    """As the app wrote them in 2022: of the world of the first frame."""
+    changed(export, lambda m: m["poses"].__setitem__(0, [0, 0, 0, 1, 0, 0, 0]))
+    write_folder(open_source(export), tmp_path / "out", Writing())
+    assert len(RgbdFolder(tmp_path / "out")) == 4
+    assert not (tmp_path / "out/gravity.txt").exists()
+
+
 def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
     metadata = record3d_metadata(FRAMES)
     change(metadata)
@@ -201,3 +209,4 @@ def test_a_real_export(shared_data: Path, tmp_path: Path) -> None:
     assert T_world_camera[1, 2] == pytest.approx(-0.77, abs=0.02)
     assert T_world_camera[1, 1] < -0.6
     assert upright(written.ups) == Turn(0)
+    np.testing.assert_allclose(frame.up, T_world_camera[1, :3], atol=1e-6)

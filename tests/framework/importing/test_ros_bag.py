@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import sqlite3
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,18 +12,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 pytest.importorskip("rosbags")
 
 from framework.data import Camera
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError, DataError
+from framework.geometry import exp_se3
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
 from framework.importing.ros_topics import Topics
-from tests.phone_exports import ROOM, write_jpeg
+from tests.phone_exports import ROOM, T_COLOR_DEPTH, write_jpeg
 from tests.ros_bags import (
     COUNT,
+    START,
     T_CAMERA_ROS,
     BagWriter,
     add_camera_of_ros,
@@ -332,6 +336,105 @@ def test_phones_have_no_topics(tmp_path: Path) -> None:
     (tmp_path / "a.r3d").touch()
     with pytest.raises(ConfigError, match="has no topics: --color, --poses are for ROS bags"):
         open_source(tmp_path / "a.r3d", Topics(color="/a", poses="/b"))
+
+
+# Gravity
+
+UP_WORLD = np.array([0.0, -1.0, 0.0])  # the room's y points down
+R_IMU_CAMERA = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
+
+
+def add_accelerometer(
+    bag: BagWriter, topic: str = "/camera/imu", frame_id: str = "imu", length: float = 9.81, late: float = 0.0
+) -> None:
+    """At 300 Hz, on the camera, which turns slowly; trembling of 4 m/s^2 at 50 Hz."""
+    for n in range(-30, 10 * COUNT + 30):
+        acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
+        measured = R_IMU_CAMERA @ pose_at(n / 10)[:3, :3].T @ acceleration
+        bag.add_imu(START + n / 300 + late, topic, measured, frame_id)
+
+
+def stands(R: np.ndarray) -> np.ndarray:
+    T = exp_se3(np.array([0.1, 0.2, -0.1, 0, 0, 0]))
+    T[:3, :3] = R
+    return T
+
+
+def check_up(folder: Path, within: float = 1.0) -> None:
+    for k, frame in enumerate(RgbdFolder(folder)):
+        assert np.degrees(np.arccos(frame.up @ pose_at(k)[:3, :3].T @ UP_WORLD)) < within
+
+
+@pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
+def test_an_accelerometer_tells_up_in_the_cameras_axes(tmp_path: Path, name: str) -> None:
+    """Over a chain of frames, both up and down it; a gyroscope's topic has no acceleration."""
+    bag = BagWriter(ros1=KINDS[name])
+    add_camera_of_ros(bag)
+    add_accelerometer(bag)
+    bag.add_imu(time_of(0), "/camera/gyro/sample", np.zeros(3), "imu")
+    base = Rotation.random(random_state=1).as_matrix()
+    bag.add_static(
+        ("base", "/camera_color_optical_frame", stands(base)),
+        ("base", "imu_mount", stands(base @ R_IMU_CAMERA.T)),
+        ("imu_mount", "imu", stands(np.eye(3))),
+        ("elsewhere", "base", stands(np.eye(3))),
+    )
+    assert not imported(bag.write(tmp_path / name), tmp_path / "out")
+    check_up(tmp_path / "out")
+
+
+def test_realsenses_accelerometer_tells_up(tmp_path: Path) -> None:
+    bag = BagWriter(ros1=True)
+    add_realsense(bag, DEPTH_CAMERA)
+    add_accelerometer(bag, "/device_0/sensor_2/Accel_0/imu/data", "2")
+    T_color_reference = T_COLOR_DEPTH
+    bag.add_transform("/device_0/sensor_2/Accel_0/tf/0", stands(R_IMU_CAMERA @ T_color_reference[:3, :3]))
+    assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
+    check_up(tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            {"frame_id": "unheard_of"},
+            "how /camera/imu stands to the camera of /camera/color/image_raw is not in the bag",
+        ),
+        ({"length": 0.0}, r"/camera/imu measures 3\.46 m/s\^2, not gravity"),
+        ({"late": 100.0}, r"/camera/imu measured nothing within 0\.05 s of a frame"),
+    ],
+)
+def test_an_accelerometer_that_cannot_tell_is_said_in_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict[str, Any], said: str
+) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_accelerometer(bag, **changed)
+    bag.add_static(("imu", "camera_color_optical_frame", stands(R_IMU_CAMERA)))
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert not (tmp_path / "out/gravity.txt").exists()
+    [line] = [record.getMessage() for record in caplog.records if "accelerometer" in record.getMessage()]
+    assert re.search(f"no accelerometer tells which way is up: {said}", line)
+    assert "\n" not in line
+
+
+def test_damaged_messages_of_an_accelerometer_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_accelerometer(bag)
+    bag.add_static(("imu", "camera_color_optical_frame", stands(R_IMU_CAMERA)))
+    for number, (time, topic, kind, message) in enumerate(bag.messages):
+        if topic == "/camera/imu" and number % 3 == 0:
+            lost = replace(message, linear_acceleration=bag.vector(np.full(3, np.nan)))
+            bag.messages[number] = (time, topic, kind, lost)
+    path = bag.write(tmp_path / "plain")
+    [file] = path.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        [[topic]] = database.execute("SELECT id FROM topics WHERE name = '/camera/imu'")
+        database.execute("UPDATE messages SET data = x'0001' WHERE topic_id = ? AND id % 5 = 0", [topic])
+    assert not imported(path, tmp_path / "out")
+    assert re.search(r"[1-9]\d* messages of /camera/imu are damaged and left out", caplog.text)
+    check_up(tmp_path / "out", within=10)
 
 
 # Damage

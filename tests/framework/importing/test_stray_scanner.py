@@ -147,3 +147,8 @@ def test_a_real_recording(shared_data: Path, tmp_path: Path) -> None:
     # the accelerometer: gravity is 0.20 along the view, which is a camera that looks down
     assert sequence[0].T_world_camera[1, 2] == pytest.approx(-0.24, abs=0.01)
     assert upright(written.ups) == Turn(1)  # the phone was held upright
+    # at rest Core Motion's acceleration points down; the camera's x is the phone's -y, its y -x, its z -z
+    rows = [line.split(",") for line in (original / "imu.csv").read_text().splitlines()[1:]]
+    x, y, z = -np.mean([[float(word) for word in row[1:4]] for row in rows if float(row[0]) < 248630.7], axis=0)
+    measured = np.array([-y, -x, -z]) / np.linalg.norm([x, y, z])
+    assert np.degrees(np.arccos(sequence[0].up @ measured)) < 3

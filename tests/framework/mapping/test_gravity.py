@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -10,6 +12,7 @@ from framework.data import Float32, Float64, Int32
 from framework.errors import DataError
 from framework.mapping.gravity import Gravity, faces, floor_height, half_sphere
 from framework.mapping.instance_list import box_around, upright_box
+from framework.mapping.map_header import MapHeader
 
 
 def rectangle(origin: Float64, a: Float64, b: Float64, cells: int = 12) -> tuple[Float32, Int32]:
@@ -73,7 +76,8 @@ def test_what_faces_up_decides_between_the_axes_of_a_box() -> None:
         rectangle(2 * Y, 1.5 * X, 1.5 * Z),
         rectangle(3 * Y, X, Y + Z),  # a lid that leans, along x
     )
-    askew = Gravity((0.68, 0.2, 0.7))  # nearer to x than to z but for 1 degree
+    askew = Gravity()
+    askew.camera_up = np.array([0.68, 0.2, 0.7])  # nearer to x than to z but for 1 degree
     up = askew.up(vertices, triangles)
     assert up is not None
     assert np.degrees(np.arccos(min(up @ Z, 1.0))) < 0.1
@@ -116,12 +120,74 @@ def test_faces_are_those_of_the_triangles() -> None:
     np.testing.assert_allclose(centers, [[2 / 3, 1, 0]])
 
 
-def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
+def sensing(turned: Float64, noise: float = 0.0, bias: float = 0.0, frames: int = 40, seed: int = 0) -> Gravity:
+    """As `held`, by a camera with an accelerometer, noise and bias in rad, whose heading changes."""
+    gravity, chosen = Gravity(), np.random.default_rng(seed)
+    for k in range(frames):
+        looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -0.5)
+        T = np.eye(4)
+        T[:3, :3] = turned @ (Rotation.from_euler("z", 2 * np.pi * k / frames) * looking).as_matrix()
+        up_camera = T[:3, :3].T @ turned @ Z
+        up_camera = Rotation.from_euler("x", bias).apply(up_camera) + chosen.normal(scale=noise, size=3)
+        gravity.held(T, up_camera / np.linalg.norm(up_camera))
+    return gravity
+
+
+def degrees(up: Float64 | None, expected: Float64) -> float:
+    assert up is not None
+    return float(np.degrees(np.arccos(min(up @ expected, 1.0))))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_sensors_tell_up_where_surfaces_cannot(seed: int) -> None:
+    """Over a slanted table alone, in a world that lies anyhow."""
+    turned = Rotation.random(random_state=seed).as_matrix()
+    vertices, triangles = rectangle(np.zeros(3), 2 * X, 2 * (np.cos(0.35) * Y + np.sin(0.35) * Z))
+    vertices = (vertices @ turned.T).astype(np.float32)
+    assert degrees(held(turned).up(vertices, triangles), turned @ Z) == pytest.approx(np.degrees(0.35), abs=0.1)
+    assert degrees(sensing(turned).up(vertices, triangles), turned @ Z) < 1e-3
+    assert degrees(sensing(turned).up(vertices[:0], triangles[:0]), turned @ Z) < 1e-3
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_and_bias_of_a_sensor_are_less_in_the_mean(seed: int) -> None:
+    """The noise of 40 frames; a bias about the camera's x points elsewhere with each heading."""
+    noise, bias = np.radians(3), np.radians(2)
+    assert degrees(sensing(np.eye(3), noise, seed=seed).sensed(), Z) < 3 * np.degrees(noise) / np.sqrt(40)
+    assert degrees(sensing(np.eye(3), 0, bias, seed=seed).sensed(), Z) < 1e-3
+
+
+def test_a_sensor_whose_directions_contradict_each_other_is_not_believed(caplog: pytest.LogCaptureFixture) -> None:
+    """As of one in other axes than the camera's."""
+    vertices, triangles = room()
     gravity = held(np.eye(3))
-    np.testing.assert_array_equal(Gravity.of(gravity.camera_up.tolist()).camera_up, gravity.camera_up)
+    for k in range(8):
+        T = np.eye(4)
+        T[:3, :3] = Rotation.from_euler("z", k).as_matrix()
+        gravity.held(T, np.array([np.sin(0.4), 0, np.cos(0.4)]))
+    assert gravity.sensed() is None
+    assert degrees(gravity.up(vertices, triangles), Z) < 0.1
+    assert caplog.text.count("is not one direction in the world: floors and walls are asked") == 1
+
+
+def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
+    saved = sensing(np.eye(3)).saved()
+    read = Gravity.of(MapHeader(json.loads(json.dumps(saved))))
+    assert read.saved() == saved
     for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0]):
-        with pytest.raises(DataError, match="camera_up"):
-            Gravity.of(wrong)
+        for key in ("camera_up", "sensed_up"):
+            with pytest.raises(DataError, match=key):
+                Gravity.of(MapHeader(saved | {key: wrong}))
+    with pytest.raises(DataError, match="sensed_up has the length 40, of 3 unit vectors"):
+        Gravity.of(MapHeader(saved | {"sensed_frames": 3}))
+    with pytest.raises(DataError, match="sensed_frames must be a whole number"):
+        Gravity.of(MapHeader(saved | {"sensed_frames": -1}))
+
+
+def test_a_map_from_before_sensors_were_asked_is_read() -> None:
+    old = Gravity.of(MapHeader({"camera_up": [0.0, 0.0, 8.0]}))
+    assert old.sensed() is None
+    assert degrees(old.up(*room()), Z) < 0.1
 
 
 @pytest.mark.parametrize("seed", range(5))

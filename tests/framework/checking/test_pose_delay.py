@@ -1,0 +1,124 @@
+"""Poses of frames later or earlier, told by points that are known exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from framework.checking.matched_pairs import MatchedPair
+from framework.checking.pose_delay import LONGEST_DELAY, PoseDelay, delayed, find_delay
+from framework.checking.pose_fit import PoseFit, motion_of
+from framework.data import Camera, Float64, Frame
+from framework.datasets.reading import CameraAxes, PoseReading
+from framework.geometry import exp_se3, inverse, project, transform
+
+CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)
+BLANK = np.zeros((240, 320, 3), np.uint8), np.zeros((240, 320), np.float32)
+FRAMES = 80
+AS_IT_IS = (PoseFit(PoseReading(), 1.0, np.zeros(0)),)
+
+
+def trembling_walk() -> list[Float64]:
+    """A camera whose velocity changes from frame to frame."""
+    chosen = np.random.default_rng(0)
+    poses = [np.eye(4)]
+    for _ in range(FRAMES - 1):
+        poses.append(poses[-1] @ exp_se3(chosen.normal(scale=0.01, size=6)))
+    return poses
+
+
+def even_walk() -> list[Float64]:
+    """One that moves on as it did: the same step from frame to frame."""
+    return [exp_se3(k * np.array([0.01, 0.0, 0.005, 0.0, 0.01, 0.0])) for k in range(FRAMES)]
+
+
+def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: float = 0.0) -> list[MatchedPair]:
+    """Of frames all over the walk, each with its stored pose; noise in px."""
+    pairs = []
+    for k, step in ((k, step) for k in range(8, FRAMES - 24, 6) for step in (4, 8, 16)):
+        chosen = np.random.default_rng(k)
+        points = np.column_stack([chosen.uniform(-0.6, 0.6, (60, 2)), chosen.uniform(1.5, 3, 60)])
+        T_second_first = inverse(true[k + step]) @ true[k]
+        first, second = (Frame(n, n / 30, *BLANK, CAMERA, stored[n]) for n in (k, k + step))
+        pixels = project(CAMERA, points).astype(np.float32)
+        moved = project(CAMERA, transform(T_second_first, points)) + chosen.normal(scale=noise, size=(60, 2))
+        pairs.append(
+            MatchedPair(
+                first, second, step, points.astype(np.float32), pixels, moved.astype(np.float32), T_second_first
+            )
+        )
+    return pairs
+
+
+def late(poses: Sequence[Float64], frames: int) -> list[Float64 | None]:
+    """As they are stored where they come so many frames late."""
+    return [poses[k - frames] if 0 <= k - frames < len(poses) else None for k in range(len(poses))]
+
+
+def found(poses: Sequence[Float64], frames: int, noise: float = 0.0) -> PoseDelay | None:
+    stored = late(poses, frames)
+    return find_delay(pairs_of(poses, stored, noise), stored, AS_IT_IS)
+
+
+@pytest.mark.parametrize("frames", [-LONGEST_DELAY, -3, -1, 1, 2, 5, LONGEST_DELAY])
+def test_the_delay_is_found_and_leaves_no_error(frames: int) -> None:
+    delay = found(trembling_walk(), frames)
+    assert delay is not None
+    assert (delay.frames, delay.alike) == (frames, ())
+    assert delay.delayed_error == pytest.approx(0, abs=1e-3)
+    assert delay.error > 2
+    assert delay.finding(1, 0.1).setting == f"dataset.pose_delay={1 + frames}"
+
+
+def test_sound_poses_are_not_late_however_noisy_the_points() -> None:
+    for noise in (0.0, 1.0, 5.0):
+        assert found(trembling_walk(), 0, noise) is None
+
+
+@pytest.mark.parametrize("frames", [-2, 1, 3])
+def test_a_camera_that_moves_evenly_tells_no_delay(frames: int) -> None:
+    assert found(even_walk(), frames, 0.5) is None
+
+
+def test_a_longer_delay_is_not_taken_for_the_longest() -> None:
+    for frames in (LONGEST_DELAY + 1, LONGEST_DELAY + 2):
+        assert found(trembling_walk(), frames) is None
+
+
+def test_poses_of_another_walk_are_not_late() -> None:
+    """Whichever delay fits them least badly."""
+    other = [exp_se3(np.array([0, 0, 0, 0, 0, 0.5 * k])) for k in range(FRAMES)]
+    assert find_delay(pairs_of(trembling_walk(), other), other, AS_IT_IS) is None
+
+
+def test_pairs_without_all_poses_around_them_are_left_out() -> None:
+    poses = trembling_walk()
+    stored = late(poses, 2)
+    pairs = pairs_of(poses, stored)
+    stored[40] = None
+    delay = find_delay(pairs, stored, AS_IT_IS)
+    assert delay is not None
+    assert (delay.frames, delay.pairs < len(pairs)) == (2, True)
+    assert find_delay(pairs, stored[:20], AS_IT_IS) is None
+    assert find_delay(pairs, [], AS_IT_IS) is None
+
+
+def test_the_delay_is_found_in_the_axes_that_fit() -> None:
+    flip = np.diag([1.0, -1.0, -1.0, 1.0])
+    poses = trembling_walk()
+    stored = [None if T is None else T @ flip for T in late(poses, 3)]
+    opengl = PoseFit(PoseReading(camera_axes=CameraAxes.OPENGL), 1.0, np.zeros(0))
+    delay = find_delay(pairs_of(poses, stored), stored, (*AS_IT_IS, opengl))
+    assert delay is not None
+    assert delay.frames == 3
+
+
+def test_delayed_pairs_have_the_poses_that_belong_to_them() -> None:
+    poses = trembling_walk()
+    stored = late(poses, -2)
+    for pair in pairs_of(poses, stored):
+        meant = delayed(pair, stored, -2)
+        np.testing.assert_allclose(motion_of(meant, PoseReading()), pair.T_second_first, atol=1e-12)
+    assert delayed(pairs_of(poses, stored)[0], stored, -20).first.T_world_camera is None
