@@ -166,7 +166,7 @@ class Allocator:
         coords = self.allocate(frame.camera, frame.depth, T_world_camera)
         capacity = len(self.voxels.grid.block_coords)
         if len(self._stamp) < capacity:
-            self._stamp = grown(self._stamp, capacity, 0)
+            self._stamp = grown(self._stamp, capacity, zeros=True)
         active = np.empty(self.voxels.block_count, np.int32)
         count = _number_blocks(
             self.voxels.grid,

@@ -69,18 +69,14 @@ class Gravity:
 
     @classmethod
     def of(cls, header: MapHeader) -> Gravity:
-        """The one that was saved in a map's header; maps from before sensors were asked have `camera_up` alone.
-
-        Raises DataError where it is none.
-        """
+        """The one that was saved in a map's header. Raises DataError where it is none."""
         gravity = cls()
         gravity.camera_up = _vector(header, "camera_up")
-        if "sensed_up" in header.values:
-            gravity.sensed_up = _vector(header, "sensed_up")
-            gravity.sensed_frames = header.whole("sensed_frames")
-            length = float(np.linalg.norm(gravity.sensed_up))
-            if not length <= gravity.sensed_frames * (1 + UNIT_TOLERANCE):
-                raise DataError(f"sensed_up has the length {length:.4g}, of {gravity.sensed_frames} unit vectors")
+        gravity.sensed_up = _vector(header, "sensed_up")
+        gravity.sensed_frames = header.whole("sensed_frames")
+        length = float(np.linalg.norm(gravity.sensed_up))
+        if not length <= gravity.sensed_frames * (1 + UNIT_TOLERANCE):
+            raise DataError(f"sensed_up has the length {length:.4g}, of {gravity.sensed_frames} unit vectors")
         return gravity
 
     def sensed(self) -> Float64 | None:

@@ -335,5 +335,5 @@ class SurfaceNets:
         if count + 1 > len(self._inside):
             capacity = len(self.voxels.grid.block_coords) + 1
             self._inside, self._seen, self._cells = (
-                grown(words, capacity, 0) for words in (self._inside, self._seen, self._cells)
+                grown(words, capacity, zeros=True) for words in (self._inside, self._seen, self._cells)
             )

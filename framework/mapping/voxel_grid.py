@@ -26,6 +26,11 @@ from numba import njit
 from framework.data import Int32, UInt8
 from framework.errors import MapFullError
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 Element = TypeVar("Element", bound=np.generic)
 Made = TypeVar("Made")
 
@@ -38,7 +43,7 @@ WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
 TSDF_MAX = 32767  # the stored value of the widest truncation distance
 UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
 NO_KEY = -1
-LEAST_RESERVED = 1024  # blocks or voxels
+FIRST_RESERVED = 1024  # blocks or voxels
 
 # What kernels call in their innermost loops. Without reference counts (_nrt): threads that count the same arrays of the
 # Grid up and down at each call wait for each other.
@@ -262,17 +267,18 @@ def _free_blocks(count: int) -> tuple[npt.NDArray[Any], ...]:
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
-    """What `make` gives for the length `most`, or where the system does not promise so much memory, for half or less.
+    """What `make` gives for the length `most`, or for FIRST_RESERVED, to grow, where memory is counted by what is asked
+    for: that is so on Windows, under `ulimit -v`, and where the system does not promise more than it has.
 
     It makes arrays without writing them: they cost no memory yet, and what need not grow is never copied.
     """
-    while True:
-        try:
-            return make(most)
-        except MemoryError:
-            if most <= LEAST_RESERVED:
-                raise
-            most = max(most // 2, LEAST_RESERVED)
+    first = min(most, FIRST_RESERVED)
+    if resource is None or resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        return make(first)
+    try:
+        return make(most)
+    except MemoryError:
+        return make(first)
 
 
 class VoxelGrid:
@@ -366,13 +372,11 @@ class VoxelGrid:
         self.grid = grid
 
 
-def grown(array: npt.NDArray[Element], length: int, fill: int | None = None) -> npt.NDArray[Element]:
-    """A copy of `array` with its first axis made `length` long, the new part filled with `fill`.
+def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:
+    """A copy of `array` with its first axis made `length` long; the new part holds anything, or zeros.
 
-    Without `fill` the new part holds anything, and costs no memory before it is written.
+    It costs no memory before it is written.
     """
-    longer = np.empty((length, *array.shape[1:]), array.dtype)
+    longer = (np.zeros if zeros else np.empty)((length, *array.shape[1:]), array.dtype)
     longer[: len(array)] = array
-    if fill is not None:
-        longer[len(array) :] = fill
     return longer

@@ -203,7 +203,7 @@ class ClassRows:
         """Updates the voxels near the measured surface of the blocks that a frame has seen."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
-            self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, 0))
+            self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
         wants_row = np.empty(len(seen.blocks), np.bool_)
         evicted = np.empty(len(seen.blocks), np.int32)
         _find_blocks_under_masks(self.voxels.grid, seen, masks.cluster, wants_row)

@@ -44,7 +44,7 @@ from framework.mapping.vertex_labels import vertex_colors
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid
 from framework.rivals.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume, look_up_object
 
-FORMAT = "object_volumes 3"  # of the saved file; a change of meaning counts it up
+FORMAT = "object_volumes 4"  # of the saved file; a change of meaning counts it up
 OBJECT = "object_"  # before the names of the arrays that hold all objects' volumes, one after the other
 
 

@@ -148,7 +148,7 @@ class ObjectVolume:
         """Makes room for the counts of new blocks, which are 0."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.counts.observed) < capacity:
-            self.counts = MaskCounts(*(grown(counts, capacity, 0) for counts in self.counts))
+            self.counts = MaskCounts(*(grown(counts, capacity, zeros=True) for counts in self.counts))
 
     def _measure(self) -> None:
         coords = self.voxels.grid.block_coords[: self.block_count]

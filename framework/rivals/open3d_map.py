@@ -19,7 +19,7 @@ from framework.mapping.instance_table import InstanceTable
 from framework.mapping.map_file import check_known, faults_of, plain_table, read_map, table_of, write_map
 from framework.rivals.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
 
-FORMAT = "open3d_vbg 4"  # of the saved file; a change of meaning counts it up
+FORMAT = "open3d_vbg 5"  # of the saved file; a change of meaning counts it up
 
 
 class Open3DMap(SceneMap):

@@ -21,7 +21,7 @@ from framework.rivals.class_evidence import ClassEvidence, ClassRows, best_class
 from framework.rivals.connected_components import component_statistics, connected_components, vertex_classes
 
 MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of what a map is made with; m^2
-FORMAT = "semantic 2"  # of the saved file; a change of meaning counts it up
+FORMAT = "semantic 3"  # of the saved file; a change of meaning counts it up
 
 
 @njit(cache=True, nogil=True, parallel=True)

@@ -1,12 +1,14 @@
 """The hash table and the blocks."""
 
+import resource
+
 import numpy as np
 import pytest
 from numba import njit
 
 from framework.errors import MapFullError
 from framework.mapping import voxel_grid
-from framework.mapping.voxel_grid import UNSEEN, VoxelGrid, find_block, reserved
+from framework.mapping.voxel_grid import FIRST_RESERVED, UNSEEN, VoxelGrid, find_block, reserved
 
 
 @njit
@@ -46,16 +48,20 @@ def test_growing_keeps_what_is_stored(promised: int, monkeypatch: pytest.MonkeyP
     assert (voxels.grid.tsdf[1:8000] == UNSEEN).all()
 
 
-def test_less_is_reserved_where_less_is_promised() -> None:
+def test_less_is_reserved_where_memory_is_counted_by_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     def make(length: int) -> int:
         if length > 3000:
             raise MemoryError
         return length
 
     assert reserved(2000, make) == 2000
-    assert reserved(10_000, make) == 2500
-    with pytest.raises(MemoryError):
-        reserved(10_000, lambda _: make(3001))
+    assert reserved(10_000, make) == FIRST_RESERVED
+    assert reserved(10, make) == 10
+    with monkeypatch.context() as limited:
+        limited.setattr(resource, "getrlimit", lambda _: (2**33, 2**33))
+        assert reserved(2000, make) == FIRST_RESERVED
+    monkeypatch.setattr(voxel_grid, "resource", None)
+    assert reserved(2000, make) == FIRST_RESERVED
 
 
 def test_the_budget_is_an_error_that_names_the_setting() -> None:

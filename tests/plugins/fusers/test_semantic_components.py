@@ -256,7 +256,7 @@ def test_mapping_goes_on_after_loading(frames: list[Frame], tmp_path: Path) -> N
 
 def test_a_map_of_instances_is_refused(tmp_path: Path) -> None:
     BayesianTsdf().scene.save(tmp_path / "map.npz")
-    with pytest.raises(DataError, match="map format 7, this version reads semantic 2"):
+    with pytest.raises(DataError, match="map format 7, this version reads semantic 3"):
         SemanticMap.load(tmp_path / "map.npz")
 
 
