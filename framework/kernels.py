@@ -38,7 +38,7 @@ LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[1]
 DEFAULT, OTHERS = "# a run with the default stages", "# what other stages add"
 MOST_WORKERS = 4  # each compiles anew what kernels share, and takes 0.5 GB
-SECONDS_EACH = 1.3  # of a core, on the machine of README's figures: for a guess of how long it takes
+SECONDS_EACH = 0.8  # of a core, on the machine of README's figures: for a guess of how long it takes
 SIGN_OF_LIFE = 4.0  # s, from one line to the next where no bar is shown
 
 
@@ -67,7 +67,8 @@ class Kernel:
         if not index.exists():
             return False
         written = index.stat().st_mtime
-        if any(Path(path).stat().st_mtime > written for path in _files_of(self.dispatcher)):
+        files = {kernel.py_func.__code__.co_filename for kernel in called_by(self.dispatcher)}
+        if any(Path(path).stat().st_mtime > written for path in files):
             cache.flush()  # numba looks at the kernel's own file alone
             return False
         codegen = self.dispatcher.targetctx.codegen()
@@ -157,29 +158,13 @@ def _worker() -> subprocess.Popen[str]:
     """A process that compiles the kernels whose lines it is given, and answers each."""
     path = os.pathsep.join(filter(None, [str(CHECKOUT), os.environ.get("PYTHONPATH")]))
     return subprocess.Popen(
-        [sys.executable, "-c", "from framework.kernels import work; work()"],
+        [sys.executable, "-P", "-m", "framework.kernel_worker"],  # -P: nothing of the working folder
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONPATH": path},
         start_new_session=os.name == "posix",  # Ctrl-C is for who has started it
     )
-
-
-def work() -> None:
-    """What a worker does: reads one kernel a line, compiles it, writes a line, until there are no more."""
-    import gc
-
-    gc.freeze()  # numba makes many objects that stay: looking through them again and again takes a tenth of the time
-    gc.set_threshold(200_000, 20, 20)
-    for line in sys.stdin:
-        module, name, arguments = line.rstrip("\n").split("\t")
-        try:
-            Kernel(module, name, arguments).compile()
-        except Exception as error:
-            print(f"{module}.{name} cannot be compiled: {type(error).__name__}: {error}".splitlines()[0], flush=True)
-        else:
-            print(flush=True)
 
 
 def _feed(
@@ -239,19 +224,18 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
         yield
 
 
-def _files_of(dispatcher: Any) -> set[str]:
-    """The files of a kernel and of all kernels that it calls, directly or not."""
+def called_by(dispatcher: Any) -> set[Any]:
+    """A kernel and all kernels that it calls, directly or not."""
     found: set[Any] = set()
     waiting = [dispatcher]
     while waiting:
         kernel = waiting.pop()
-        if kernel in found:
-            continue
-        found.add(kernel)
-        names = set(_names(kernel.py_func.__code__))
-        scope = kernel.py_func.__globals__
-        waiting += [scope[name] for name in names if isinstance(scope.get(name), Dispatcher)]
-    return {kernel.py_func.__code__.co_filename for kernel in found}
+        if kernel not in found:
+            found.add(kernel)
+            scope = kernel.py_func.__globals__
+            called = {scope.get(name) for name in _names(kernel.py_func.__code__)}
+            waiting += [kernel for kernel in called if isinstance(kernel, Dispatcher)]
+    return found
 
 
 def _names(code: CodeType) -> Iterator[str]:

@@ -14,6 +14,7 @@ LAYERS = [
     ["errors"],
     ["data", "interruption", "parameters", "settings"],
     ["geometry", "kernels", "sensor_noise"],
+    ["kernel_worker"],
     ["interfaces"],
     ["frame_stream"],
     ["files"],
