@@ -233,8 +233,8 @@ def called_by(dispatcher: Any) -> set[Any]:
         if kernel not in found:
             found.add(kernel)
             scope = kernel.py_func.__globals__
-            called = {scope.get(name) for name in _names(kernel.py_func.__code__)}
-            waiting += [kernel for kernel in called if isinstance(kernel, Dispatcher)]
+            called = (scope.get(name) for name in set(_names(kernel.py_func.__code__)))
+            waiting += [value for value in called if isinstance(value, Dispatcher)]
     return found
 
 
