@@ -24,7 +24,7 @@ from pathlib import Path
 from types import CodeType
 from typing import Any
 
-from filelock import FileLock
+from filelock import FileLock, Timeout
 from numba import types
 from numba.core.dispatcher import Dispatcher
 from tqdm import tqdm
@@ -38,7 +38,7 @@ LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[1]
 DEFAULT, OTHERS = "# a run with the default stages", "# what other stages add"
 MOST_WORKERS = 4  # each compiles anew what kernels share, and takes 0.5 GB
-SECONDS_EACH = 0.8  # of a core, an AMD EPYC (Zen 5) with 2 cores: for a guess of how long it takes
+SECONDS_EACH = 0.9  # of a core, an AMD EPYC (Zen 5) with 2 cores: for a guess of how long it takes
 SIGN_OF_LIFE = 4.0  # s, from one line to the next where no bar is shown
 
 
@@ -220,8 +220,19 @@ def _one_process_at_a_time(kernels: list[Kernel]) -> Iterator[None]:
     """The jobs of a sweep start together: one compiles, and the others wait for what it has made."""
     folder = Path(kernels[0].dispatcher._cache.cache_path)
     folder.mkdir(parents=True, exist_ok=True)
-    with FileLock(folder / "compiling.lock"):
+    lock = FileLock(folder / "compiling.lock")
+    try:
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            log.info("another process compiles kernels: waiting for it")
+            lock.acquire()
+    except OSError as error:  # a file system without locks: several may do the same work
+        log.warning("%s cannot be locked (%s)", folder, error.strerror)
+    try:
         yield
+    finally:
+        lock.release()
 
 
 def called_by(dispatcher: Any) -> set[Any]:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
 import numba
 import numpy as np
 import pytest
+from filelock import FileLock
 from numba.core.dispatcher import Dispatcher
 
 from framework import kernels
@@ -111,3 +114,22 @@ def test_a_worker_that_ends_is_told(small: Path, monkeypatch: pytest.MonkeyPatch
     )
     with pytest.raises(DataError, match=r"kernel_caller\.small: its process has ended"):
         compile_all([Kernel("kernel_caller", "small", "int64")])
+
+
+def test_who_comes_second_waits_and_compiles_nothing(
+    small: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    kernel = Kernel("kernel_caller", "small", "int64")
+    monkeypatch.setattr(kernels, "listed", lambda *_: [kernel])
+    importlib.import_module("kernel_caller")  # as the stages of a run are
+    lock = FileLock(Path(kernel.dispatcher._cache.cache_path) / "compiling.lock")
+    Path(lock.lock_file).parent.mkdir(exist_ok=True)
+    caplog.set_level("INFO")
+    with lock:
+        second = threading.Thread(target=kernels.compile_for_run)
+        second.start()
+        while not caplog.messages:
+            time.sleep(0.01)
+        compile_all([kernel])
+    second.join()
+    assert caplog.messages == ["another process compiles kernels: waiting for it"]
