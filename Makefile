@@ -24,6 +24,7 @@ help: ## this list
 
 .PHONY: demo
 demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
+	@$(BIN)/python -m framework compile
 	@$(BIN)/python -m framework dataset=desk hydra.run.dir=$(DEMO)
 
 .PHONY: test
@@ -31,10 +32,12 @@ test: $(INSTALLED_DEV) ## lint, check types, run the tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/python -m framework compile --all
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --quiet
 
 .PHONY: install
 install: $(INSTALLED_DEV) ## only set up, for developers
+	@$(BIN)/python -m framework compile --all
 
 .PHONY: format
 format: $(INSTALLED_DEV) ## format the code and mend what the linter can

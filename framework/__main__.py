@@ -20,6 +20,7 @@ COMMANDS = {
     "evaluate": "evaluates stored runs anew, without running them again",
     "detect": "writes a video's detections as a COCO result file",
     "show-refinement": "draws one frame's masks before and after refinement",
+    "compile": "compiles the map's kernels, once for a machine: the first run then begins at once",
     "plugins": "lists what is registered for each stage, with its parameters",
     "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
     "train-detector": "trains Mask R-CNN on rendered rooms",

@@ -28,6 +28,7 @@ from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence, SceneMap
 from framework.journal import Journal
+from framework.kernels import compile_for_run
 from framework.object_queries import Map
 from framework.parameters import checked_path
 from framework.pipeline import Pipeline
@@ -141,6 +142,7 @@ class Mapper(Map):
         Settings.of(config).apply()
         self.pipeline = pipeline_of(config)
         begin(config, self.pipeline)
+        compile_for_run()
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)

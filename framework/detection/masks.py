@@ -81,7 +81,7 @@ def _bounds(masks):
                 u -= 1
             x2 = max(x2, u)
         if x2 >= 0:
-            bounds[i] = x1, y1, x2, y2
+            bounds[i, 0], bounds[i, 1], bounds[i, 2], bounds[i, 3] = x1, y1, x2, y2
     return bounds
 
 

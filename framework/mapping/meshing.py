@@ -117,7 +117,10 @@ def _find_cells(grid, blocks, inside, seen, most_jump, cells):
                 n = lowest_bit(candidates)
                 candidates &= candidates - ONE
                 _cell_corners(tsdf, around, n & 7, n >> 3, z, corners)
-                if corners.max() - corners.min() > most_jump:
+                lowest = highest = corners[0]
+                for c in range(1, 8):
+                    lowest, highest = min(lowest, corners[c]), max(highest, corners[c])
+                if highest - lowest > most_jump:
                     found ^= ONE << np.uint64(n)
             cells[block, z] = found
             any_low, all_low, seen_low = any_high, all_high, seen_high

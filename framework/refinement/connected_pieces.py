@@ -118,10 +118,22 @@ def _keep_near(
     if len(others) == 0:
         return
     ends = _some_of(pixels, piece, largest, ENDS)
-    for other in others[np.argsort(-sizes[others], kind="mergesort")]:
+    for _ in range(len(others)):
+        other = _largest(others, sizes, large)
+        large[other] = False
         if _is_near(_some_of(pixels, piece, other, STARTS), ends, depth, gap, gap_per_depth, steepest):
             stays[other] = True
             ends = np.concatenate((ends, _some_of(pixels, piece, other, ENDS)))
+
+
+@njit(cache=True, nogil=True)
+def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
+    """The largest of the pieces that wait, of several such the first; they are few, and np.argsort compiles slowly."""
+    largest = -1
+    for piece in pieces:
+        if waiting[piece] and (largest < 0 or sizes[piece] > sizes[largest]):
+            largest = piece
+    return largest
 
 
 @njit(cache=True, nogil=True)

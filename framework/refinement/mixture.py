@@ -259,7 +259,10 @@ def _claim(
     """Whether own / (own + others) > min_posterior for each point of the batches, of one mixture each."""
     for b in prange(len(owner)):
         k, first, last = owner[b], firsts[b], lasts[b]
-        if rows[k, :, 0].max() <= ABSENT:
+        absent = True
+        for component in range(rows.shape[1]):
+            absent = absent and rows[k, component, 0] <= ABSENT
+        if absent:
             claimed[first:last] = True
         else:
             _claim_batch(

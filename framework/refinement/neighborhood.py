@@ -191,20 +191,25 @@ def thread_shares(costs: Int64) -> tuple[Int64, Int64]:
     costliest goes first, to the thread that has least to do (Graham 1969). Clusters do not know of each other, so that
     results do not depend on it.
     """
-    order, starts = _longest_first(costs, numba.get_num_threads())
+    order, starts = _share(costs, np.argsort(-costs, kind="stable"), numba.get_num_threads())
     return order, starts
 
 
 @njit(cache=True, nogil=True)
-def _longest_first(costs: Int64, threads: int) -> tuple[Int64, Int64]:
+def _share(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
-    for k in np.argsort(-costs, kind="mergesort"):
+    for k in longest_first:
         owners[k] = np.argmin(loads)
         loads[owners[k]] += costs[k] + 1
-    order = np.argsort(owners, kind="mergesort")
     for k in range(len(costs)):
         starts[owners[k] + 1] += 1
-    return order, np.cumsum(starts)
+    for thread in range(threads):
+        starts[thread + 1] += starts[thread]
+    places, order = starts.copy(), np.empty(len(costs), np.int64)
+    for k in range(len(costs)):
+        order[places[owners[k]]] = k
+        places[owners[k]] += 1
+    return order, starts
 
 
 def pinhole(camera: Camera) -> Float32:

@@ -15,31 +15,46 @@ def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: f
     `on_plane` (H, W) has 1 + the plane of each reading, 0 = none. A cluster loses those planes of which it holds at
     most `max_own` of the readings.
     """
-    kept, structure = _off_planes(clusters.cluster, clusters.pixels, on_plane, len(clusters), planes, max_own)
+    structure = on_plane > 0
+    kept = _off_planes(clusters.cluster, clusters.pixels, on_plane, len(clusters), planes, max_own, structure)
     return kept, structure
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _off_planes(
-    cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float
-) -> tuple[Bool, Bool]:
-    """A pixel is in a cluster once, so its points on a plane are a part of the plane's."""
+    cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float, structure: Bool
+) -> Bool:
+    """Returns which points are kept, and takes those on planes from `structure`.
+
+    A pixel is in a cluster once, so its points on a plane are a part of the plane's.
+    """
     parts = (len(cluster) + PART - 1) // PART
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
     counts = np.zeros((parts, clusters + 1, planes + 1), np.int64)  # the last row is for points of no cluster
     for part in prange(parts):
         own = slice(part * PART, (part + 1) * PART)
         _count_on_planes(cluster[own], pixels[own], on_plane, labels[own], counts[part])
-    on_planes = counts.sum(axis=0)
-    stays = np.ones((clusters + 1, planes + 1), np.bool_)
-    for label in range(1, planes + 1):
-        stays[:clusters, label] = on_planes[:clusters, label] > max_own * _count(on_plane.ravel(), label)
-    structure = on_plane > 0
+    stays = _stays(counts, on_plane, max_own)
     for i in prange(len(cluster)):
         kept[i] = stays[cluster[i], labels[i]]
         if kept[i] and cluster[i] >= 0 and labels[i] > 0:
             structure[pixels[i, 1], pixels[i, 0]] = False
-    return kept, structure
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def _stays(counts: Int64, on_plane: UInt8, max_own: float) -> Bool:
+    """Whether the points of each cluster, and in the last row of none, on each plane, and in column 0 on none, stay."""
+    parts, rows, columns = counts.shape
+    stays = np.ones((rows, columns), np.bool_)
+    for label in range(1, columns):
+        most = max_own * _count(on_plane.ravel(), label)
+        for k in range(rows - 1):
+            own = 0
+            for part in range(parts):
+                own += counts[part, k, label]
+            stays[k, label] = own > most
+    return stays
 
 
 @njit(cache=True, nogil=True)

@@ -106,6 +106,7 @@ def _framed(R_world_camera: Float64, points_world: Float32, width: int, height: 
 def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: Float64) -> Int32:
     """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
     nearest = np.full(camera.shape, -1, np.int32)
+    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)  # one kernel for both layouts
     _draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
     return np.asarray(nearest[nearest >= 0])
 

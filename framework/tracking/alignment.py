@@ -397,7 +397,8 @@ def _accumulate(
         for i in range(SUMS):
             for lane in range(LANES):
                 total[i] += lanes[i * LANES + lane]
-        sums[chunk] = total
+        for i in range(TERMS):  # not `sums[chunk] = total`, which takes seconds to compile
+            sums[chunk, i] = total[i]
 
 
 def linearize(

@@ -13,7 +13,8 @@ CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = [
     ["errors"],
     ["data", "interruption", "parameters", "settings"],
-    ["geometry", "sensor_noise"],
+    ["geometry", "kernels", "sensor_noise"],
+    ["kernel_worker"],
     ["interfaces"],
     ["frame_stream"],
     ["files"],

@@ -166,6 +166,7 @@ FAULTY = {
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],
+    "compile": ["nothing"],
     "plugins": ["detector", "nothing"],
     "synthesize": ["new", "--scenes=999"],
     "train-detector": ["device=tpu"],

@@ -7,11 +7,18 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.geometry import back_project
-from framework.refinement.planes import Planes, find_planes, plane_image
+from framework.refinement.planes import Planes, _order, find_planes, plane_image
 from tests.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 FLOOR, WALL = np.array([0.0, 1 / 1.2, 0.0]), np.array([0.1, 0.05, 0.3])  # 1/m, n / d
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 10, 257])
+def test_order_is_that_of_sorted_values(count):
+    values = np.random.default_rng(count).integers(0, 40, count).astype(np.float64)  # with equal ones
+    for k in range(count):
+        assert _order(values.copy(), k) == np.sort(values)[k]
 
 
 def rays(camera: Camera = CAMERA) -> np.ndarray:
