@@ -184,6 +184,27 @@ def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
         Gravity.of(MapHeader(saved | {"sensed_frames": -1}))
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_an_upright_box_is_the_box_that_was_turned(seed: int) -> None:
+    chosen = np.random.default_rng(seed)
+    size, center, turn = np.sort(chosen.uniform(0.2, 2, 3)), chosen.normal(size=3), chosen.uniform(0, np.pi)
+    world = Rotation.random(random_state=seed)
+    standing = world * Rotation.from_euler("z", turn)
+    corners = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * size
+    inside = chosen.uniform(-0.5, 0.5, (200, 3)) * size
+    points = (standing.apply(np.concatenate([corners, inside])) + center).astype(np.float32)
+    up = world.apply(Z)
+    box = upright_box(points, up)
+    np.testing.assert_allclose(box.center, center, atol=1e-4)
+    np.testing.assert_allclose(np.sort(box.extent[:2]), np.sort(size[:2]), atol=1e-4)
+    assert box.extent[2] == pytest.approx(size[2], abs=1e-4)
+    np.testing.assert_allclose(box.rotation[:, 2], up, atol=1e-9)
+    np.testing.assert_allclose(box.rotation @ box.rotation.T, np.eye(3), atol=1e-9)
+    assert np.linalg.det(box.rotation) == pytest.approx(1)
+    within = np.abs((points - box.center) @ box.rotation)
+    assert (within <= box.extent / 2 + 1e-4).all()
+
+
 def test_a_box_around_little_is_a_box() -> None:
     for points in (np.zeros((1, 3)), np.array([[0, 0, 0], [1, 0, 0]]), np.array([[0, 0, 0], [0, 0, 2]])):
         box = box_around(points.astype(np.float32), Z)
