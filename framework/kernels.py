@@ -52,7 +52,13 @@ class Kernel:
 
     @property
     def dispatcher(self) -> Any:
-        return getattr(import_module(self.module), self.name)
+        """Raises DataError where the list is older than the code."""
+        found = getattr(import_module(self.module), self.name, None)
+        if not isinstance(found, Dispatcher):
+            raise DataError(
+                f"{LIST.name}: there is no kernel {self.module}.{self.name}; run python -m tests.kernel_calls"
+            )
+        return found
 
     @property
     def signature(self) -> tuple[Any, ...]:
