@@ -6,6 +6,8 @@ numbered in a serial pass, so that the map is the same with any number of thread
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit, prange
 
@@ -156,6 +158,10 @@ class Allocator:
         self._frames = 0
         self._stamp = np.zeros(0, np.int32)  # (B,) the last frame, counted from 1, in which a block was active
         self._found = np.empty((CHUNKS, 4096), np.int64)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved."""
+        return {**vars(self), "_stamp": self._stamp[: self.voxels.block_count]}
 
     def active_blocks(self, frame: Frame, T_world_camera: Float64) -> Int32:
         """(A,) the blocks around the surface that the frame sees, allocated here, and those that it sees through.

@@ -428,6 +428,10 @@ class EvidenceRows:
         self._class_slots = CLASS_SLOTS
         self.evidence = self._free()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved, which is gigabytes."""
+        return {**vars(self), "evidence": self.in_use()}
+
     @property
     def byte_count(self) -> int:
         """Of what is in use: capacity that no voxel has been given yet takes no memory."""

@@ -33,6 +33,10 @@ class TsdfVolume:
         self._up: Float64 | None = None
         self.gravity = Gravity()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is derived from the voxels."""
+        return {**vars(self), "_nets": None, "_mesh": None}
+
     @property
     def voxel_size(self) -> float:
         """m"""

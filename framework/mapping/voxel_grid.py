@@ -80,6 +80,9 @@ class Grid(NamedTuple):
     label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
 
 
+OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # (B, ...)
+
+
 @device
 def pack_key(x, y, z):
     """The key of the coordinates of a region or a block, never negative."""
@@ -253,17 +256,17 @@ def _rehash(old_keys, old_regions, keys, regions):
             regions[slot] = old_regions[i]
 
 
-def _free_blocks(count: int) -> tuple[npt.NDArray[Any], ...]:
-    """The arrays of so many blocks, as in a Grid."""
-    return (
-        np.empty((count, 3), np.int32),
-        np.empty((count, 8), np.int32),
-        np.empty((count, BLOCK_VOXELS), np.int16),
-        np.empty((count, BLOCK_VOXELS), np.uint16),
-        np.empty((count, BLOCK_VOXELS), np.uint32),
-        np.empty(count, np.uint8),
-        np.empty(count, np.int32),
-    )
+def _free_blocks(count: int) -> dict[str, Any]:
+    """The OF_BLOCKS of so many blocks."""
+    return {
+        "block_coords": np.empty((count, 3), np.int32),
+        "neighbors": np.empty((count, 8), np.int32),
+        "tsdf": np.empty((count, BLOCK_VOXELS), np.int16),
+        "weight": np.empty((count, BLOCK_VOXELS), np.uint16),
+        "color": np.empty((count, BLOCK_VOXELS), np.uint32),
+        "solid": np.empty(count, np.uint8),
+        "label_row": np.empty(count, np.int32),
+    }
 
 
 def reserved(most: int, make: Callable[[int], Made]) -> Made:
@@ -288,7 +291,6 @@ class VoxelGrid:
         self.max_blocks = max_blocks
         self.block_count = 0
         self.region_count = 0
-        block_coords, neighbors, tsdf, weight, color, solid, label_row = reserved(max_blocks, _free_blocks)
         self.grid = Grid(
             voxel_size=np.float32(voxel_size),
             tsdf_unit=np.float32(max_truncation / TSDF_MAX),
@@ -296,14 +298,13 @@ class VoxelGrid:
             table_regions=np.full(256, -1, np.int32),
             region_coords=np.empty((64, 3), np.int32),
             region_blocks=np.empty((64, REGION_BLOCKS), np.int32),
-            block_coords=block_coords,
-            neighbors=neighbors,
-            tsdf=tsdf,
-            weight=weight,
-            color=color,
-            solid=solid,
-            label_row=label_row,
+            **reserved(max_blocks, _free_blocks),
         )
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved, which is gigabytes."""
+        blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
+        return {**vars(self), "grid": self.grid._replace(**blocks)}
 
     @property
     def byte_count(self) -> int:
@@ -311,15 +312,7 @@ class VoxelGrid:
         grid = self.grid
         table = (grid.table_keys, grid.table_regions)
         regions = (grid.region_coords, grid.region_blocks)
-        blocks = (
-            grid.block_coords,
-            grid.neighbors,
-            grid.tsdf,
-            grid.weight,
-            grid.color,
-            grid.solid,
-            grid.label_row,
-        )
+        blocks: list[npt.NDArray[Any]] = [getattr(grid, name) for name in OF_BLOCKS]
         return (
             sum(array.nbytes for array in table)
             + sum(array[: self.region_count].nbytes for array in regions)
@@ -349,16 +342,9 @@ class VoxelGrid:
         """Doubles whichever capacity is used up."""
         grid = self.grid
         if self.block_count == len(grid.block_coords):
-            more = min(2 * len(grid.block_coords), self.max_blocks)
-            grid = grid._replace(
-                block_coords=grown(grid.block_coords, more),
-                neighbors=grown(grid.neighbors, more),
-                tsdf=grown(grid.tsdf, more),
-                weight=grown(grid.weight, more),
-                color=grown(grid.color, more),
-                solid=grown(grid.solid, more),
-                label_row=grown(grid.label_row, more),
-            )
+            more = min(max(2 * len(grid.block_coords), FIRST_RESERVED), self.max_blocks)
+            longer: dict[str, Any] = {name: grown(getattr(grid, name), more) for name in OF_BLOCKS}
+            grid = grid._replace(**longer)
         if self.region_count == len(grid.region_blocks):
             grid = grid._replace(
                 region_coords=grown(grid.region_coords, 2 * self.region_count),

@@ -188,6 +188,11 @@ class ClassRows:
         self.evicted = 0  # slots given to another class so far
         self.evidence = _free_rows(0)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved."""
+        unmasked = self.evidence.unmasked[: self.voxels.block_count]
+        return {**vars(self), "evidence": self.evidence._replace(unmasked=unmasked)}
+
     @property
     def byte_count(self) -> int:
         """Of what is in use."""

@@ -124,6 +124,10 @@ class ObjectVolume:
         self.low = np.full(3, np.inf)  # m: the corners of the box around its blocks
         self.high = np.full(3, -np.inf)
 
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved."""
+        return {**vars(self), "counts": MaskCounts(*(counts[: self.block_count] for counts in self.counts))}
+
     @property
     def block_count(self) -> int:
         return self.voxels.block_count

@@ -111,10 +111,13 @@ def test_several_threads_share_a_mapper(room: CornerRoom) -> None:
     np.testing.assert_array_equal(mapper.scene.mesh().vertices, alone.scene.mesh().vertices)
 
 
-def test_a_mapper_is_pickled(room: CornerRoom) -> None:
-    mapper = Mapper(*STAGES)
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "object_volumes", "semantic_components"])
+def test_a_mapper_is_pickled(room: CornerRoom, fuser: str) -> None:
+    mapper = Mapper(*STAGES, f"fuser={fuser}")
     mapper.add(room[0])
-    copied = pickle.loads(pickle.dumps(mapper))
+    pickled = pickle.dumps(mapper)
+    assert len(pickled) < 20e6, "without what is only reserved: gigabytes"
+    copied = pickle.loads(pickled)
     for one in (mapper, copied):
         one.add(room[1])
     np.testing.assert_array_equal(copied.scene.mesh().vertices, mapper.scene.mesh().vertices)
