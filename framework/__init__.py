@@ -4,7 +4,11 @@
 Scene" (Discrete Dynamics in Nature and Society, 2020, article 2528954); numbers in brackets are its equations.
 """
 
+import atexit
 import os
+import shutil
+import tempfile
+from pathlib import Path
 
 __version__ = "0.1.0"
 
@@ -15,3 +19,19 @@ __version__ = "0.1.0"
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+
+
+def _can_be_written(folder: Path) -> bool:
+    """The folder, or where it is to be made."""
+    there = next((path for path in (folder, *folder.parents) if path.exists()), Path())
+    return os.access(there, os.W_OK)
+
+
+# numba keeps kernels beside the code, else in the user's cache, and does not begin where neither can be written: in an
+# image that is only read, without a home. There they last as long as this process. The place is no known one, where
+# somebody else could leave other code.
+_HOME = os.environ.get("XDG_CACHE_HOME") or os.environ.get("HOME") or os.environ.get("USERPROFILE") or "/"
+_KEPT = (Path(__file__).parent, Path(_HOME))
+if "NUMBA_CACHE_DIR" not in os.environ and not any(map(_can_be_written, _KEPT)):
+    os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="instancemap-kernels-")
+    atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 from typing import Any
 
 import numba
@@ -17,6 +18,8 @@ from framework.errors import ConfigError
 from framework.evaluation import instances
 from framework.settings import Settings, available_cores
 from framework.synthetic.ray_caster import RayCaster
+
+CHECKOUT = Path(__file__).resolve().parents[2]
 
 
 def test_threads_limit_what_is_loaded_and_what_is_loaded_later() -> None:
@@ -78,6 +81,30 @@ print(torch.initial_seed())
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
     assert done.stdout.split() == ["5", "6"]
+
+
+WITHOUT_A_PLACE = """
+import os
+os.access = lambda *_: False
+import framework
+print(os.environ["NUMBA_CACHE_DIR"], os.path.isdir(os.environ["NUMBA_CACHE_DIR"]))
+from framework import geometry
+"""
+
+
+def test_kernels_are_kept_for_a_process_where_nothing_else_can_be_written(tmp_path: Path) -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(CHECKOUT)
+    line = [sys.executable, "-c", WITHOUT_A_PLACE]
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    folder, was_there = done.stdout.split()
+    assert was_there == "True"
+    assert not Path(folder).exists(), "it is removed in the end"
+    given = subprocess.run(
+        line, cwd=tmp_path, env=environment | {"NUMBA_CACHE_DIR": "given"}, capture_output=True, text=True, check=False
+    )
+    assert given.stdout.split()[0] == "given"
 
 
 def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
