@@ -24,6 +24,7 @@ from framework.data import UNIT_TOLERANCE, Float32, Float64, Int32
 from framework.errors import DataError
 from framework.mapping.map_header import MapHeader
 
+MOST_FRAMES = 1e9  # of a map
 AGREED = 0.95  # length of the mean of sensors' unit vectors, at least: so they are 18 degrees off it, or less
 DIGITS = 6  # of what a frame adds: the last ones of float64 depend on how arrays lie in memory
 SAMPLED = 20_000  # triangles that refine a direction; each VOTING-th of them votes for it
@@ -102,7 +103,7 @@ class Gravity:
     def _up_of(self, vertices: Float32, triangles: Int32) -> Float64 | None:
         """By a surface."""
         length = float(np.linalg.norm(self.camera_up))
-        if length == 0 or not len(triangles):
+        if length < 10.0**-DIGITS or not len(triangles):
             return None
         chosen = triangles[:: max(1, len(triangles) // SAMPLED)]
         normals, areas, _ = faces(vertices, chosen)
@@ -119,8 +120,8 @@ class Gravity:
 def _vector(header: MapHeader, key: str) -> Float64:
     saved = header.items(key)
     numbers = [float(value) for value in saved if isinstance(value, int | float)]
-    if len(numbers) != 3 or len(saved) != 3 or not np.isfinite(numbers).all():
-        raise DataError(f"{key} must be three finite numbers, found {saved!r:.60}")
+    if len(numbers) != 3 or len(saved) != 3 or not (np.abs(numbers) < MOST_FRAMES).all():
+        raise DataError(f"{key} must be three numbers, sums of unit vectors, found {saved!r:.60}")
     return np.array(numbers)
 
 

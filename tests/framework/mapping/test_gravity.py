@@ -174,7 +174,7 @@ def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
     saved = sensing(np.eye(3)).saved()
     read = Gravity.of(MapHeader(json.loads(json.dumps(saved))))
     assert read.saved() == saved
-    for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0]):
+    for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0], [1e200, 0, 0]):
         for key in ("camera_up", "sensed_up"):
             with pytest.raises(DataError, match=key):
                 Gravity.of(MapHeader(saved | {key: wrong}))
