@@ -94,8 +94,9 @@ def begin_in(pipeline: Pipeline, run: Path) -> None:
     pipeline.tracker.recall(read_places(run / PLACES), scene_of("world", run))
 
 
-def begin(config: DictConfig, pipeline: Pipeline) -> None:
-    """What the keys `map` and `world` ask for."""
+def begin(config: DictConfig) -> Pipeline:
+    """The stages that a config names, with the map or the world that it asks for and their kernels compiled."""
+    pipeline = pipeline_of(config)
     map_, world = config.get("map"), config.get("world")
     if map_ is not None and world is not None:
         raise ConfigError("map and world exclude each other: one goes on with a map, the other begins one in its world")
@@ -103,6 +104,8 @@ def begin(config: DictConfig, pipeline: Pipeline) -> None:
         go_on(pipeline, checked_path("map", map_))
     if world is not None:
         begin_in(pipeline, checked_path("world", world))
+    compile_for_run()
+    return pipeline
 
 
 def scene_of(key: str, run: Path) -> SceneMap:
@@ -140,9 +143,7 @@ class Mapper(Map):
                 raise ConfigError(f"Mapper: {override} is of a run on the command line; here the frames are yours")
         config = composed("~dataset", *words)
         Settings.of(config).apply()
-        self.pipeline = pipeline_of(config)
-        begin(config, self.pipeline)
-        compile_for_run()
+        self.pipeline = begin(config)
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)

@@ -59,19 +59,16 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
     The first signal ends it after the frame, or the record, that is in work, the second one at once.
     """
-    from framework.api import begin, pipeline_of  # here: a misspelt name is answered before these load
+    from framework.api import begin  # here: a misspelt name is answered before these load
     from framework.datasets.recording import Recording
     from framework.detection.cache import cache_metrics
     from framework.interfaces import RGBDSequence, RGBDVideo
-    from framework.kernels import compile_for_run
     from framework.records.run_record import RunRecord, reason
     from framework.registry import STAGES, build
     from framework.settings import Settings
 
     Settings.of(config).apply()
-    pipeline = pipeline_of(config)
-    begin(config, pipeline)
-    compile_for_run()
+    pipeline = begin(config)
     video = build(RGBDVideo, config.get("dataset"))  # after the stages: making up a room takes longest
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")

@@ -5,7 +5,7 @@ Files of others often follow the format but for one convention. `python -m frame
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
 from pathlib import Path
@@ -86,15 +86,13 @@ class PoseReading:
         """The frames, each with the stored pose that belongs to it; one has a fault where that has, or is not there."""
         if not self.pose_delay:
             return stored
-        return [self._delayed(stored, k) for k in range(len(stored))]
+        return [self._delayed(*pair) for pair in with_partners(stored, self.pose_delay)]
 
-    def _delayed(self, stored: Sequence[RecordedFrame], k: int) -> RecordedFrame:
-        partner = k + self.pose_delay
-        if not 0 <= partner < len(stored):
-            fault = stored[k].fault or f"no pose is {self.pose_delay} frames away"
-            return replace(stored[k], T_world_camera=None, fault=fault)
-        fault = stored[k].fault or stored[partner].fault
-        return replace(stored[k], T_world_camera=stored[partner].T_world_camera, fault=fault)
+    def _delayed(self, frame: RecordedFrame, posed: RecordedFrame | None) -> RecordedFrame:
+        if posed is None:
+            fault = frame.fault or f"no pose is {self.pose_delay} frames away"
+            return replace(frame, T_world_camera=None, fault=fault)
+        return replace(frame, T_world_camera=posed.T_world_camera, fault=frame.fault or posed.fault)
 
 
 @dataclass(frozen=True)
@@ -111,15 +109,20 @@ class DepthReading:
 
     def frames(self, stored: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
         """The frames, each with the depth image that belongs to it; one that has none has a fault."""
-        if not self.depth_delay:
-            return stored
-        return [self._delayed(stored, k) for k in range(len(stored))]
+        return (
+            [self._delayed(*pair) for pair in with_partners(stored, self.depth_delay)] if self.depth_delay else stored
+        )
 
-    def _delayed(self, stored: Sequence[RecordedFrame], k: int) -> RecordedFrame:
-        partner = k + self.depth_delay
-        if not 0 <= partner < len(stored):
-            return replace(stored[k], fault=stored[k].fault or f"no depth image is {self.depth_delay} frames away")
-        return replace(stored[k], images=ColorAndDepth(stored[k].images, stored[partner].images))
+    def _delayed(self, frame: RecordedFrame, deep: RecordedFrame | None) -> RecordedFrame:
+        if deep is None:
+            return replace(frame, fault=frame.fault or f"no depth image is {self.depth_delay} frames away")
+        return replace(frame, images=ColorAndDepth(frame.images, deep.images))
+
+
+def with_partners(stored: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
+    """Each frame with the one that is so many frames later, None where there is none."""
+    for k, frame in enumerate(stored):
+        yield frame, stored[k + delay] if 0 <= k + delay < len(stored) else None
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,7 @@ def look_up_instances(
             z = depth[row * stride, column * stride]
             if z > np.float32(0.0):
                 block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
-                voxel = labeled_voxel(grid, evidence, block, n) if block >= 0 else np.int32(-1)
+                voxel = labeled_voxel(grid, evidence, block, n)
                 if voxel >= 0:
                     instance_ids[row, column] = best_instance(evidence, voxel)
 

@@ -133,8 +133,8 @@ def class_said(gains: Float64, units: int, named_bit: UInt8) -> Int64:
 
 @device
 def labeled_voxel(grid, evidence, block, n):
-    """The number of voxel n of a block among those that have slots, -1 if it has none."""
-    row = grid.label_row[block]
+    """The number of voxel n of a block, -1 = of none, among those that have slots; -1 if it has none."""
+    row = grid.label_row[block] if block >= 0 else np.int32(-1)
     return evidence.labeled[row, n] if row >= 0 else np.int32(-1)
 
 

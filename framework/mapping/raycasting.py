@@ -338,7 +338,7 @@ def label(grid, evidence, view, depth, instance_ids, class_ids):
             z = depth[v, u]
             if z > np.float32(0.0):
                 block, n, key, region = voxel_seen(grid, view, u, v, z, key, region)
-                voxel = labeled_voxel(grid, evidence, block, n) if block >= 0 else np.int32(-1)
+                voxel = labeled_voxel(grid, evidence, block, n)
                 if voxel >= 0:
                     instance_ids[v, u] = best_instance(evidence, voxel)
                     class_ids[v, u] = best_class(evidence, voxel)
