@@ -230,7 +230,8 @@ class Integrator:
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
         if len(self._near_pixel) < len(active):
-            self._near_pixel = np.empty((2 * len(active), BLOCK_VOXELS), np.int32)
+            # by an eighth more than is needed: nothing is copied, so that doubling would only take memory
+            self._near_pixel = np.empty((len(active) * 9 // 8 + 1, BLOCK_VOXELS), np.int32)
         seen = SeenBlocks(active, np.empty(len(active), np.bool_), self._near_pixel[: len(active)])
         _integrate(
             self.voxels.grid,
