@@ -7,13 +7,14 @@ import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import TypeVar, cast
 
 import numba
 
+from framework.core_sharing import CoreSharing
 from framework.data import Detections, Frame, Pose
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
@@ -114,16 +115,18 @@ class Pipeline:
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""
-        with closing(self.detect_ahead(video, journal, interruption)) as detected:
+        sharing = CoreSharing()
+        with closing(self.detect_ahead(video, journal, interruption, sharing)) as detected:
             for frame, detections in detected:
                 try:
-                    self.map_frame(frame, detections, journal)
+                    with sharing.mapping() if self.ahead else nullcontext():
+                        self.map_frame(frame, detections, journal)
                 except FrameError as error:
                     journal.frame_skipped(error)
                 interruption.check()
 
     def detect_ahead(
-        self, video: RGBDVideo, journal: Journal, interruption: Interruption
+        self, video: RGBDVideo, journal: Journal, interruption: Interruption, sharing: CoreSharing
     ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
@@ -132,8 +135,13 @@ class Pipeline:
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
         ahead = self.ahead if stream.most_ahead is None else min(self.ahead, stream.most_ahead)
+
+        def work(stream: FrameStream) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
+            with sharing.ahead() if ahead else nullcontext():
+                return self.read_and_detect(stream)
+
         # the stream ends first: the worker may be waiting for its next frame
-        with closing(map_ahead(self.read_and_detect, repeat(stream), ahead)) as outcomes, stream:
+        with closing(map_ahead(work, repeat(stream), ahead)) as outcomes, stream:
             for outcome in outcomes:
                 interruption.check()  # waiting for a frame may have taken long
                 journal.frames_dropped = stream.dropped

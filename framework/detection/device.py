@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 import torch
 
 from framework.parameters import require
@@ -16,3 +19,14 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
     there = torch.cuda.is_available()
     require(device != "cuda" or there, name, device, "cpu or auto without a GPU")
     return torch.device("cuda" if device != "cpu" and there else "cpu")
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Has torch compute in the calling thread alone: what is short is done before others have woken up."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)

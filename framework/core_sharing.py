@@ -1,0 +1,65 @@
+"""Who gets how many cores: the thread that reads and detects ahead, and the one that maps what was detected.
+
+A parallel loop waits for its slowest thread, and a thread whose core is taken is late by milliseconds. So loops of two
+threads that share all cores wait for each other: on two cores, beside a network that takes one, tracking and fusion
+have taken up to ten times as long with two threads as with one. Each gets cores of its own instead, in proportion to
+its work. No result depends on it, as no kernel's result depends on its number of threads.
+"""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
+from statistics import median
+from threading import Lock
+
+import numba
+
+RECENT = 15  # frames; their median is a frame's work
+
+
+class CoreSharing:
+    """How many threads the kernels of either side have, by what the latest frames have cost it."""
+
+    def __init__(self) -> None:
+        self.cores = numba.get_num_threads()
+        self._ahead: deque[float] = deque(maxlen=RECENT)  # s of cores' time a frame
+        self._mapping: deque[float] = deque(maxlen=RECENT)
+        self._lock = Lock()
+
+    @contextmanager
+    def ahead(self) -> Iterator[None]:
+        """Around what the thread ahead does with one frame."""
+        with self._measured(self.cores_ahead(), self._ahead):
+            yield
+
+    @contextmanager
+    def mapping(self) -> Iterator[None]:
+        """Around the mapping of one frame."""
+        with self._measured(self.cores - self.cores_ahead(), self._mapping):
+            yield
+
+    def cores_ahead(self) -> int:
+        """The share of the thread ahead, rounded.
+
+        0: its work is so little that the mapping has all cores, and is disturbed. All of them: the other way round.
+        """
+        with self._lock:
+            if not (self._ahead and self._mapping):
+                return self.cores // 2
+            ahead, mapping = median(self._ahead), median(self._mapping)
+        return round(self.cores * ahead / max(ahead + mapping, 1e-9))
+
+    @contextmanager
+    def _measured(self, cores: int, spent: deque[float]) -> Iterator[None]:
+        before, threads = numba.get_num_threads(), max(cores, 1)
+        numba.set_num_threads(threads)  # of the kernels that this thread calls
+        began = time.thread_time()
+        try:
+            yield
+        finally:
+            numba.set_num_threads(before)
+            with self._lock:
+                spent.append(threads * (time.thread_time() - began))
