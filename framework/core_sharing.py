@@ -24,7 +24,7 @@ class CoreSharing:
     """How many threads the kernels of either side have, by what the latest frames have cost it."""
 
     def __init__(self) -> None:
-        self.cores = numba.get_num_threads()
+        self.cores = int(numba.get_num_threads())
         self._ahead: deque[float] = deque(maxlen=RECENT)  # s of cores' time a frame
         self._mapping: deque[float] = deque(maxlen=RECENT)
         self._lock = Lock()

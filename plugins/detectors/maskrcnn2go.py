@@ -9,6 +9,7 @@ import logging
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -88,17 +89,18 @@ class MaskRCNN2Go(Detector):
         require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
         self._device = torch_device(self.device)
         self.classes = COCO
-        graph, tensors = _read_network(_find_weights(self.weights))
+        graph, tensors, spacings = _read_network(_find_weights(self.weights))
         tensors = {name: tensor.to(self._device) for name, tensor in tensors.items()}
         self._anchors: Float32 = tensors.pop("anchor").cpu().numpy()
         first = next(operator for operator in graph if operator["type"] == "Int8ConvRelu")["inputs"][1]
         tensors[first] = tensors[first].flip(1)  # trained on BGR; frames are RGB
         self._integers = self._computes_in_integers()
-        network = int8_network if self._integers else float_network
+        network = partial(int8_network, spacings=spacings) if self._integers else float_network
         outputs = ("xif3_6_int8", "rpn_cls_logits_int8", "rpn_bbox_pred_int8")
-        self._backbone = network(graph, tensors, ("data_NHWC",), outputs)
-        self._box_head = network(graph, tensors, ("roi_features",), ("cls_score_int8", "bbox_pred_int8"))
-        self._mask_head = network(graph, tensors, ("_[mask]_pool5",), ("conv5_mask_v1_int8",))
+        boxes = ("cls_score_int8", "bbox_pred_int8")
+        self._backbone = network(graph, tensors, inputs=("data_NHWC",), outputs=outputs)
+        self._box_head = network(graph, tensors, inputs=("roi_features",), outputs=boxes)
+        self._mask_head = network(graph, tensors, inputs=("_[mask]_pool5",), outputs=("conv5_mask_v1_int8",))
         self._mask_logits = tensors["mask_fcn_logits_w_int8"][:, :, 0, 0], tensors["mask_fcn_logits_b_int8"]
         self._mask_upsampling = tensors["mask_fcn_logits_up_w_int8"], tensors["mask_fcn_logits_up_b_int8"]
 
@@ -196,14 +198,14 @@ def _find_weights(folder: Path) -> Path:
     raise DataError(f"detector.weights: there is no folder {looked}; put {' and '.join(SHA256)} there")
 
 
-def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor]]:
-    """The operators in order, and every tensor dequantised."""
+def _read_network(folder: Path) -> tuple[list[Operator], dict[str, Tensor], dict[str, float]]:
+    """The operators in order, every tensor dequantised, and the distance of neighboring numbers in those that were."""
     content = {name: _read_checked(folder / name, sha256) for name, sha256 in SHA256.items()}
     description = json.loads(content["graph.json"])
     quantisation: Mapping[str, tuple[float, int]] = description["quant"]
     arrays = np.load(io.BytesIO(content["maskrcnn2go_coco_int8.npz"]), allow_pickle=False)
     tensors = {name: dequantised(arrays[name], quantisation.get(name)) for name in arrays.files}
-    return description["ops"], tensors
+    return description["ops"], tensors, {name: scale for name, (scale, _) in quantisation.items()}
 
 
 def _read_checked(path: Path, sha256: str) -> bytes:

@@ -1,4 +1,4 @@
-"""Mask R-CNN 2Go: the operators against their definition, and the real network on real pictures."""
+"""Mask R-CNN 2Go: the real network on real pictures, in integers and in float."""
 
 import json
 from pathlib import Path
@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from framework.data import Camera, Frame
+from framework.detection.caffe2_network import float_network
 from framework.detection.masks import mask_overlaps, tight_boxes
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import PROJECT_ROOT
 from framework.label_spaces import COCO
-from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, Network, _dequantised, _read_network
+from plugins.detectors import maskrcnn2go
+from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, _read_network
 
 SHARED = Path(__file__).resolve().parents[4] / "shared"
 WEIGHTS = PROJECT_ROOT / "plugins" / "detectors" / "maskrcnn2go_int8"
@@ -32,9 +34,9 @@ def shared_picture(scene, index):
     return picture(cv2.imread(str(path))[..., ::-1].copy())
 
 
-@pytest.fixture(scope="module")
-def detector():
-    return MaskRCNN2Go(device="cpu")
+@pytest.fixture(scope="module", params=[True, False], ids=["int8", "float"])
+def detector(request):
+    return MaskRCNN2Go(device="cpu", int8=request.param)
 
 
 def best_scores(detections):
@@ -43,86 +45,6 @@ def best_scores(detections):
         name = detections.classes[row.argmax()]
         best[name] = max(best.get(name, 0.0), float(score))
     return best
-
-
-# The operators
-
-
-def quantised(rng, shape, zero_point=120):
-    return rng.integers(0, 256, shape).astype(np.uint8), (0.01, zero_point)
-
-
-def real(values, scale_zero):
-    return (values.astype(np.float64) - scale_zero[1]) * scale_zero[0]
-
-
-def run_one(kind, args, x_nhwc, tensors):
-    """One operator through the graph interpreter, from and to NHWC as in the graph's own definition."""
-    operator = {"type": kind, "inputs": ["x", *tensors], "outputs": ["y"], "args": args}
-    network = Network([operator], tensors, ("x",), ("y",))
-    (y,) = network(torch.from_numpy(x_nhwc.astype(np.float32)).permute(0, 3, 1, 2))
-    return y.permute(0, 2, 3, 1).numpy() if y.ndim == 4 else y.numpy()
-
-
-@pytest.mark.parametrize(("stride", "pad", "group"), [(1, 1, 1), (2, 1, 1), (1, 1, 6), (2, 0, 3)])
-@pytest.mark.parametrize("relu", [False, True])
-def test_convolution_is_the_sum_over_the_window_of_dequantised_weights(stride, pad, group, relu):
-    rng = np.random.default_rng(7)
-    x = rng.normal(0, 1, (1, 7, 8, 6))
-    weight, weight_scale = quantised(rng, (6, 3, 3, 6 // group))
-    bias, bias_scale = rng.integers(-200, 200, 6).astype(np.int32), (0.002, 0)
-    tensors = {"w": _dequantised(weight, weight_scale), "b": _dequantised(bias, bias_scale)}
-    args = {"kernel": 3, "stride": stride, "pad": pad, "group": group}
-    y = run_one("Int8ConvRelu" if relu else "Int8Conv", args, x, tensors)
-
-    padded, w = np.pad(x, ((0, 0), (pad, pad), (pad, pad), (0, 0))), real(weight, weight_scale)
-    for i, j, out in np.ndindex(*y.shape[1:]):
-        first = out // (6 // group) * (6 // group)
-        window = padded[0, i * stride : i * stride + 3, j * stride : j * stride + 3, first : first + 6 // group]
-        expected = (window * w[out]).sum() + bias[out] * 0.002
-        assert y[0, i, j, out] == pytest.approx(max(expected, 0) if relu else expected, abs=1e-4)
-
-
-@pytest.mark.parametrize(("kernel", "pad"), [(2, 0), (4, 1)])
-def test_transposed_convolution_adds_each_input_times_the_kernel(kernel, pad):
-    rng = np.random.default_rng(8)
-    x = rng.normal(0, 1, (1, 5, 6, 3))
-    weight, scale = quantised(rng, (3, kernel, kernel, 4))
-    tensors = {"w": _dequantised(weight, scale), "b": torch.zeros(4)}
-    y = run_one("Int8ConvTranspose", {"kernel": kernel, "stride": 2, "pad": pad}, x, tensors)
-
-    expected, w = np.zeros((2 * 5 + kernel, 2 * 6 + kernel, 4)), real(weight, scale)
-    for i, j, ky, kx in np.ndindex(5, 6, kernel, kernel):
-        expected[2 * i + ky, 2 * j + kx] += x[0, i, j] @ w[:, ky, kx]
-    assert y.shape == (1, 10, 12, 4)
-    np.testing.assert_allclose(y[0], expected[pad : pad + 10, pad : pad + 12], atol=1e-4)
-
-
-def test_fully_connected_mean_sum_and_relu():
-    rng = np.random.default_rng(9)
-    x = rng.normal(0, 1, (2, 3, 3, 5))
-    mean = run_one("Int8AveragePool", {"kernel": 3, "stride": 1}, x, {})
-    np.testing.assert_allclose(mean[:, 0, 0], x.mean(axis=(1, 2)), atol=1e-6)
-    weight, scale = quantised(rng, (4, 5))
-    tensors = {"w": _dequantised(weight, scale), "b": torch.ones(4)}
-    np.testing.assert_allclose(
-        run_one("Int8FC", {}, mean, tensors), mean[:, 0, 0] @ real(weight, scale).T + 1, atol=1e-5
-    )
-    np.testing.assert_allclose(run_one("Int8Relu", {}, x, {}), np.maximum(x, 0), atol=1e-6)
-
-
-def test_a_network_runs_only_what_its_outputs_need():
-    tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
-    conv = {"type": "Int8Conv", "args": {"kernel": 1, "stride": 1, "pad": 0}}
-    graph = [
-        {**conv, "inputs": ["x", "w", "b"], "outputs": ["y"]},
-        {"type": "Unknown", "inputs": ["y"], "outputs": ["elsewhere"], "args": {}},
-        {"type": "Int8Sum", "inputs": ["x", "y"], "outputs": ["z"], "args": {}},
-    ]
-    (z,) = Network(graph, tensors, ("x",), ("z",))(torch.full((1, 1, 2, 2), 3.0))
-    assert (z == 6).all()
-    with pytest.raises(DataError, match="the operator Unknown is not known"):
-        Network(graph, tensors, ("x",), ("elsewhere",))
 
 
 # The network
@@ -150,25 +72,69 @@ def test_the_mask_of_the_true_bed_sits_on_it(detector):
         pytest.skip(f"{root} is absent")
     beds = [int(i) for i, about in json.loads((root / "instances.json").read_text()).items() if about["class"] == "bed"]
     ious = []
-    for index in range(0, 123, 8):
+    for index in range(0, 123, 2):
         detections = detector.detect(shared_picture("replica_floor2", index))
         ids = cv2.imread(str(root / "instance" / f"{index:06d}.png"), cv2.IMREAD_UNCHANGED)
         for mask, score, row in zip(detections.masks, detections.scores, detections.class_probabilities, strict=True):
-            if score > 0.9 and COCO[row.argmax()] == "bed":
+            if score > 0.7 and COCO[row.argmax()] == "bed":
                 ious.append(max((mask & (ids == i)).sum() / (mask | (ids == i)).sum() for i in beds))
-    assert len(ious) >= 3
-    assert np.median(ious) > 0.8  # its pillows carry labels of their own
+    assert len(ious) >= 5
+    assert np.median(ious) > 0.7  # its pillows carry labels of their own
 
 
-def test_mask_grids_are_the_channels_that_the_whole_graph_computes(detector):
-    """The shortcut upsamples one class a detection; the graph upsamples all 81."""
-    graph, tensors = _read_network(WEIGHTS)
-    whole = Network(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
+def test_mask_grids_are_the_channels_that_the_whole_graph_computes():
+    """The shortcut computes one class a detection; the graph all 81."""
+    detector = MaskRCNN2Go(device="cpu", int8=False)
+    graph, tensors, _ = _read_network(WEIGHTS)
+    whole = float_network(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
     pooled = torch.from_numpy(np.random.default_rng(10).normal(0, 0.3, (4, 128, 6, 6)).astype(np.float32))
     label = np.array([1, 80, 57, 57], np.int32)
     with torch.inference_mode():
         expected = torch.sigmoid(whole(pooled)[0])[torch.arange(4), torch.from_numpy(label).long()]
         np.testing.assert_allclose(detector._mask_grids(pooled, label), expected.numpy(), atol=1e-5)
+
+
+def test_integers_find_what_float_finds():
+    """The sure detections of real pictures: as many, of the same classes, with masks that agree."""
+    integers, real = MaskRCNN2Go(device="cpu"), MaskRCNN2Go(device="cpu", int8=False)
+    assert integers.fingerprint() != real.fingerprint()
+    agreements = []
+    for scene, index in (("redkitchen", 0), ("redkitchen", 290), ("mit76", 0), ("replica_floor2", 40)):
+        frame = shared_picture(scene, index)
+        a, b = integers.detect(frame), real.detect(frame)
+        for mask, row, score in zip(b.masks, b.class_probabilities, b.scores, strict=True):
+            if score > 0.7:
+                same = a.masks[a.class_probabilities.argmax(axis=1) == row.argmax()]
+                agreements.append(max(((mask & m).sum() / (mask | m).sum() for m in same), default=0.0))
+    assert len(agreements) > 8
+    assert np.median(agreements) > 0.9
+    assert min(agreements) > 0.6
+
+
+def test_float_where_torch_has_no_kernels_for_integers(monkeypatch, caplog):
+    monkeypatch.setattr(maskrcnn2go, "has_int8_kernels", lambda: False)
+    caplog.set_level("INFO")
+    detector = MaskRCNN2Go(device="cpu")
+    assert "so the network runs in float" in caplog.text
+    assert detector.fingerprint() == MaskRCNN2Go(device="cpu").fingerprint()
+    frame = shared_picture("redkitchen", 0)
+    np.testing.assert_array_equal(
+        detector.detect(frame).scores, MaskRCNN2Go(device="cpu", int8=False).detect(frame).scores
+    )
+
+
+def test_integers_take_one_thread_and_leave_the_others_as_they_were(monkeypatch):
+    seen = []
+    detector = MaskRCNN2Go(device="cpu")
+    inner = detector._resize
+    monkeypatch.setattr(detector, "_resize", lambda frame: (seen.append(torch.get_num_threads()), inner(frame))[1])
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        detector.detect(shared_picture("redkitchen", 0))
+        assert (seen, torch.get_num_threads()) == ([1], 2)
+    finally:
+        torch.set_num_threads(before)
 
 
 def test_detections_keep_the_contract(detector):
