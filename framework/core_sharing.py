@@ -25,20 +25,21 @@ class CoreSharing:
 
     def __init__(self) -> None:
         self.cores = int(numba.get_num_threads())
-        self._ahead: deque[float] = deque(maxlen=RECENT)  # s of cores' time a frame
-        self._mapping: deque[float] = deque(maxlen=RECENT)
+        self._ahead: deque[float] = deque(maxlen=RECENT)  # s of CPU time a frame, of the thread itself
+        self._mapping: deque[float] = deque(maxlen=RECENT)  # likewise, times its threads: it is one loop after another
         self._lock = Lock()
 
     @contextmanager
     def ahead(self) -> Iterator[None]:
         """Around what the thread ahead does with one frame."""
-        with self._measured(self.cores_ahead(), self._ahead):
+        with self._measured(self.cores_ahead(), self._ahead, 1):
             yield
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
         """Around the mapping of one frame."""
-        with self._measured(self.cores - self.cores_ahead(), self._mapping):
+        cores = self.cores - self.cores_ahead()
+        with self._measured(cores, self._mapping, cores):
             yield
 
     def cores_ahead(self) -> int:
@@ -53,13 +54,13 @@ class CoreSharing:
         return round(self.cores * ahead / max(ahead + mapping, 1e-9))
 
     @contextmanager
-    def _measured(self, cores: int, spent: deque[float]) -> Iterator[None]:
-        before, threads = numba.get_num_threads(), max(cores, 1)
-        numba.set_num_threads(threads)  # of the kernels that this thread calls
+    def _measured(self, cores: int, spent: deque[float], parallel: int) -> Iterator[None]:
+        before = numba.get_num_threads()
+        numba.set_num_threads(max(cores, 1))  # of the kernels that this thread calls
         began = time.thread_time()
         try:
             yield
         finally:
             numba.set_num_threads(before)
             with self._lock:
-                spent.append(threads * (time.thread_time() - began))
+                spent.append(max(parallel, 1) * (time.thread_time() - began))
