@@ -1,6 +1,7 @@
 """The tracker on a scene whose motion is known exactly."""
 
 import dataclasses
+import pickle
 import time
 
 import numpy as np
@@ -116,6 +117,18 @@ def test_it_is_the_same_whenever_features_are_found(seconds: float) -> None:
         np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
     for name, array in at_once.places().items():
         np.testing.assert_array_equal(later.places()[name], array, err_msg=name)
+
+
+def test_a_tracker_is_pickled_on_its_way() -> None:
+    frames = [papered_frame(exp_se3(np.array([0.03 * k, 0, 0, 0, 0, 0])), k) for k in range(8)]
+    tracker = VoxelHashingIcp()
+    _, scene = run(tracker, frames[:-1])
+    copied = pickle.loads(pickle.dumps(tracker))
+    for name, array in tracker.places().items():
+        np.testing.assert_array_equal(copied.places()[name], array, err_msg=name)
+    expected, found = (one.track(frames[-1], scene) for one in (tracker, copied))
+    assert not expected.lost
+    np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
 
 
 def test_garbage_is_lost() -> None:
