@@ -19,6 +19,9 @@ __version__ = "0.1.0"
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 os.environ.setdefault("GOMP_SPINCOUNT", "10000")
+# The threads of OpenBLAS, of which numpy, scipy and OpenCV bring one each, spin for 2^26 cycles by default after a
+# product that they were woken for: OpenCV's took a core from the kernels of the frame after each keyframe for 30 ms.
+os.environ.setdefault("OPENBLAS_THREAD_TIMEOUT", "14")  # 2^14 cycles
 
 
 def _can_be_written(folder: Path) -> bool:

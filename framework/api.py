@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,6 +106,7 @@ def begin(config: DictConfig) -> Pipeline:
     if world is not None:
         begin_in(pipeline, checked_path("world", world))
     compile_for_run()
+    gc.collect()  # of itself, it would stop one of the first hundreds of frames for longer than they take
     return pipeline
 
 

@@ -45,6 +45,7 @@ RESERVED = 128  # voxels with slots for each block of the budget: most have fewe
 NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 NO_CLASS = 255  # in a free slot
+MERGED_AT_ONCE = 512  # voxels: where none of them knows an instance, they are passed over
 MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
 MOST_GAIN = 2**15 - 1 - MOST_UNITS  # units that one cluster may add there: what int16 has room for
 
@@ -396,22 +397,34 @@ def _fewest_free(instance_ids):
     return fewest
 
 
+@device
+def _merge_voxel(ids, values, kept, dropped, combine):
+    """Gives what a voxel's slots hold for instance `dropped`, if anything, to `kept`."""
+    for s in range(len(ids)):
+        if ids[s] == dropped:
+            gain = values[s]
+            last = len(ids) - 1  # slots stay filled from the front
+            while ids[last] == 0:
+                last -= 1
+            ids[s], values[s] = ids[last], values[last]
+            ids[last], values[last] = 0, 0
+            add_evidence(ids, values, 0, kept, gain, combine, UNBOUNDED)
+            best_first(ids, values, 0)
+            break
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _merge(evidence, count, kept, dropped, combine):
-    for voxel in prange(count):
-        ids = evidence.instance_ids[voxel]
-        values = evidence.instance_value[voxel]
-        for s in range(len(ids)):
-            if ids[s] == dropped:
-                gain = values[s]
-                last = len(ids) - 1  # slots stay filled from the front
-                while ids[last] == 0:
-                    last -= 1
-                ids[s], values[s] = ids[last], values[last]
-                ids[last], values[last] = 0, 0
-                add_evidence(ids, values, 0, kept, gain, combine, UNBOUNDED)
-                best_first(ids, values, 0)
-                break
+    slots = evidence.instance_ids.shape[1]
+    all_ids = evidence.instance_ids.ravel()
+    for part in prange((count + MERGED_AT_ONCE - 1) // MERGED_AT_ONCE):
+        first, last = part * MERGED_AT_ONCE, min((part + 1) * MERGED_AT_ONCE, count)
+        ids = all_ids[first * slots : last * slots]
+        found = np.int32(0)
+        for i in range(len(ids)):  # without a branch, so that it is vectorised: most parts have none
+            found = one_more(found, ids[i] == dropped)
+        for voxel in range(first, last if found > 0 else first):
+            _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
 
 
 class EvidenceRows:
@@ -480,7 +493,7 @@ class EvidenceRows:
     def merge_instances(self, kept: int, dropped: int) -> None:
         """Combines the evidence for instance `dropped` with that for `kept` in every voxel.
 
-        Rare, and it visits the whole map.
+        Rare, and it goes through the slots of the whole map.
         """
         _merge(self.evidence, self.voxel_count, np.int32(kept), np.int32(dropped), int(self.combine))
 

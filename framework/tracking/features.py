@@ -53,15 +53,15 @@ class FeatureExtractor:
 
     def __post_init__(self) -> None:
         check_bounds(self, max_features=(1, 100_000), contrast=(1e-6, 1.0))
-        # without precise upscaling OpenCV's keypoints lie a quarter of a pixel beside the image's
-        self._sift = cv2.SIFT.create(
-            nfeatures=self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True
-        )
 
     def extract(self, frame: Frame) -> Features:
-        """The features of `frame`; none in an image without texture."""
+        """The features of `frame`; none in an image without texture. Several threads may call it at once."""
         gray, scale = _reduced(cv2.cvtColor(frame.color, cv2.COLOR_RGB2GRAY))
-        keypoints, descriptors = self._sift.detectAndCompute(gray, None)
+        # without precise upscaling OpenCV's keypoints lie a quarter of a pixel beside the image's
+        sift = cv2.SIFT.create(
+            nfeatures=self.max_features, contrastThreshold=self.contrast, enable_precise_upscale=True
+        )
+        keypoints, descriptors = sift.detectAndCompute(gray, None)
         if not keypoints:
             return Features(
                 np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, DESCRIPTOR_LENGTH), np.uint8)

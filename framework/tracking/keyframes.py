@@ -7,7 +7,9 @@ the few keyframes that may show the same place; matched features with depth and 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -48,14 +50,16 @@ class Keyframe:
 class Keyframes:
     """A bounded database of keyframes.
 
-    `add` is offered every trusted frame; only one that shows something new costs more than a few microseconds.
+    `add` is offered every trusted frame; the features of one that shows something new are found by a thread of its own.
+    Whatever else is asked or told waits for that first, so that all answers are as if nothing had been put off.
     `relocalize` costs the same whatever the number of keyframes, but for the comparison of their bags of words.
 
     Measured on 640x480 frames of redkitchen on one core: a frame that is not new takes 0.02 ms, one that is added
-    20 ms, a lost one 30 to 50 ms (of which features 20; the bags of 200 keyframes 4). With keyframes from frames 0 to
-    149, every second frame of 150 to 299 is found (24 inliers and a ratio of 0.2 at the least, 0.06 m in the median and
-    0.2 m at worst), also among 69 keyframes of another flat. Garbage, black frames and three other scenes are not (6
-    inliers at most), nor mirrored frames of the same kitchen (17 inliers at a ratio of 0.17, 20 at 0.12).
+    20 ms in its thread, a lost one 30 to 50 ms (of which features 20; the bags of 200 keyframes 4). With keyframes from
+    frames 0 to 149, every second frame of 150 to 299 is found (24 inliers and a ratio of 0.2 at the least, 0.06 m in
+    the median and 0.2 m at worst), also among 69 keyframes of another flat. Garbage, black frames and three other
+    scenes are not (6 inliers at most), nor mirrored frames of the same kitchen (17 inliers at a ratio of 0.17, 20 at
+    0.12).
     """
 
     max_keyframes: int = 200  # >= 1; beyond, the one that the others replace best is dropped
@@ -87,17 +91,26 @@ class Keyframes:
         self._keyframes: list[Keyframe] = []
         self._poses = np.zeros((0, 4, 4))  # of the keyframes
         self._barren: Float64 | None = None  # where the last frame was that had too few features
+        self._offered: tuple[Float64, Future[Keyframe | None]] | None = None  # its pose, and what it is found to be
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without the thread."""
+        self._settle()
+        return vars(self)
 
     def __len__(self) -> int:
+        self._settle()
         return len(self._keyframes)
 
     @property
     def byte_count(self) -> int:
         """Bytes that the keyframes take."""
+        self._settle()
         return sum(keyframe.bytes for keyframe in self._keyframes)
 
     def saved(self) -> dict[str, Array]:
         """What `restore` makes them of again; nothing where there is none."""
+        self._settle()
         if not self._keyframes:
             return {}
         return {
@@ -126,6 +139,7 @@ class Keyframes:
             or not counts.sum() == len(points) == len(descriptors)
         ):
             raise DataError(f"keyframes' counts {counts.tolist()!s:.60} are not those of their poses and points")
+        self._settle()
         ends = np.cumsum(counts)
         for k, T_world_camera in enumerate(np.asarray(poses, np.float64)):
             check_rigid(f"keyframe {k}", T_world_camera)
@@ -135,28 +149,56 @@ class Keyframes:
             self._keyframes.append(Keyframe(T_world_camera, points_world, found, self._words.bag(found)))
         self._poses = np.concatenate([self._poses, np.asarray(poses, np.float64)])
 
-    def add(self, frame: Frame, T_world_camera: Float64) -> bool:
-        """Makes `frame` a keyframe if no other one is near; True when it has become one."""
+    def add(self, frame: Frame, T_world_camera: Float64) -> None:
+        """Offers a frame, which becomes a keyframe if no other one is near and it has features enough.
+
+        That turns out in a thread of its own; what goes wrong in it is raised by whatever is called next and waits.
+        """
+        if self._near_offered(T_world_camera):
+            return  # whether that one becomes a keyframe or has too few features, this one is too near to it
         if not self.is_new(T_world_camera) or self._near_barren(T_world_camera):
-            return False
-        if self.add_with(frame, self.extractor.extract(frame), T_world_camera):
-            return True
-        self._barren = T_world_camera.copy()
-        return False
+            return
+        worker = ThreadPoolExecutor(1, "keyframe")
+        self._offered = T_world_camera.copy(), worker.submit(self._extracted, frame, T_world_camera.copy())
+        worker.shutdown(wait=False)  # it ends with this frame
+
+    def _settle(self) -> None:
+        """Waits until the frame that was offered last is a keyframe or is not one. Raises what went wrong with it."""
+        if self._offered is None:
+            return
+        T_world_camera, found = self._offered
+        try:
+            keyframe = found.result()
+        finally:
+            self._offered = None
+        if keyframe is None:
+            self._barren = T_world_camera
+        else:
+            self._append(keyframe)
 
     def add_with(self, frame: Frame, features: Features, T_world_camera: Float64) -> bool:
-        """Like `add`, with the frame's features where they are known already."""
+        """Makes `frame`, whose features are known, a keyframe if it has enough of them and no other one is near; True
+        when it has become one.
+        """
         features = features.with_depth()
         if len(features) < self.min_features or not self.is_new(T_world_camera):
             return False
-        self._keyframes.append(self.keyframe(frame, features, T_world_camera))
-        self._poses = np.concatenate([self._poses, T_world_camera[None]])
-        if len(self) > self.max_keyframes:
-            self._drop_most_redundant()
+        self._append(self.keyframe(frame, features, T_world_camera))
         return True
 
+    def _extracted(self, frame: Frame, T_world_camera: Float64) -> Keyframe | None:
+        """What a frame is as a keyframe; None where it has too few features."""
+        features = self.extractor.extract(frame).with_depth()
+        return self.keyframe(frame, features, T_world_camera) if len(features) >= self.min_features else None
+
+    def _append(self, keyframe: Keyframe) -> None:
+        self._keyframes.append(keyframe)
+        self._poses = np.concatenate([self._poses, keyframe.T_world_camera[None]])
+        if len(self._keyframes) > self.max_keyframes:
+            self._drop_most_redundant()
+
     def keyframe(self, frame: Frame, features: Features, T_world_camera: Float64) -> Keyframe:
-        """What a frame would be as a keyframe; `add` keeps it."""
+        """What a frame would be as a keyframe; `add_with` keeps it."""
         features = features.with_depth()
         points = back_project(frame.camera, features.pixels, features.depth)
         points_world = np.asarray(transform(T_world_camera, points), np.float32)
@@ -166,7 +208,14 @@ class Keyframes:
 
     def is_new(self, T_world_camera: Float64) -> bool:
         """Whether no keyframe was seen from near here. Takes microseconds."""
+        self._settle()
         return bool((self._separation(self._poses, T_world_camera) >= 1).all())
+
+    def _near_offered(self, T_world_camera: Float64) -> bool:
+        """Whether the frame that is still being looked at was seen from nearer to here than the next one may be."""
+        if self._offered is None:
+            return False
+        return bool(self._separation(self._offered[0][None], T_world_camera)[0] < BARREN_SEPARATION)
 
     def _near_barren(self, T_world_camera: Float64) -> bool:
         """Whether the last frame with too few features was seen from near here: this one would cost as much in vain."""
@@ -181,6 +230,7 @@ class Keyframes:
 
     def alike(self, features: Features) -> list[Keyframe]:
         """The keyframes that look most like an image with these features, best first."""
+        self._settle()
         if not self._keyframes:
             return []
         bags = np.stack([keyframe.bag for keyframe in self._keyframes])
@@ -189,6 +239,7 @@ class Keyframes:
 
     def nearest(self, T_world_camera: Float64) -> list[Keyframe]:
         """The keyframes seen from nearest to a pose, best first."""
+        self._settle()
         order = np.argsort(self._separation(self._poses, T_world_camera), kind="stable")
         return [self._keyframes[k] for k in order[: self.candidates]]
 

@@ -240,7 +240,7 @@ class VoxelHashingIcp(PoseTracker):
                 self._keyframes.add_with(seen.frame, seen.found, T_world_camera)
             else:
                 self._keyframes.add(seen.frame, T_world_camera)
-            if not any(_near(T, T_world_camera, VISITED_APART) for T in self._visited):
+            if not any(_near(T, T_world_camera, VISITED_APART) for T in reversed(self._visited)):  # the last is nearest
                 self._visited.append(T_world_camera)
         return Pose(T_world_camera)
 

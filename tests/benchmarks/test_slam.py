@@ -17,6 +17,7 @@ from framework.data import Detections, Float64, Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
+from framework.pipeline import sparing_what_is_there
 from framework.registry import assemble
 from framework.synthetic.sequence import Synthetic
 from plugins.detectors.ground_truth import GroundTruthDetector
@@ -34,7 +35,8 @@ FIRST, LAST = 20, 80  # frames in [FIRST, LAST) count: at first the map is small
 TARGETS = {"whole loop": ">= 5", "integrate": ">= 3", "render full image": ">= 3"}  # times as fast as Open3D ...
 TARGETS_AT = 0.01  # m, ... at this voxel size
 WALK = 2000  # frames
-EARLY, LATE = (200, 700), (1500, 2000)  # frames whose cost is compared
+WARM = 10  # frames, after which none may be late
+EARLY, LATE = (WARM, 700), (WARM + 1300, WALK)  # frames whose cost is compared: a third each, whole rooms apart
 SECOND_START = LATE[0] - EARLY[0]
 assert SECOND_START % FRAMES_A_ROOM == 0, "both see the same pictures"
 
@@ -116,7 +118,7 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
 
 
 def test_slam_long_walk(benchmark, tables) -> None:
-    """2,000 frames through eight rooms that are all alike: the last ones cost what the first ones did.
+    """2,000 frames through eight rooms that are all alike: the last third costs what the first did, none is late.
 
     From frame 1300 on, five whole rooms from the start, a second loop begins the walk in turns with the first: it sees
     the same pictures at the same time, on a map that is still small. pytest-benchmark's figures are of the first loop.
@@ -124,13 +126,13 @@ def test_slam_long_walk(benchmark, tables) -> None:
     walk, detector = RoomRow(WALK), GroundTruthDetector()
     long, short = (SlamLoop(VoxelHashingIcp(), BayesianTsdf()) for _ in range(2))
     spent: dict[str, list[float]] = {"long": [], "short": []}  # s, of track and fuse in each frame
-    size = []  # bytes and blocks of the long walk's map after each frame
+    size = []  # bytes and voxels of the long walk's map after each frame, and of its labels alone
     scene = long.fuser.scene
 
     def keep_books() -> None:
         if long.poses:
             spent["long"].append(long.seconds["track"] + long.seconds["fuse"])
-            size.append((scene.byte_count, scene.voxel_count))
+            size.append((scene.byte_count, scene.voxel_count, scene.labels.byte_count, scene.labels.voxel_count))
 
     def begin_frame() -> tuple[tuple[Frame, Detections], dict[str, Any]]:
         keep_books()
@@ -141,7 +143,8 @@ def test_slam_long_walk(benchmark, tables) -> None:
             spent["short"].append(short.seconds["track"] + short.seconds["fuse"])
         return (frame := walk[k], detector.detect(frame)), {}
 
-    benchmark.pedantic(long, setup=begin_frame, rounds=WALK)
+    with sparing_what_is_there():  # as a run does
+        benchmark.pedantic(long, setup=begin_frame, rounds=WALK)
     keep_books()
     drift = np.linalg.norm((inverse(walk[WALK - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])
     lost = long.lost
@@ -154,18 +157,27 @@ def test_slam_long_walk(benchmark, tables) -> None:
     )
     at_700, at_2000, after = size[EARLY[1] - 1], size[-1], (scene.byte_count, scene.voxel_count)
     grown = [(size[end - 1][1] - size[begin - 1][1]) / (end - begin) for begin, end in (EARLY, LATE)]
+    usual = float(np.median(spent["long"][WARM:]))
+    worst = [max(spent["long"][slice(*window)]) for window in (EARLY, LATE, (WARM, WALK))]
+    percentile = float(np.quantile(spent["long"][WARM:], 0.999))
     table = Table(
         f"Long walk: {WALK} frames, {WALK / FRAMES_A_ROOM:.1f} rooms, 640x480, 1 cm voxels",
-        ["", "frames 200 to 700", "frames 1500 to 2000", "ratio", "target"],
+        ["", *(f"frames {begin} to {end}" for begin, end in (EARLY, LATE)), "ratio", "target"],
         [
-            ["track + fuse, ms, median; in turns", ms(beside), ms(late), f"{late / beside:.2f}", "<= 1.1"],
-            ["track + fuse, ms, median; one after the other", ms(early), ms(late), f"{late / early:.2f}", "<= 1.1"],
+            ["track + fuse, ms, median; in turns", ms(beside), ms(late), f"{late / beside:.2f}", "<= 1.05"],
+            ["track + fuse, ms, median; one after the other", ms(early), ms(late), f"{late / early:.2f}", "<= 1.05"],
+            ["worst frame, ms; of all, over the median", ms(worst[0]), ms(worst[1]), f"{worst[2] / usual:.2f}",
+             "<= 2.5"],
             ["new voxels a frame", f"{grown[0]:.0f}", f"{grown[1]:.0f}", f"{grown[1] / grown[0]:.2f}", NOTHING],
             ["map at the end, MiB", mib(at_700[0]), mib(at_2000[0]), NOTHING, NOTHING],
-            ["map at the end, bytes a voxel", *(f"{b / n:.1f}" for b, n in (at_700, at_2000)),
+            ["map at the end, bytes a voxel", *(f"{b / n:.1f}" for b, n, *_ in (at_700, at_2000)),
              f"{at_2000[0] / at_2000[1] / (at_700[0] / at_700[1]):.2f}", NOTHING],
+            ["its labels, bytes a labelled voxel", *(f"{b / n:.1f}" for *_, b, n in (at_700, at_2000)),
+             f"{at_2000[2] / at_2000[3] / (at_700[2] / at_700[3]):.2f}", NOTHING],
         ],
         [
+            f"The worst frame is {WARM + int(np.argmax(spent['long'][WARM:]))}; one in a thousand takes "
+            f"{percentile / usual:.2f} times the median or more. What else the machine does makes frames late, too.",
             f"Back through the last room the map grew by {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
             f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
             f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
@@ -175,6 +187,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
     tables.append(table)
     benchmark.extra_info.update(
         early_ms=1e3 * early, late_ms=1e3 * late, small_map_ms=1e3 * beside, bytes_700=at_700[0], bytes_2000=at_2000[0],
+        median_ms=1e3 * usual, worst_ms=1e3 * worst[2], one_in_a_thousand_ms=1e3 * percentile,
         voxels_700=at_700[1], voxels_2000=at_2000[1], voxels_after_return=after[1], drift_m=float(drift), lost=lost,
     )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -15,6 +16,7 @@ from tqdm import TMonitor
 
 from framework.data import Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
+from framework.interfaces import SceneMap
 from framework.journal import RunResult
 from framework.pipeline import Pipeline, map_ahead
 from framework.registry import assemble
@@ -275,6 +277,37 @@ def test_runs_outside_the_main_thread(room: CornerRoom) -> None:
     thread.start()
     thread.join()
     assert results[0].frames == 6
+
+
+@dataclass
+class Collecting(GivenPose):
+    """Collects garbage at every frame, and notes how many objects are spared."""
+
+    def __post_init__(self) -> None:
+        self.spared: list[int] = []
+        self.garbage: list[int] = []
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        circle: list[object] = []
+        circle.append(circle)
+        del circle
+        self.garbage.append(gc.collect())
+        self.spared.append(gc.get_freeze_count())
+        return super().track(frame, scene)
+
+
+def test_garbage_is_collected_among_what_a_run_makes(room: CornerRoom) -> None:
+    tracker = Collecting()
+    pipeline(tracker=tracker).run(room)
+    assert min(tracker.spared) > 10_000, "what was imported"
+    assert min(tracker.garbage) >= 1
+    assert gc.get_freeze_count() == 0
+    gc.freeze()
+    try:
+        pipeline().run(room)
+        assert gc.get_freeze_count() > 10_000, "as it was"
+    finally:
+        gc.unfreeze()
 
 
 def test_map_ahead_is_bounded_and_ordered() -> None:

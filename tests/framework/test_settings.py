@@ -134,3 +134,25 @@ def test_settings_are_within_bounds_that_the_message_says(name: str, value: obje
 def test_threads_are_a_number_of_threads(threads: object) -> None:
     with pytest.raises(ConfigError, match="threads must be a whole number, 0 or more and at most 4096, found"):
         Settings(seed=0, device="cpu", threads=threads)  # type: ignore[arg-type]
+
+
+IDLE_AFTER_A_PRODUCT = """
+import framework
+import time
+import cv2, numpy as np
+
+for _ in range(2):
+    cv2.gemm(np.ones((800, 128), np.float32), np.ones((128, 12), np.float32), 1, None, 0)
+    np.ones((500, 500)) @ np.ones((500, 500))
+done = time.process_time()
+time.sleep(0.2)
+print(time.process_time() - done)
+"""
+
+
+def test_threads_of_products_do_not_spin_when_they_are_done() -> None:
+    """They would take 0.02 s and more of the CPU time of a process that sleeps."""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_THREAD_TIMEOUT"}
+    line = [sys.executable, "-c", IDLE_AFTER_A_PRODUCT]
+    done = subprocess.run(line, cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 0.01

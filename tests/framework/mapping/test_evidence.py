@@ -209,6 +209,26 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
     assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
 
 
+@pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
+def test_merging_finds_every_voxel(count: int) -> None:
+    """Of thousands, a few know the instance: the first and the last in use, and some between; none beyond."""
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 100))
+    evidence = rows.evidence
+    evidence.instance_ids[: count + 100], evidence.instance_value[: count + 100] = [4, 2, 0, 0], [7, 5, 0, 0]
+    known = np.unique([0, count // 3, count - 1])
+    evidence.instance_ids[known, 1] = 3
+    evidence.instance_ids[count : count + 100, 1] = 3
+    rows.voxel_count = count
+    before = evidence.instance_ids[: count + 100].copy()
+    rows.merge_instances(4, 3)
+    expected = before.copy()
+    expected[known] = [4, 0, 0, 0]
+    np.testing.assert_array_equal(evidence.instance_ids[: count + 100], expected)
+    value = np.tile(np.float32([7, 5, 0, 0]), (count + 100, 1))
+    value[known] = [12, 0, 0, 0]
+    np.testing.assert_array_equal(evidence.instance_value[: count + 100], value)
+
+
 def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
     labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
     assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
+import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,10 +12,11 @@ import cv2
 import numpy as np
 import pytest
 
+from framework.data import Frame
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError
 from framework.geometry import exp_se3, inverse, rotation_angle
-from framework.tracking.features import FeatureExtractor
+from framework.tracking.features import FeatureExtractor, Features
 from framework.tracking.keyframes import Keyframes
 from framework.tracking.visual_words import VisualWords, similarity
 from tests.scenes.papered_room import CAMERA, papered_frame
@@ -37,20 +41,32 @@ def keyframes() -> Keyframes:
     return keyframes
 
 
+def has_become_one(keyframes: Keyframes, frame: Frame, T_world_camera: np.ndarray) -> bool:
+    before = len(keyframes)
+    keyframes.add(frame, T_world_camera)
+    return len(keyframes) > before
+
+
+def blanked(frame: Frame) -> Frame:
+    return replace(frame, color=np.zeros_like(frame.color))
+
+
 def test_only_what_is_new_becomes_a_keyframe() -> None:
     keyframes = Keyframes(min_distance=0.2, min_angle=0.3)
     added = [
-        keyframes.add(papered_frame(T), T) for T in (pose(0), pose(0.19), pose(0.21), pose(0.21, 0.2), pose(0, 0.31))
+        has_become_one(keyframes, papered_frame(T), T)
+        for T in (pose(0), pose(0.19), pose(0.21), pose(0.21, 0.2), pose(0, 0.31))
     ]
     assert added == [True, False, True, False, True]
-    assert keyframes.add(papered_frame(pose(-0.12, 0.16)), pose(-0.12, 0.16)), "half of each is enough"
+    half_of_each = pose(-0.12, 0.16)
+    assert has_become_one(keyframes, papered_frame(half_of_each), half_of_each)
 
 
 def test_a_frame_that_is_not_new_is_not_looked_at(monkeypatch: pytest.MonkeyPatch) -> None:
     keyframes = Keyframes()
-    assert keyframes.add(papered_frame(pose(0)), pose(0))
+    assert has_become_one(keyframes, papered_frame(pose(0)), pose(0))
     monkeypatch.setattr(FeatureExtractor, "extract", None)
-    assert not keyframes.add(papered_frame(pose(0.05)), pose(0.05))
+    assert not has_become_one(keyframes, papered_frame(pose(0.05)), pose(0.05))
 
 
 def test_a_frame_without_features_is_not_looked_at_again_and_again() -> None:
@@ -58,14 +74,97 @@ def test_a_frame_without_features_is_not_looked_at_again_and_again() -> None:
     seen = []
     extract = keyframes.extractor.extract
     keyframes.extractor.extract = lambda frame: seen.append(frame) or extract(frame)
-    blank = replace(papered_frame(pose(0)), color=np.zeros((*CAMERA.shape, 3), np.uint8))
-    added = [keyframes.add(blank, pose(x)) for x in (0, 0.01, 0.04, 0.06, 0.07)]
-    assert added == [False] * 5
+    nothing = blanked(papered_frame(pose(0)))
+    assert not any(has_become_one(keyframes, nothing, pose(x)) for x in (0, 0.01, 0.04, 0.06, 0.07))
     assert len(seen) == 2, "at 0 and at 0.06 m"
     without_depth = replace(papered_frame(pose(1)), depth=np.zeros(CAMERA.shape, np.float32))
-    assert not keyframes.add(without_depth, pose(1.0))
-    assert keyframes.add(papered_frame(pose(0.9)), pose(0.9))
+    assert not has_become_one(keyframes, without_depth, pose(1.0))
+    assert has_become_one(keyframes, papered_frame(pose(0.9)), pose(0.9))
     assert len(keyframes) == 1
+
+
+def slowed(keyframes: Keyframes, seconds: float) -> None:
+    """Has features take longer to be found."""
+    extract = keyframes.extractor.extract
+
+    def slow(frame: Frame) -> Features:
+        time.sleep(seconds)
+        return extract(frame)
+
+    keyframes.extractor.extract = slow
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.05])
+def test_keyframes_are_those_of_features_found_at_once(seconds: float) -> None:
+    """A walk in steps of all sizes, half of it before nothing to be seen, through more places than are remembered."""
+    rng = np.random.default_rng(3)
+    at_once, later = (Keyframes(max_keyframes=4, min_distance=0.2) for _ in range(2))
+    slowed(later, seconds)
+    x = 0.0
+    looked_at = 0
+    for k in range(120):
+        x = np.clip(x + rng.choice([0.01, 0.03, 0.08, 0.25]) * rng.choice([-1, 1]), -1.8, 1.8)
+        frame = papered_frame(pose(x))
+        frame = blanked(frame) if k // 10 % 2 else frame
+        at_once.add(frame, pose(x))
+        looked_at += at_once._offered is not None
+        at_once._settle()
+        later.add(frame, pose(x))
+    assert looked_at > 12
+    assert len(at_once) == 4
+    for name, array in at_once.saved().items():
+        np.testing.assert_array_equal(later.saved()[name], array, err_msg=name)
+
+
+def test_nobody_waits_for_a_frame_whose_outcome_does_not_matter() -> None:
+    keyframes = Keyframes(min_distance=0.2)
+    extract, may_end = keyframes.extractor.extract, threading.Event()
+
+    def held(frame: Frame) -> Features:
+        assert may_end.wait(60)
+        return extract(frame)
+
+    keyframes.extractor.extract = held
+    keyframes.add(papered_frame(pose(0)), pose(0))
+    keyframes.add(papered_frame(pose(0.04)), pose(0.04))
+    assert not may_end.is_set(), "and here we are"
+    threading.Timer(0.1, may_end.set).start()
+    keyframes.add(papered_frame(pose(0.1)), pose(0.1))
+    assert may_end.is_set(), "near enough for a keyframe, not for a frame with too few features"
+    assert len(keyframes) == 1
+
+
+def test_what_goes_wrong_in_the_thread_is_raised_once() -> None:
+    keyframes = Keyframes(min_distance=0.2)
+    found = keyframes.extractor.extract
+    keyframes.extractor.extract = lambda frame: {}[frame.index]
+    frame = papered_frame(pose(0))
+    for ask in (keyframes.saved, lambda: keyframes.nearest(pose(0)), lambda: keyframes.add(frame, pose(0.5))):
+        keyframes.add(frame, pose(0))
+        with pytest.raises(KeyError):
+            ask()
+    keyframes.extractor.extract = found
+    assert has_become_one(keyframes, frame, pose(0))
+
+
+def test_keyframes_are_pickled_with_the_last_one() -> None:
+    keyframes = Keyframes()
+    keyframes.add(papered_frame(pose(0)), pose(0))
+    copied = pickle.loads(pickle.dumps(keyframes))
+    assert len(copied) == 1
+    assert copied.relocalize(papered_frame(pose(0.1))) is not None
+    assert has_become_one(copied, papered_frame(pose(0.5)), pose(0.5))
+
+
+def test_no_thread_is_left() -> None:
+    keyframes = Keyframes()
+    keyframes.add(papered_frame(pose(0)), pose(0))
+    assert [thread for thread in threading.enumerate() if thread.name.startswith("keyframe")]
+    assert len(keyframes) == 1
+    for thread in threading.enumerate():
+        if thread.name.startswith("keyframe"):
+            thread.join(60)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("keyframe")]
 
 
 def test_a_camera_is_found_wherever_it_is(keyframes: Keyframes) -> None:
@@ -100,7 +199,7 @@ def test_what_was_never_seen_is_not_found(keyframes: Keyframes) -> None:
 def test_the_database_is_bounded_and_keeps_what_is_apart() -> None:
     keyframes = Keyframes(max_keyframes=5, min_distance=0.01, min_angle=0.01, candidates=5)
     for yaw in (0, 0.48, 0.5, 1.0, 2.0, 2.5, 2.52):
-        assert keyframes.add(papered_frame(pose(0, yaw)), pose(0, yaw))
+        keyframes.add(papered_frame(pose(0, yaw)), pose(0, yaw))
     assert len(keyframes) == 5
     kept = sorted(apart(keyframe.T_world_camera, pose(0))[1] for keyframe in keyframes.nearest(pose(0)))
     np.testing.assert_allclose(kept, [0, 0.5, 1, 2, 2.52], atol=1e-6)

@@ -1,6 +1,8 @@
 """The tracker on a scene whose motion is known exactly."""
 
 import dataclasses
+import pickle
+import time
 
 import numpy as np
 import pytest
@@ -11,10 +13,13 @@ from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.interfaces import SceneMap
 from framework.registry import assemble
 from framework.tracking.absolute_pose import AbsolutePose
+from framework.tracking.features import Features
+from framework.tracking.keyframes import Keyframe
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers import voxel_hashing_icp
 from plugins.trackers.voxel_hashing_icp import STEADY, Alignment, VoxelHashingIcp
 from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
+from tests.scenes.papered_room import papered_frame
 
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:
@@ -76,6 +81,54 @@ def test_a_jump_is_found_by_keyframes_or_lost_and_not_integrated() -> None:
     assert poses[-1].lost
     assert np.array_equal(poses[-1].T_world_camera, poses[-2].T_world_camera)
     assert np.median(room().distance(scene.mesh().vertices.astype(float))) < 0.004
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.1])
+def test_it_is_the_same_whenever_features_are_found(seconds: float) -> None:
+    """Of frames that are taken aside, one is in doubt or lost and asks for keyframes right after one was offered."""
+    path = [exp_se3(np.array([0.03 * k - 0.3, 0, 0, 0, 0.01 * k, 0])) for k in range(24)]
+    for k in (8, 16, 17):
+        path[k] = path[k] @ exp_se3(np.array([0, 0, -0.4, 0, 0.3, 0]))
+    frames = [papered_frame(T, k) for k, T in enumerate(path)]
+    at_once, later = VoxelHashingIcp(), VoxelHashingIcp()
+    extract, nearest, track = later._keyframes.extractor.extract, later._keyframes.nearest, at_once.track
+    offered = []
+
+    def slow(frame: Frame) -> Features:
+        time.sleep(seconds)
+        return extract(frame)
+
+    def asked(T_world_camera: np.ndarray) -> list[Keyframe]:
+        offered.append(later._keyframes._offered is not None)
+        return nearest(T_world_camera)
+
+    def waiting(frame: Frame, scene: SceneMap) -> Pose:
+        pose = track(frame, scene)
+        at_once.places()
+        return pose
+
+    later._keyframes.extractor.extract, later._keyframes.nearest = slow, asked
+    at_once.track = waiting
+    expected, found = run(at_once, frames)[0], run(later, frames)[0]
+    assert any(offered)
+    assert len(at_once.places()["poses"]) > 4
+    for pose, other in zip(found, expected, strict=True):
+        assert (pose.lost, pose.reason) == (other.lost, other.reason)
+        np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
+    for name, array in at_once.places().items():
+        np.testing.assert_array_equal(later.places()[name], array, err_msg=name)
+
+
+def test_a_tracker_is_pickled_on_its_way() -> None:
+    frames = [papered_frame(exp_se3(np.array([0.03 * k, 0, 0, 0, 0, 0])), k) for k in range(8)]
+    tracker = VoxelHashingIcp()
+    _, scene = run(tracker, frames[:-1])
+    copied = pickle.loads(pickle.dumps(tracker))
+    for name, array in tracker.places().items():
+        np.testing.assert_array_equal(copied.places()[name], array, err_msg=name)
+    expected, found = (one.track(frames[-1], scene) for one in (tracker, copied))
+    assert not expected.lost
+    np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
 
 
 def test_garbage_is_lost() -> None:
