@@ -340,48 +340,38 @@ def _label(evidence, row, n, voxel, free_classes):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _count_new(grid, seen, evidence, measurement, first_point, new):
-    """Counts in new (A,) the voxels of each block without slots that lie under some cluster with an instance."""
+def _update(grid, seen, evidence, measurement, first_point, new, evicted):
+    """Updates the near voxels of the seen blocks that have slots.
+
+    Counts in new (A,) those without that lie under a cluster with an instance, in evicted (A,) slots given away.
+    """
     for a in prange(seen.blocks.shape[0]):
-        new[a] = 0
-        if seen.near[a]:
-            pixels = seen.near_pixel[a]
-            labeled = evidence.labeled[max(grid.label_row[seen.blocks[a]], np.int32(0))]
-            none = grid.label_row[seen.blocks[a]] < 0
-            under = np.int32(0)
-            for n in range(
-                BLOCK_VOXELS
-            ):  # without a branch, so that it is vectorised: most have slots or are under none
-                pixel = pixels[n]
-                over_points = (pixel >= 0) & (first_point[max(pixel, np.int32(0))] >= 0)
-                under = one_more(under, over_points & (none | (labeled[n] < 0)))
-            for n in range(BLOCK_VOXELS if under > 0 else 0):
-                pixel = pixels[n]
-                if pixel >= 0 and (none or labeled[n] < 0):
-                    new[a] = one_more(new[a], _is_named(measurement, first_point[pixel]))
+        evicted[a] = new[a] = 0
+        row = grid.label_row[seen.blocks[a]]
+        for i in range(seen.near_count[a]):
+            point = first_point[seen.near_pixel[a, i]]
+            voxel = evidence.labeled[row, seen.near_voxel[a, i]] if row >= 0 else np.int32(-1)
+            if voxel >= 0:
+                evicted[a] += update_voxel(evidence, voxel, measurement, point)
+            else:
+                new[a] = one_more(new[a], _is_named(measurement, point))
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _update(grid, seen, evidence, measurement, first_point, first_new, free_classes, evicted):
-    """Updates the near voxels of the seen blocks that have slots, or get them now, from first_new (A,) on, with
-    free_classes (T,) in those for classes; evicted (A,) counts slots given away.
+def _label_new(grid, seen, evidence, measurement, first_point, new, first_new, free_classes):
+    """Gives the new (A,) voxels of each block their slots, from first_new (A,) on, and has them updated.
+
+    free_classes (T,) is what slots for classes hold before.
     """
     for a in prange(seen.blocks.shape[0]):
-        evicted[a] = 0
+        voxel = first_new[a]
         row = grid.label_row[seen.blocks[a]]
-        if seen.near[a] and row >= 0:
-            new = first_new[a]
-            for n in range(BLOCK_VOXELS):
-                pixel = seen.near_pixel[a, n]
-                if pixel >= 0:
-                    point = first_point[pixel]
-                    voxel = evidence.labeled[row, n]
-                    if voxel < 0 and _is_named(measurement, point):
-                        voxel = new
-                        new += np.int32(1)
-                        _label(evidence, row, n, voxel, free_classes)
-                    if voxel >= 0:
-                        evicted[a] += update_voxel(evidence, voxel, measurement, point)
+        for i in range(seen.near_count[a] if new[a] > 0 else 0):
+            point, n = first_point[seen.near_pixel[a, i]], seen.near_voxel[a, i]
+            if evidence.labeled[row, n] < 0 and _is_named(measurement, point):
+                _label(evidence, row, n, voxel, free_classes)
+                update_voxel(evidence, voxel, measurement, point)
+                voxel += np.int32(1)
 
 
 @njit(cache=True, nogil=True)
@@ -482,12 +472,12 @@ class EvidenceRows:
         first_point = measurement.first_point.ravel()
         new = np.empty(len(seen.blocks), np.int32)
         evicted = np.empty(len(seen.blocks), np.int32)
-        _count_new(self.voxels.grid, seen, self.evidence, measurement, first_point, new)
         if self.storage is Storage.EXACT:
             self._make_room_for_instances(len(measurement.instance_id))
+        grid, free_classes = self.voxels.grid, self._free_classes()
+        _update(grid, seen, self.evidence, measurement, first_point, new, evicted)
         first_new = self._make_room(seen.blocks, new)
-        free_classes = self._free_classes()
-        _update(self.voxels.grid, seen, self.evidence, measurement, first_point, first_new, free_classes, evicted)
+        _label_new(grid, seen, self.evidence, measurement, first_point, new, first_new, free_classes)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:

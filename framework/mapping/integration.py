@@ -4,8 +4,8 @@ The signed distance is projective, along z; its running average is the TSDF of C
 distance widens with depth as the sensor's noise does, and the weight of an observation falls with depth squared.
 
 Bytes moved a frame: every block that the frame sees is gone through once. Distances and weights are read and written,
-2 * 2 KiB; so are colours, 2 * 2 KiB, where a voxel lies within the truncation band; where one lies near the measured
-surface, 2 KiB of pixel numbers are written for the labels. The images, 2.5 MB at 640x480, stay in the cache. At 1 cm
+2 * 2 KiB; so are colours, 2 * 2 KiB, where a voxel lies within the truncation band; of each voxel near the measured
+surface, a sixth of them, 6 bytes are written for the labels. The images, 2.5 MB at 640x480, stay in the cache. At 1 cm
 that is (medians over 40 frames) about 25 MB in redkitchen (2809 blocks seen, 1608 near the surface) and 100 MB in the
 synthetic room (10435 and 7953), which two cores copy in 0.9 and 3.5 ms. The kernel takes three to four times as long:
 on one core 2.1 microseconds a block, of which 0.4 project, 0.1 and 0.3 gather depths and colours, 0.5 average distances
@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Bool, Float64, Frame, Int32
+from framework.data import Bool, Float64, Frame, Int32, UInt16
 from framework.geometry import inverse
 from framework.mapping.allocation import Allocator
 from framework.mapping.prefetching import prefetch_row
@@ -146,14 +146,26 @@ def _average_colors(packed, seen, rounding, scratch):
         packed[n] = mean if share > zero else packed[n]
 
 
+@device
+def _list_near(pixel, near_band, near_voxel, near_pixel, scratch):
+    """Lists the voxels whose distance to the measured surface in scratch[:512] is at most near_band, with their pixels.
+
+    Each is written behind the last one found and stays if it is near: without a branch, which nobody could foretell.
+    """
+    found = np.int32(0)
+    for n in range(BLOCK_VOXELS):
+        near_voxel[found] = np.uint16(n)
+        near_pixel[found] = pixel[n]
+        found = one_more(found, abs(scratch[n]) <= near_band)
+
+
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near, near_pixel):
+def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_count, near_voxel, near_pixel):
     """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
 
     `color` (H, W) holds a pixel's RGBA in its bytes, `camera` T_camera_world. `rounding` in [0, 1) is added before
-    values are truncated to integers. near (A,) tells whether a block has voxels within near_band m of the measured
-    surface, and near_pixel (A, 512) gets, for such blocks, the number of the pixel that sees each such voxel, -1 for
-    the others.
+    values are truncated to integers. near_count (A,), near_voxel (A, 512) and near_pixel (A, 512) get the voxels within
+    near_band m of the measured surface, as SeenBlocks has them.
 
     A block is done in passes over its 512 voxels that the compiler vectorises: they hold no branches, read images only
     in loops of their own, and share one scratch array, so that few arrays have to be proved not to overlap.
@@ -184,19 +196,18 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
             for n in range(BLOCK_VOXELS):
                 seen[n] = color[np.uint32(pixel[n])]
             _average_colors(packed, seen, rounding, scratch)
-        near[a] = near_voxels > 0
+        near_count[a] = near_voxels
         if near_voxels > 0:
-            here = near_pixel[a]
-            for n in range(BLOCK_VOXELS):
-                here[n] = pixel[n] if abs(scratch[n]) <= near_band else np.int32(-1)
+            _list_near(pixel, near_band, near_voxel[a], near_pixel[a], scratch)
 
 
 class SeenBlocks(NamedTuple):
-    """The A blocks that a frame has updated; valid until the next frame."""
+    """The A blocks that a frame has updated, and their voxels near the measured surface; valid until the next frame."""
 
     blocks: Int32  # (A,) their numbers
-    near: Bool  # (A,) whether a voxel lies near the measured surface
-    near_pixel: Int32  # (A, 512) where one does: the number v * width + u of the pixel that sees it, -1 for the others
+    near_count: Int32  # (A,) voxels near the surface, which are the first so many of
+    near_voxel: UInt16  # (A, 512) in their order
+    near_pixel: Int32  # (A, 512) the number v * width + u of the pixel that sees each
 
 
 class Integrator:
@@ -207,6 +218,7 @@ class Integrator:
         self.sensor = sensor
         self.frames = 0
         self._allocator = Allocator(voxels, sensor)
+        self._near_voxel = np.empty((0, BLOCK_VOXELS), np.uint16)
         self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
@@ -231,8 +243,10 @@ class Integrator:
         view = pinhole(frame.camera, inverse(T_world_camera))
         if len(self._near_pixel) < len(active):
             # by an eighth more than is needed: nothing is copied, so that doubling would only take memory
-            self._near_pixel = np.empty((len(active) * 9 // 8 + 1, BLOCK_VOXELS), np.int32)
-        seen = SeenBlocks(active, np.empty(len(active), np.bool_), self._near_pixel[: len(active)])
+            shape = (len(active) * 9 // 8 + 1, BLOCK_VOXELS)
+            self._near_voxel, self._near_pixel = np.empty(shape, np.uint16), np.empty(shape, np.int32)
+        count, n = np.empty(len(active), np.int32), len(active)
+        seen = SeenBlocks(active, count, self._near_voxel[:n], self._near_pixel[:n])
         _integrate(
             self.voxels.grid,
             active,
@@ -242,7 +256,8 @@ class Integrator:
             self.sensor,
             rounding,
             np.float32(near_band),
-            seen.near,
+            seen.near_count,
+            seen.near_voxel,
             seen.near_pixel,
         )
         return seen

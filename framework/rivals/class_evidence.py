@@ -152,10 +152,9 @@ def _find_blocks_under_masks(grid, seen, cluster, wants_row):
     """Notes in wants_row (A,) the blocks without a row that have a voxel under some mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
-        if seen.near[a] and grid.label_row[seen.blocks[a]] < 0:
-            for n in range(BLOCK_VOXELS):
-                pixel = seen.near_pixel[a, n]
-                if pixel >= 0 and cluster[pixel] >= 0:
+        if grid.label_row[seen.blocks[a]] < 0:
+            for i in range(seen.near_count[a]):
+                if cluster[seen.near_pixel[a, i]] >= 0:
                     wants_row[a] = True
                     break
 
@@ -166,17 +165,15 @@ def _update(grid, seen, evidence, masks, evicted):
     unmasked = evidence.unmasked  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
-        if seen.near[a]:
-            block = seen.blocks[a]
-            row = grid.label_row[block]
-            for n in range(BLOCK_VOXELS):
-                pixel = seen.near_pixel[a, n]
-                if pixel >= 0:
-                    k = masks.cluster[pixel]
-                    if k >= 0:
-                        evicted[a] += observe_mask(evidence, row, n, masks, k)
-                    elif unmasked[block, n] < MOST_FRAMES:
-                        unmasked[block, n] += 1
+        block = seen.blocks[a]
+        row = grid.label_row[block]
+        for i in range(seen.near_count[a]):
+            n = seen.near_voxel[a, i]
+            k = masks.cluster[seen.near_pixel[a, i]]
+            if k >= 0:
+                evicted[a] += observe_mask(evidence, row, n, masks, k)
+            elif unmasked[block, n] < MOST_FRAMES:
+                unmasked[block, n] += 1
 
 
 class ClassRows:

@@ -47,22 +47,18 @@ def _probability(foreground, observed):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _count_masks(near, near_pixel, mask, counts):
-    """Counts for the voxels near the measured surface, as of SeenBlocks, whether `mask` (H, W) has their pixel.
-
-    Block a of near (A,) and near_pixel (A, 512) is number a of the grid.
-    """
+def _count_masks(seen, mask, counts):
+    """Counts for the seen blocks' voxels near the measured surface whether `mask` (H, W) has their pixel."""
     foreground, observed = counts
     most = np.uint16(65535)
     inside = mask.ravel()
-    for a in prange(near.shape[0]):
-        if not near[a]:
-            continue
-        for n in range(BLOCK_VOXELS):
-            pixel = near_pixel[a, n]
-            if pixel >= 0 and observed[a, n] < most:
-                observed[a, n] += np.uint16(1)
-                foreground[a, n] += np.uint16(inside[pixel])
+    for a in prange(seen.blocks.shape[0]):
+        block = seen.blocks[a]
+        for i in range(seen.near_count[a]):
+            n = seen.near_voxel[a, i]
+            if observed[block, n] < most:
+                observed[block, n] += np.uint16(1)
+                foreground[block, n] += np.uint16(inside[seen.near_pixel[a, i]])
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -144,7 +140,7 @@ class ObjectVolume:
         """
         seen = self.volume.integrator.integrate_object(frame, T_world_camera, band, mask)
         self._grow()
-        _count_masks(seen.near, seen.near_pixel, mask, self.counts)
+        _count_masks(seen, mask, self.counts)
         self._measure()
         self.volume.changed(seen.blocks)
 

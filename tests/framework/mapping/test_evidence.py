@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from framework.data import Int32
 from framework.errors import DataError
 from framework.mapping import evidence as evidence_module
 from framework.mapping.evidence import (
@@ -321,7 +322,18 @@ def at_pixel(block: int, *voxels: int) -> SeenBlocks:
     """A frame that sees these voxels of one block at the one pixel that there is."""
     pixel = np.full((1, 512), -1, np.int32)
     pixel[0, voxels] = 0
-    return SeenBlocks(np.array([block], np.int32), np.ones(1, np.bool_), pixel)
+    return seen_at(np.array([block], np.int32), pixel)
+
+
+def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
+    """A frame that sees the voxels of some blocks at pixels (A, 512), -1 = not near."""
+    seen = SeenBlocks(
+        blocks, (pixels >= 0).sum(axis=1, dtype=np.int32), np.zeros(pixels.shape, np.uint16), np.zeros_like(pixels)
+    )
+    for a, count in enumerate(seen.near_count):
+        seen.near_voxel[a, :count] = np.flatnonzero(pixels[a] >= 0)
+        seen.near_pixel[a, :count] = pixels[a][pixels[a] >= 0]
+    return seen
 
 
 def test_only_voxels_that_are_named_have_slots() -> None:
@@ -368,15 +380,16 @@ def _updated(max_blocks: int) -> Evidence:
             following[p], first[pixel_of[p]] = first[pixel_of[p]], p
         said = said._replace(first_point=first[None], next_point=following, cluster=cluster, absence=np.float32(-0.2))
         blocks = rng.permutation(4)[:3].astype(np.int32)
-        seen = SeenBlocks(blocks, np.array([True, True, False]), rng.integers(-1, 10, (3, 512)).astype(np.int32))
-        rows.update(seen, said)
+        pixels = rng.integers(-1, 10, (3, 512)).astype(np.int32)
+        pixels[2] = -1
+        rows.update(seen_at(blocks, pixels), said)
         for a in range(2):
             for n in range(512):
-                point = first[seen.near_pixel[a, n]] if seen.near_pixel[a, n] >= 0 else -1
+                point = first[pixels[a, n]] if pixels[a, n] >= 0 else -1
                 key, p, named = (int(blocks[a]), n), point, False
                 while p >= 0:
                     named, p = named or bool(said.instance_id[cluster[p]]), following[p]
-                if seen.near_pixel[a, n] >= 0 and (named or key in by_voxel):
+                if pixels[a, n] >= 0 and (named or key in by_voxel):
                     update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(point))
     evidence = rows.in_use()
     assert len(by_voxel) == rows.voxel_count > 100

@@ -27,7 +27,12 @@ def new_integrator() -> Integrator:
 def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The blocks that a frame has updated, and the pixels that see their voxels near the surface, -1 for the others."""
     seen = integrator.integrate(frame, T_world_camera, VOXEL)
-    return seen.blocks, np.where(seen.near[:, None], seen.near_pixel, -1)
+    pixels = np.full((len(seen.blocks), 512), -1)
+    for a, count in enumerate(seen.near_count):
+        voxels = seen.near_voxel[a, :count]
+        assert (np.diff(voxels.astype(int)) > 0).all()
+        pixels[a, voxels] = seen.near_pixel[a, :count]
+    return seen.blocks, pixels
 
 
 def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
