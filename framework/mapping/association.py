@@ -80,17 +80,23 @@ def look_up_instances(
     This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
     that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
     """
+    columns = instance_ids.shape[1]
     for row in prange(instance_ids.shape[0]):
         key = np.int64(-2)
         region = np.int32(-1)
-        for column in range(instance_ids.shape[1]):
-            instance_ids[row, column] = 0
+        blocks, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
+        for column in range(columns):
+            blocks[column] = -1
             z = depth[row * stride, column * stride]
             if z > np.float32(0.0):
                 block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
-                voxel = labeled_voxel(grid, evidence, block, n)
-                if voxel >= 0:
-                    instance_ids[row, column] = best_instance(evidence, voxel)
+                blocks[column], voxels[column] = block, n
+        # in passes of their own, in which many loads that wait for the memory are under way at once
+        for column in range(columns):
+            voxels[column] = labeled_voxel(grid, evidence, blocks[column], voxels[column])
+        for column in range(columns):
+            voxel = voxels[column]
+            instance_ids[row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
 
 
 @njit(cache=True, nogil=True)

@@ -92,6 +92,11 @@ def _keep_on_top(first, following, cluster, sizes, share, kept_first, kept_follo
     for v in prange(first.shape[0]):
         for u in range(first.shape[1]):
             p = first[v, u]
+            if p < 0 or following[p] < 0:  # nothing lies on another here: so it is nearly everywhere
+                kept_first[v, u] = p
+                if p >= 0:
+                    kept_following[p] = -1
+                continue
             smallest = np.float64(np.inf)
             while p >= 0:
                 size = sizes[cluster[p]]
@@ -127,10 +132,15 @@ def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32
 def _leave_to_others(first, following, cluster, lying, seen, stride, kept_first, kept_following):
     """Copies each pixel's list without the points of clusters on which the instance seen there lies."""
     for v in prange(first.shape[0]):
+        row = seen[v // stride]
+        column, left = 0, stride  # of u // stride: a division would cost more than all the rest
         for u in range(first.shape[1]):
             kept_first[v, u] = -1
             last = np.int32(-1)
-            found = seen[v // stride, u // stride]
+            found = row[column]
+            left -= 1
+            if left == 0:
+                column, left = column + 1, stride
             p = first[v, u]
             while p >= 0:
                 if not lying[cluster[p], found]:
