@@ -33,7 +33,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
+from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.errors import DataError
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more, reserved
@@ -92,7 +92,7 @@ class Measurement(NamedTuple):
     instance_gain: Float32  # (N,) for that instance, over any other
     absence: np.float32  # not above 0, for an instance matched in this frame but not seen here
     matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
-    class_said: Int64  # (N, NO_CLASS + 1) for each class and for none, see class_said()
+    class_said: Integers  # (N, NO_CLASS + 1) int32 or, for exact storage, int64: of each class and none, class_said()
     named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
     combine: int  # Combine
     most_units: int  # that a class may have
@@ -123,13 +123,13 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
     return gains, np.concatenate([named, again], axis=1).astype(np.uint8), bits
 
 
-def class_said(gains: Float64, units: int, named_bit: UInt8) -> Int64:
+def class_said(gains: Float64, units: int, named_bit: UInt8, exact: bool = False) -> Integers:
     """What clusters say of each class in one number, so that a voxel looks up one: the `gains` (N, C) over those that
     the cluster does not name, in whole units, times 2^NEW_CLASSES, and in the lowest bits the class's `named_bit`.
     """
     said = named_bit.astype(np.int64)
     said[:, : gains.shape[1]] += np.rint(gains * units).astype(np.int64) << NEW_CLASSES
-    return said
+    return said if exact else said.astype(np.int32)
 
 
 @device
@@ -238,16 +238,18 @@ def sum_classes(classes, units, measurement, k):
     Returns the number of evictions.
     """
     most = measurement.most_units
-    known = 0  # bits of the named classes that have a slot
-    filled = 0
-    too_much = np.int64(0)
+    said_by = measurement.class_said[k]
+    number: Any = said_by.dtype.type  # int32 where that is enough: twice as many fit into a vector
+    known = number(0)  # bits of the named classes that have a slot
+    filled = number(0)
+    too_much = number(0)
     for s in range(len(classes)):  # without a branch, so that it is vectorised
-        said = measurement.class_said[k, classes[s]]
-        value = max(units[s] + (said >> NEW_CLASSES), -most)
+        said = said_by[classes[s]]
+        value = max(number(number(units[s]) + (said >> number(NEW_CLASSES))), number(-most))
         units[s] = value
-        too_much = max(too_much, value - most)
-        known |= said & ALL_NAMED
-        filled += classes[s] != NO_CLASS
+        too_much = max(too_much, number(value - number(most)))
+        known |= said & number(ALL_NAMED)
+        filled += number(classes[s] != NO_CLASS)
     for s in range(filled if too_much > 0 else 0):  # the distances stay, and with them the likeliest class
         units[s] = max(units[s] - too_much, -most)
     evicted = 0

@@ -70,7 +70,7 @@ def measured(
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
         matched,
-        class_said(gains, UNITS, bits),
+        class_said(gains, UNITS, bits, exact=True),
         named,
         int(Combine.SUM),
         1 << 62,
@@ -85,7 +85,7 @@ def voted(ids: list[int], weights: list[float], classes: list[int], combine: Com
     every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
     return every._replace(
         instance_gain=np.array(weights, np.float32),
-        class_said=class_said(gains, 100, bits),
+        class_said=class_said(gains, 100, bits, exact=True),
         named_classes=named,
         combine=int(combine),
     )
@@ -379,6 +379,7 @@ def _updated(max_blocks: int) -> Evidence:
         for p in reversed(range(points)):
             following[p], first[pixel_of[p]] = first[pixel_of[p]], p
         said = said._replace(first_point=first[None], next_point=following, cluster=cluster, absence=np.float32(-0.2))
+        said = said._replace(class_said=said.class_said.astype(np.int32), most_units=MOST_UNITS)  # as compact storage
         blocks = rng.permutation(4)[:3].astype(np.int32)
         pixels = rng.integers(-1, 10, (3, 512)).astype(np.int32)
         pixels[2] = -1
