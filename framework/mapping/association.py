@@ -9,7 +9,7 @@ lies on it.
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
 from typing import Protocol
@@ -20,7 +20,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
-from framework.mapping.evidence import Evidence, best_instance, labeled_voxel
+from framework.mapping.evidence import Evidence, best_instance, labeled_voxel, next_instance
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.pixel_lists import PixelLists, cover_another
 from framework.mapping.raycasting import voxel_seen
@@ -49,6 +49,7 @@ class Overlaps:
     votes: Int32  # (N, M) pixels of both
     seen: Int32  # (h, w) the instance at every `stride`-th pixel of every `stride`-th row, 0 = none
     stride: int
+    hidden: Overlaps | None = None  # likewise, with the instances that are the next likeliest where they are
 
     def by(self, rule: OverlapRule, least: int) -> npt.NDArray[np.float64]:
         """(N, M) overlaps in [0, 1] by one of the rules, with `least` as in `over_smaller`."""
@@ -74,14 +75,14 @@ class Overlaps:
 def look_up_instances(
     grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
 ) -> None:
-    """Fills instance_ids (ceil(H / stride), ceil(W / stride)) with the instance of the voxel nearest to every stride-th
-    reading of every stride-th row of `depth` (H, W); 0 = none.
+    """Fills instance_ids (2, ceil(H / stride), ceil(W / stride)) with the likeliest instance of the voxel nearest to
+    every stride-th reading of every stride-th row of `depth` (H, W), and with the next likeliest one; 0 = none.
 
     This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
     that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
     """
-    columns = instance_ids.shape[1]
-    for row in prange(instance_ids.shape[0]):
+    columns = instance_ids.shape[2]
+    for row in prange(instance_ids.shape[1]):
         key = np.int64(-2)
         region = np.int32(-1)
         blocks, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
@@ -96,7 +97,8 @@ def look_up_instances(
             voxels[column] = labeled_voxel(grid, evidence, blocks[column], voxels[column])
         for column in range(columns):
             voxel = voxels[column]
-            instance_ids[row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
+            instance_ids[0, row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
+            instance_ids[1, row, column] = next_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
 
 
 @njit(cache=True, nogil=True)
@@ -188,7 +190,7 @@ class LabeledMap(Protocol):
     table: InstanceTable
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """(ceil(H / stride), ceil(W / stride)) the instance that the map has at the measured surface, 0 = none.
+        """(L, ceil(H / stride), ceil(W / stride)) the L likeliest instances at the measured surface, 0 = none.
 
         Looked up at every stride-th reading of every stride-th row of `frame.depth`. Unlike a ray-cast, this cannot see
         an instance behind an object that is new.
@@ -253,7 +255,11 @@ class Association:
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the instances that the map has at the measured surface."""
         stride = vote_stride(frame.camera)
-        return count_overlaps(clusters, scene.instances_seen(frame, pose.T_world_camera, stride), stride)
+        overlaps, *hidden = (
+            count_overlaps(clusters, instance_ids, stride)
+            for instance_ids in scene.instances_seen(frame, pose.T_world_camera, stride)
+        )
+        return replace(overlaps, hidden=hidden[0]) if hidden else overlaps
 
     def associate(
         self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame_index: int
@@ -264,6 +270,8 @@ class Association:
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
         match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
+        if overlaps.hidden is not None:
+            self._match_hidden(table, overlaps.hidden, clusters, instance_ids)
         may_create = (
             (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         )
@@ -274,6 +282,25 @@ class Association:
         for k in np.flatnonzero(may_create):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id
         return Matches(frame_index, clusters, overlaps, instance_ids)
+
+    def _match_hidden(
+        self, table: InstanceTable, hidden: Overlaps, clusters: PointClusters, instance_ids: Int32
+    ) -> None:
+        """Gives clusters without an instance, 0 in instance_ids (N,), one that lies under another in the map's voxels.
+
+        A keyboard on a desk that was seen before it is such an instance until enough has been said for it; as a new one
+        every time, it would never be.
+        """
+        free = ~np.isin(hidden.instance_ids, instance_ids)
+        allowed = (
+            (hidden.by(self.overlap_rule, self.create_points) > self.overlap) & (instance_ids == 0)[:, None] & free
+        )
+        if not allowed.any():
+            return
+        known = np.stack([table.class_probabilities(table.records[int(k)]) for k in hidden.instance_ids])
+        allowed &= class_agreement(clusters.class_probabilities, known) >= max(self.class_gate, self.merge_agreement)
+        match = match_one_to_one(allowed, hidden.over_union(self.create_points))
+        instance_ids[match >= 0] = hidden.instance_ids[match[match >= 0]]
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """(N, M) whether a cluster may be the same thing as an instance, by their classes."""

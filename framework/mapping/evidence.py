@@ -146,6 +146,19 @@ def best_instance(evidence, voxel):
 
 
 @device
+def next_instance(evidence, voxel):
+    """The most likely instance of a labelled voxel but for the one in slot 0, 0 when none is more likely than the rest."""
+    best = np.int32(0)
+    best_value = np.float32(0.0)
+    for s in range(1, evidence.instance_ids.shape[1]):
+        label, value = evidence.instance_ids[voxel, s], evidence.instance_value[voxel, s]
+        if label > 0 and (value > best_value or (value == best_value and label < best)):
+            best = label
+            best_value = value
+    return best
+
+
+@device
 def best_counted_instance(evidence, voxel, counts):
     """The most likely instance of a labelled voxel among those that count, by id in counts; 0 when none is likelier
     than the rest.
