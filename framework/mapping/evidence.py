@@ -36,6 +36,7 @@ from numba import njit, prange
 from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.errors import DataError
 from framework.mapping.integration import SeenBlocks
+from framework.mapping.pages import PagesAhead
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more, reserved
 
 Integers = npt.NDArray[Any]  # of int16 or int64
@@ -445,6 +446,7 @@ class EvidenceRows:
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
         self.evidence = self._free()
+        self._pages = PagesAhead()
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what is only reserved, which is gigabytes."""
@@ -543,6 +545,7 @@ class EvidenceRows:
             slots = {name: grown(getattr(self.evidence, name), capacity) for name in SLOTS}
             self.evidence = self.evidence._replace(**slots)
         self.row_count, self.voxel_count = rows, voxels
+        self._pages.ask_for_one((getattr(self.evidence, name) for name in SLOTS), voxels)
 
     def _make_room_for_instances(self, new: int) -> None:
         """Doubles the slots until every voxel has `new` free ones."""

@@ -25,6 +25,7 @@ from numba import njit
 
 from framework.data import Int32, UInt8
 from framework.errors import MapFullError
+from framework.mapping.pages import PagesAhead
 
 try:
     import resource
@@ -300,6 +301,7 @@ class VoxelGrid:
             region_blocks=np.empty((64, REGION_BLOCKS), np.int32),
             **reserved(max_blocks, _free_blocks),
         )
+        self._pages = PagesAhead()
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what is only reserved, which is gigabytes."""
@@ -330,6 +332,7 @@ class VoxelGrid:
                 self.grid, coords, done, self.region_count, self.block_count
             )
             if done == len(coords):
+                self._pages.ask_for_one((getattr(self.grid, name) for name in OF_BLOCKS), self.block_count)
                 return
             if self.block_count == self.max_blocks:
                 raise MapFullError(
