@@ -24,7 +24,6 @@ help: ## this list
 
 .PHONY: demo
 demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
-	@$(BIN)/python -m framework compile
 	@$(BIN)/python -m framework dataset=desk hydra.run.dir=$(DEMO)
 
 .PHONY: test

@@ -38,7 +38,7 @@ LIST = Path(__file__).with_name("kernels.txt")
 CHECKOUT = Path(__file__).resolve().parents[1]
 DEFAULT, OTHERS = "# a run with the default stages", "# what other stages add"
 MOST_WORKERS = 4  # each compiles anew what kernels share, and takes 0.5 GB
-SECONDS_EACH = 0.9  # of a core, an AMD EPYC (Zen 5) with 2 cores: for a guess of how long it takes
+SECONDS_EACH = 0.65  # of a core, an AMD EPYC (Zen 5) with 2 cores: for a guess of how long it takes
 SIGN_OF_LIFE = 3.0  # s, from one line to the next where no bar is shown
 
 

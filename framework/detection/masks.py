@@ -112,13 +112,14 @@ def _paste(ringed, borders, threshold, masks):
     cells = ringed.shape[1] - 2
     row = np.empty(cells + 2, np.float32)
     for i in range(n):
-        x1, y1, x2, y2 = borders[i]
+        x1, y1, x2, y2 = borders[i, 0], borders[i, 1], borders[i, 2], borders[i, 3]
         if not (x2 > x1 and y2 > y1):
             continue
         u0, left, u_weight = _axis_cells(x1, x2, cells, width)
         v0, above, v_weight = _axis_cells(y1, y2, cells, height)
         for j in range(len(above)):
-            row[:] = ringed[i, above[j]] + v_weight[j] * (ringed[i, above[j] + 1] - ringed[i, above[j]])
+            for c in range(cells + 2):
+                row[c] = ringed[i, above[j], c] + v_weight[j] * (ringed[i, above[j] + 1, c] - ringed[i, above[j], c])
             for k in range(len(left)):
                 value = row[left[k]] + u_weight[k] * (row[left[k] + 1] - row[left[k]])
                 masks[i, v0 + j, u0 + k] = value > threshold

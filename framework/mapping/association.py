@@ -120,7 +120,8 @@ def _count_votes(pixels, cluster, instance_ids, stride, column, votes):
     Divisions cost more than all the rest, so that of each coordinate is looked up; -1 = not a multiple of the stride.
     """
     sample = np.full(stride * max(instance_ids.shape), -1, np.int32)
-    sample[::stride] = np.arange(max(instance_ids.shape))
+    for i in range(max(instance_ids.shape)):
+        sample[i * stride] = i
     k, label, count = np.int32(0), np.int32(0), 0
     for p in range(pixels.shape[0]):
         u, v = sample[pixels[p, 0]], sample[pixels[p, 1]]

@@ -95,7 +95,9 @@ def _find_pieces_of(
     pieces = np.zeros(count, np.int32)
     for run in range(count):
         pieces[parents[run]] += sizes[run]
-    largest = np.argmax(pieces)
+    largest = 0
+    for run in range(count):
+        largest = run if pieces[run] > pieces[largest] else largest
     piece = np.empty(len(pixels), np.int32)
     for i in range(len(pixels)):
         piece[i] = parents[runs[(pixels[i, 1] - v0) * stride + pixels[i, 0] - u0]]
@@ -112,18 +114,23 @@ def _keep_near(
     gap_per_depth: np.float32, steepest: np.float32, stays: Bool,
 ) -> None:  # fmt: skip
     """Marks the pieces that no large step parts from those that stay, the larger ones first."""
-    large = (sizes > 0) & (sizes >= min_share * np.float32(sizes[largest]))
-    large[largest] = False
-    others = np.flatnonzero(large)
-    if len(others) == 0:
+    least = min_share * np.float32(sizes[largest])
+    others, waiting, count = np.empty(len(sizes), np.int64), np.zeros(len(sizes), np.bool_), 0
+    for other in range(len(sizes)):
+        if other != largest and sizes[other] > 0 and sizes[other] >= least:
+            others[count], waiting[other] = other, True
+            count += 1
+    if count == 0:
         return
-    ends = _some_of(pixels, piece, largest, ENDS)
-    for _ in range(len(others)):
-        other = _largest(others, sizes, large)
-        large[other] = False
-        if _is_near(_some_of(pixels, piece, other, STARTS), ends, depth, gap, gap_per_depth, steepest):
+    starts, ends = np.empty((STARTS, 2), np.int32), np.empty((len(pixels), 2), np.int32)
+    end = _take_some(pixels, piece, largest, ENDS, ends)
+    for _ in range(count):
+        other = _largest(others[:count], sizes, waiting)
+        waiting[other] = False
+        start = _take_some(pixels, piece, other, STARTS, starts)
+        if _is_near(starts[:start], ends[:end], depth, gap, gap_per_depth, steepest):
             stays[other] = True
-            ends = np.concatenate((ends, _some_of(pixels, piece, other, ENDS)))
+            end += _take_some(pixels, piece, other, ENDS, ends[end:])
 
 
 @njit(cache=True, nogil=True)
@@ -137,11 +144,20 @@ def _largest(pieces: Int64, sizes: Int32, waiting: Bool) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _some_of(pixels: Int32, piece: Int32, wanted: int, most: int) -> Int32:
-    """Up to `most` pixels of a piece, evenly over all."""
-    places = np.flatnonzero(piece == wanted)
-    step = (len(places) + most - 1) // most
-    return pixels[places[step // 2 :: step]]
+def _take_some(pixels: Int32, piece: Int32, wanted: int, most: int, some: Int32) -> int:
+    """Writes up to `most` pixels of a piece, evenly over all; their number."""
+    size = 0
+    for i in range(len(pixels)):
+        size += piece[i] == wanted
+    step = (size + most - 1) // most
+    count, skip = 0, step // 2
+    for i in range(len(pixels)):
+        if piece[i] == wanted:
+            if skip == 0:
+                some[count, 0], some[count, 1] = pixels[i, 0], pixels[i, 1]
+                count, skip = count + 1, step
+            skip -= 1
+    return count
 
 
 @njit(cache=True, nogil=True)

@@ -154,14 +154,16 @@ def _fit_one(
     rows = np.zeros((components, 10), np.float32)
     previous = -np.inf
     for iteration in range(max_iterations):
-        if weights.sum() == 0.0:
+        if not _any_left(weights):
             return
         for j in range(components):
             set_coefficients(weights[j], means[j], covariances[j], rows[j])
             for a in range(3):
                 rows[j, 1 + a] = means[j, a] - center[a]
         log_outlier = np.float32(math.log(outlier[0] * outlier[1])) if outlier[0] > 0 else ABSENT
-        moments[:] = 0.0
+        for j in range(components):
+            for a in range(10):
+                moments[j, a] = 0.0
         total, outliers = _expect(xyz, odds, own_components, rows, log_outlier, moments)
         _maximize(moments, center, count, variance_floor, weights, means, covariances)
         outlier[0] = outliers / count
@@ -169,6 +171,14 @@ def _fit_one(
         if log_likelihood[0] - previous < tolerance:
             break
         previous = log_likelihood[0]
+
+
+@njit(cache=True, nogil=True)
+def _any_left(weights: Float64) -> bool:
+    left = False
+    for weight in weights:
+        left = left or weight != 0.0
+    return left
 
 
 @njit(cache=True, nogil=True)
@@ -191,7 +201,8 @@ def _expect(
                 add_to(densities[j], odds[first : first + n])
             raise_to(largest, densities[j], n)
         constant_exponential(log_outlier, largest, evidence, n)
-        outliers_before[:n] = evidence[:n]
+        for i in range(n):
+            outliers_before[i] = evidence[i]
         for j in range(components):
             exponentials(densities[j], largest, evidence, n)
         total += log_evidence(largest, evidence, n)
@@ -228,8 +239,9 @@ def _maximize(
 @njit(cache=True, nogil=True)
 def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
     """The mean of the points, and the volume of their bounding box with no side below four standard deviations."""
-    center = np.zeros(3)
-    low, high = points[0].astype(np.float64), points[0].astype(np.float64)
+    center, low, high = np.zeros(3), np.empty(3), np.empty(3)
+    for a in range(3):
+        low[a] = high[a] = points[0, a]
     for i in range(len(points)):
         for a in range(3):
             center[a] += points[i, a]

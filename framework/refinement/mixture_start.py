@@ -57,8 +57,10 @@ def _start_one(
     points: Float32, log_odds: Float32, mask_count: int, object_components: int, background_components: int,
     labels: Int32,
 ) -> None:  # fmt: skip
-    of_ring = np.arange(len(points)) >= mask_count
-    in_core = ~of_ring & (log_odds >= 0)
+    of_ring, in_core = np.empty(len(points), np.bool_), np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        of_ring[i] = i >= mask_count
+        in_core[i] = i < mask_count and log_odds[i] >= 0
     _group(points, in_core, object_components, 0, labels)
     centers = _group(points, of_ring, background_components, object_components, labels)
     for i in range(mask_count):
@@ -69,10 +71,17 @@ def _start_one(
 @njit(cache=True, nogil=True)
 def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels: Int32) -> Float64:
     """Sets the labels of the chosen points; their groups' centers."""
-    members = np.nonzero(chosen)[0]
-    own, own_labels = points[members], np.full(len(members), -1, np.int32)
-    centers: Float64 = depth_groups_of(own, groups)
-    lloyd(own, centers, START_ITERATIONS, own_labels)
-    for j, i in enumerate(members):
-        labels[i] = first_label + own_labels[j]
+    own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
+    for i in range(len(points)):
+        if chosen[i]:
+            own[count, 0], own[count, 1], own[count, 2] = points[i, 0], points[i, 1], points[i, 2]
+            own_labels[count] = -1
+            count += 1
+    centers: Float64 = depth_groups_of(own[:count], groups)
+    lloyd(own[:count], centers, START_ITERATIONS, own_labels[:count])
+    count = 0
+    for i in range(len(points)):
+        if chosen[i]:
+            labels[i] = first_label + own_labels[count]
+            count += 1
     return centers

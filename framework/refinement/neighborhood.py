@@ -144,8 +144,10 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
     windows = np.zeros((len(clusters), 4), np.int64)
     _bound(pixels, firsts, widths, *frame.camera.shape, windows)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])
-    steps, ring_counts, radii = _signed_distances(
-        pixels, firsts, widths, windows, cells, readings, *thread_shares(areas)
+    steps = np.empty(cells[-1], np.int16)
+    ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)
+    _signed_distances(
+        pixels, firsts, widths, windows, cells, readings, *thread_shares(areas), steps, ring_counts, radii
     )
     return Surroundings(clusters, frame, order, pixels, firsts, windows, cells, steps, ring_counts, widths, radii)
 
@@ -199,8 +201,11 @@ def thread_shares(costs: Int64) -> tuple[Int64, Int64]:
 def _share(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
     loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
     for k in longest_first:
-        owners[k] = np.argmin(loads)
-        loads[owners[k]] += costs[k] + 1
+        least = 0
+        for thread in range(1, threads):
+            least = thread if loads[thread] < loads[least] else least
+        owners[k] = least
+        loads[least] += costs[k] + 1
     for k in range(len(costs)):
         starts[owners[k] + 1] += 1
     for thread in range(threads):
@@ -244,16 +249,14 @@ def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
 @njit(cache=True, nogil=True, parallel=True)
 def _signed_distances(
     pixels: Int32, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
-    share_order: Int64, share_starts: Int64,
-) -> tuple[Int16, Int64, Float32]:  # fmt: skip
+    share_order: Int64, share_starts: Int64, steps: Int16, ring_counts: Int64, radii: Float32,
+) -> None:  # fmt: skip
     """In every window (cells,) how deep each of the mask's pixels lies in it; readings in the rings; the masks' radii.
 
     Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
     mask; 0 elsewhere. A pixel without a reading is no border of the mask: holes in the depth are common inside of
     objects.
     """
-    steps = np.empty(cells[-1], np.int16)
-    ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)
     for share in prange(len(share_starts) - 1):
         for k in share_order[share_starts[share] : share_starts[share + 1]]:
             if cells[k] < cells[k + 1]:
@@ -261,7 +264,6 @@ def _signed_distances(
                     pixels[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
                     steps[cells[k] : cells[k + 1]],
                 )  # fmt: skip
-    return steps, ring_counts, radii
 
 
 @njit(cache=True, nogil=True)

@@ -61,9 +61,18 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
     A plane begins at the flattest cell that is left, grows over neighboring cells and then takes all cells of the frame
     that lie in it: what stands before a wall does not cut it in two.
     """
-    moments = _cell_moments(frame.depth, pinhole(frame.camera))
+    height, width = frame.camera.shape
+    moments = np.zeros(((height + CELL - 1) // CELL, (width + CELL - 1) // CELL, 10))
+    _sum_moments(frame.depth, pinhole(frame.camera), moments)
+    cells = moments.reshape(-1, 10)
+    flatness = np.full(len(cells), np.inf)
+    _write_flatness(cells, distance, noise, flatness)
+    free = flatness < np.inf
+    seeds = np.argsort(flatness, kind="stable")[: free.sum()]
     pixel_size = 1.0 / math.sqrt(frame.camera.fx * frame.camera.fy)
-    return Planes(*_find(moments, distance, noise, min_area, STEP * pixel_size))
+    found = np.empty((MAX_PLANES, 7))
+    count = _find(cells, moments.shape[1], seeds, free, distance, noise, min_area, STEP * pixel_size, found)
+    return Planes(found[:count, :3].copy(), *found[:count, 3:].T.copy())
 
 
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
@@ -83,11 +92,10 @@ def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _cell_moments(depth: Float32, pinhole: Float32) -> Float64:
+def _sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
     """(rows, columns, 10) of each cell: the sums of 1, x, y, x x, x y, y y, q, x q, y q, q q over its readings."""
     height, width = depth.shape
-    moments = np.zeros(((height + CELL - 1) // CELL, (width + CELL - 1) // CELL, 10))
-    fx, fy, cx, cy = pinhole
+    fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     for row in prange(moments.shape[0]):
         for column in range(moments.shape[1]):
             n, sx, sy, sxx, sxy, syy, sq, sxq, syq, sqq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -106,9 +114,9 @@ def _cell_moments(depth: Float32, pinhole: Float32) -> Float64:
                         sxq += x * q
                         syq += y * q
                         sqq += q * q
-            for a, value in enumerate((n, sx, sy, sxx, sxy, syy, sq, sxq, syq, sqq)):
-                moments[row, column, a] = value
-    return moments
+            cell = moments[row, column]
+            cell[0], cell[1], cell[2], cell[3], cell[4] = n, sx, sy, sxx, sxy
+            cell[5], cell[6], cell[7], cell[8], cell[9] = syy, sq, sxq, syq, sqq
 
 
 @njit(cache=True, nogil=True)
@@ -163,20 +171,25 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 
 @njit(cache=True, nogil=True)
-def _find(
-    moments: Float64, distance: float, noise: float, min_area: float, spacing: float
-) -> tuple[Float64, Float64, Float64, Float64, Float64]:
-    rows, columns = moments.shape[:2]
-    cells = moments.reshape((rows * columns, 10))
-    free, flatness = np.zeros(len(cells), np.bool_), np.full(len(cells), np.inf)
-    m, total = np.zeros(3), np.zeros(10)
+def _write_flatness(cells: Float64, distance: float, noise: float, flatness: Float64) -> None:
+    """Writes the deviation of each cell (C, 10) that is full and flat enough to begin a plane."""
+    m = np.zeros(3)
     for i in range(len(cells)):
         if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise):
-            free[i], flatness[i] = True, _deviation(cells[i], m)
-    seeds = np.argsort(flatness, kind="mergesort")[: free.sum()]
+            flatness[i] = _deviation(cells[i], m)
+
+
+@njit(cache=True, nogil=True)
+def _find(
+    cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, min_area: float,
+    spacing: float, found: Float64,
+) -> int:  # fmt: skip
+    """Writes m, deviation, area, share and what is behind of each plane; how many there are. `free` is used up."""
+    m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
-    readings = cells[:, 0].sum()
-    found = np.zeros((MAX_PLANES, 7))
+    readings = 0.0
+    for i in range(len(cells)):
+        readings += cells[i, 0]
     k = 0
     region, deviations = np.empty(len(cells), np.int64), np.empty(len(cells))
     for seed in seeds:
@@ -184,12 +197,14 @@ def _find(
             continue
         size = _grow(cells, columns, seed, free, distance, noise, m, region)
         area = 0.0
-        for i in region[:size]:
+        for j in range(size):
+            i = region[j]
             tried[i] = True
             area += _area(cells[i], m, spacing)
         if 4 * area < min_area:
             continue
-        total[:] = 0.0
+        for a in range(10):
+            total[a] = 0.0
         for _ in range(REFITS):
             _collect(cells, free, m, distance, noise, deviations)
             _refit(cells, deviations, m, total)
@@ -201,12 +216,13 @@ def _find(
                 count += cells[i, 0]
         if area < min_area or total[0] == 0:
             continue
-        free &= deviations == np.inf
-        found[k, :3], found[k, 3] = m, min(_deviation(total, m), noise)
+        for i in range(len(cells)):
+            free[i] = free[i] and deviations[i] == np.inf
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = m[0], m[1], m[2], min(_deviation(total, m), noise)
         found[k, 4], found[k, 5] = area, count / readings
         found[k, 6] = _readings_behind(cells, m, found[k, 3], distance) / count
         k += 1
-    return found[:k, :3].copy(), found[:k, 3].copy(), found[:k, 4].copy(), found[:k, 5].copy(), found[:k, 6].copy()
+    return k
 
 
 @njit(cache=True, nogil=True)
@@ -218,7 +234,9 @@ def _grow(
     The plane is fitted again with every cell that comes in.
     """
     seen = np.zeros(len(cells), np.bool_)
-    total = cells[seed].copy()
+    total = np.zeros(10)
+    for a in range(10):
+        total[a] = cells[seed, a]
     _solve(total, m)
     region[0], seen[seed] = seed, True
     size, done = 1, 0
@@ -261,19 +279,24 @@ def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> N
 
     The others are cells across the line where two planes meet, which would tilt both towards each other.
     """
-    inside = deviations[deviations < np.inf]
-    if len(inside) == 0:
+    inside, count = np.empty(len(deviations)), 0
+    for i in range(len(deviations)):
+        if deviations[i] < np.inf:
+            inside[count] = deviations[i]
+            count += 1
+    if count == 0:
         return
-    middle = len(inside) // 2
+    inside, middle = inside[:count], count // 2
     upper = _order(inside, middle)
-    bound = TRIM * (upper if len(inside) % 2 else (_order(inside, middle - 1) + upper) / 2)
+    bound = TRIM * (upper if count % 2 else (_order(inside, middle - 1) + upper) / 2)
     best = np.zeros(10)
     for i in range(len(cells)):
         if deviations[i] <= bound:
             for a in range(10):
                 best[a] += cells[i, a]
     if _solve(best, m):
-        total[:] = best
+        for a in range(10):
+            total[a] = best[a]
 
 
 @njit(cache=True, nogil=True)

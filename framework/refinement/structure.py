@@ -16,25 +16,26 @@ def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: f
     most `max_own` of the readings.
     """
     structure = on_plane > 0
-    kept = _off_planes(clusters.cluster, clusters.pixels, on_plane, len(clusters), planes, max_own, structure)
+    rows = len(clusters) + 1  # the last is for points of no cluster
+    counts = np.zeros((-(-len(clusters.cluster) // PART), rows, planes + 1), np.int64)
+    stays = np.ones((rows, planes + 1), np.bool_)
+    kept = _off_planes(clusters.cluster, clusters.pixels, on_plane, max_own, counts, stays, structure)
     return kept, structure
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def _off_planes(
-    cluster: Int32, pixels: Int32, on_plane: UInt8, clusters: int, planes: int, max_own: float, structure: Bool
+    cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
 ) -> Bool:
     """Returns which points are kept, and takes those on planes from `structure`.
 
     A pixel is in a cluster once, so its points on a plane are a part of the plane's.
     """
-    parts = (len(cluster) + PART - 1) // PART
     labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
-    counts = np.zeros((parts, clusters + 1, planes + 1), np.int64)  # the last row is for points of no cluster
-    for part in prange(parts):
+    for part in prange(len(counts)):
         own = slice(part * PART, (part + 1) * PART)
         _count_on_planes(cluster[own], pixels[own], on_plane, labels[own], counts[part])
-    stays = _stays(counts, on_plane, max_own)
+    _judge(counts, on_plane, max_own, stays)
     for i in prange(len(cluster)):
         kept[i] = stays[cluster[i], labels[i]]
         if kept[i] and cluster[i] >= 0 and labels[i] > 0:
@@ -43,10 +44,9 @@ def _off_planes(
 
 
 @njit(cache=True, nogil=True)
-def _stays(counts: Int64, on_plane: UInt8, max_own: float) -> Bool:
-    """Whether the points of each cluster, and in the last row of none, on each plane, and in column 0 on none, stay."""
+def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
+    """Takes from `stays` the points of each cluster, but the last row's, on each plane, but column 0's, that leave."""
     parts, rows, columns = counts.shape
-    stays = np.ones((rows, columns), np.bool_)
     for label in range(1, columns):
         most = max_own * _count(on_plane.ravel(), label)
         for k in range(rows - 1):
@@ -54,7 +54,6 @@ def _stays(counts: Int64, on_plane: UInt8, max_own: float) -> Bool:
             for part in range(parts):
                 own += counts[part, k, label]
             stays[k, label] = own > most
-    return stays
 
 
 @njit(cache=True, nogil=True)

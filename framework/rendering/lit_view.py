@@ -14,7 +14,8 @@ from framework.rendering.surface import FrontSides, Surface
 
 SUPERSAMPLING = 2  # rays per pixel in either direction
 NOTHING = (229, 232, 236)  # where nothing was mapped: a shade off the paper, as mapped things may be white
-LAMP = np.array([-0.45, -0.75, -0.6])  # the way to it in the camera's coordinates: over the viewer's left shoulder
+TO_LAMP = np.array([-0.45, -0.75, -0.6])  # in the camera's coordinates: over the viewer's left shoulder
+LAMP = TO_LAMP / np.linalg.norm(TO_LAMP)
 AMBIENT, DIFFUSE = 0.70, 0.34  # light from around and from the lamp, which is soft
 
 
@@ -64,7 +65,6 @@ class LitView:
 def _light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
     """Writes the brightness (H, W), and turns the normals (H, W, 3): to the camera, of unit length, in its axes."""
     R = R_world_camera
-    lamp = LAMP / np.linalg.norm(LAMP)
     for v in range(normals.shape[0]):
         y = (v - K[1, 2]) / K[1, 1]
         for u in range(normals.shape[1]):
@@ -75,7 +75,7 @@ def _light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Floa
             away = (u - K[0, 2]) / K[0, 0] * nx + y * ny + nz > 0
             scale = (-1 if away else 1) / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
             n[0], n[1], n[2] = scale * nx, scale * ny, scale * nz
-            light[v, u] = AMBIENT + DIFFUSE * max(n[0] * lamp[0] + n[1] * lamp[1] + n[2] * lamp[2], 0.0)
+            light[v, u] = AMBIENT + DIFFUSE * max(n[0] * LAMP[0] + n[1] * LAMP[1] + n[2] * LAMP[2], 0.0)
 
 
 @njit(cache=True, nogil=True)

@@ -83,10 +83,11 @@ def _morton_codes(vertices: Float32, triangles: Int32) -> npt.NDArray[np.uint32]
             )
             middle[f, axis] = corners / 3
     low, side = np.zeros(3, np.float32), np.float32(0)
-    for axis in range(3):
-        if len(middle):
-            low[axis] = middle[:, axis].min()
-            side = max(side, middle[:, axis].max() - low[axis])
+    for axis in range(3 if len(middle) else 0):
+        lowest = highest = middle[0, axis]
+        for f in range(len(middle)):
+            lowest, highest = min(lowest, middle[f, axis]), max(highest, middle[f, axis])
+        low[axis], side = lowest, max(side, highest - lowest)
     codes = np.zeros(len(triangles), np.uint32)
     if side > 0:
         for f in range(len(triangles)):
@@ -103,14 +104,17 @@ def _bounding_spheres(vertices: Float32, triangles: Int32) -> Float64:
     spheres = np.zeros(((len(triangles) + CHUNK - 1) // CHUNK, 4))
     for chunk in range(len(spheres)):
         part = triangles[chunk * CHUNK : (chunk + 1) * CHUNK]
-        low, high = np.full(3, np.inf), np.full(3, -np.inf)
+        low, high = np.array([np.inf, np.inf, np.inf]), np.array([-np.inf, -np.inf, -np.inf])
         for f in range(len(part)):
             for corner in range(3):
                 for axis in range(3):
                     at = vertices[part[f, corner], axis]
                     low[axis], high[axis] = min(low[axis], at), max(high[axis], at)
-        spheres[chunk, :3] = 0.5 * (low + high)
-        spheres[chunk, 3] = 0.5 * np.sqrt(((high - low) ** 2).sum())
+        squares = 0.0
+        for axis in range(3):
+            spheres[chunk, axis] = 0.5 * (low[axis] + high[axis])
+            squares += (high[axis] - low[axis]) ** 2
+        spheres[chunk, 3] = 0.5 * np.sqrt(squares)
     return spheres
 
 
