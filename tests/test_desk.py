@@ -18,10 +18,10 @@ def test_it_is_small_and_says_whose_it_is() -> None:
 
 
 def test_a_real_desk_is_tracked_and_its_things_are_found() -> None:
-    """Its first twelve frames, by the network that comes with the project."""
+    """Its first two dozen frames, by the network that comes with the project."""
     config = composed("dataset=desk")
     assert config.detector._target_ == "plugins.detectors.maskrcnn2go.MaskRCNN2Go"
-    sequence = build(RGBDSequence, composed("dataset=desk", "dataset.stop=12").dataset)
+    sequence = build(RGBDSequence, composed("dataset=desk", "dataset.stop=24").dataset)
     mapper = Mapper("fuser.voxel_size=0.02")
     assert not any(mapper.add(sequence[k]).lost for k in range(len(sequence)))
     classes = mapper.scene.classes

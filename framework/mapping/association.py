@@ -271,8 +271,6 @@ class Association:
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
         match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
-        if overlaps.hidden is not None:
-            self._match_hidden(table, overlaps.hidden, clusters, instance_ids)
         may_create = (
             (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         )
@@ -280,22 +278,22 @@ class Association:
             may_create &= ~allowed.any(axis=1)
         if may_create.any():
             may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
-        for k in np.flatnonzero(may_create):
+        if overlaps.hidden is not None:
+            self._find_hidden(table, overlaps.hidden, clusters, may_create, instance_ids)
+        for k in np.flatnonzero(may_create & (instance_ids == 0)):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id
         return Matches(frame_index, clusters, overlaps, instance_ids)
 
-    def _match_hidden(
-        self, table: InstanceTable, hidden: Overlaps, clusters: PointClusters, instance_ids: Int32
+    def _find_hidden(
+        self, table: InstanceTable, hidden: Overlaps, clusters: PointClusters, may_create: Bool, instance_ids: Int32
     ) -> None:
-        """Gives clusters without an instance, 0 in instance_ids (N,), one that lies under another in the map's voxels.
+        """Fills in instance_ids (N,) the instances of clusters that may create one, and have one under another already.
 
-        A keyboard on a desk that was seen before it is such an instance until enough has been said for it; as a new one
-        every time, it would never be.
+        A keyboard on a desk that was known before it is such an instance, until enough has been said for it. A new one
+        every time would never be more.
         """
         free = ~np.isin(hidden.instance_ids, instance_ids)
-        allowed = (
-            (hidden.by(self.overlap_rule, self.create_points) > self.overlap) & (instance_ids == 0)[:, None] & free
-        )
+        allowed = may_create[:, None] & free & (hidden.by(self.overlap_rule, self.create_points) > self.overlap)
         if not allowed.any():
             return
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in hidden.instance_ids])

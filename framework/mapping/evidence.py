@@ -148,7 +148,7 @@ def best_instance(evidence, voxel):
 
 @device
 def next_instance(evidence, voxel):
-    """The most likely instance of a labelled voxel but for the one in slot 0, 0 when none is more likely than the rest."""
+    """The most likely instance of a labelled voxel after that in slot 0, 0 when none is more likely than the rest."""
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(1, evidence.instance_ids.shape[1]):
