@@ -4,6 +4,8 @@ A parallel loop waits for its slowest thread, and a thread whose core is taken i
 threads that share all cores wait for each other: on two cores, beside a network that takes one, tracking and fusion
 have taken up to ten times as long with two threads as with one. Each gets cores of its own instead, in proportion to
 its work. No result depends on it, as no kernel's result depends on its number of threads.
+
+This is about numba's kernels. The threads of a network are its own: they are neither limited here nor counted.
 """
 
 from __future__ import annotations
@@ -23,24 +25,29 @@ RECENT = 15  # frames; their median is a frame's work
 class CoreSharing:
     """How many threads the kernels of either side have, by what the latest frames have cost it."""
 
-    def __init__(self) -> None:
+    def __init__(self, with_a_thread_ahead: bool = True) -> None:
         self.cores = int(numba.get_num_threads())
+        self._alone = not with_a_thread_ahead
         self._ahead: deque[float] = deque(maxlen=RECENT)  # s of CPU time a frame, of the thread itself
         self._mapping: deque[float] = deque(maxlen=RECENT)  # likewise, times its threads: it is one loop after another
         self._lock = Lock()
 
     @contextmanager
     def ahead(self) -> Iterator[None]:
-        """Around what the thread ahead does with one frame."""
-        with self._measured(self.cores_ahead(), self._ahead, 1):
+        """Around what is done ahead with one frame."""
+        with self._with_threads(self.cores if self._alone else max(self.cores_ahead(), 1)):
+            began = time.thread_time()
             yield
+            self._note(self._ahead, time.thread_time() - began)
 
     @contextmanager
     def mapping(self) -> Iterator[None]:
         """Around the mapping of one frame."""
-        cores = self.cores - self.cores_ahead()
-        with self._measured(cores, self._mapping, cores):
+        threads = self.cores if self._alone else max(self.cores - self.cores_ahead(), 1)
+        with self._with_threads(threads):
+            began = time.thread_time()
             yield
+            self._note(self._mapping, threads * (time.thread_time() - began))
 
     def cores_ahead(self) -> int:
         """The share of the thread ahead, rounded.
@@ -53,14 +60,16 @@ class CoreSharing:
             ahead, mapping = median(self._ahead), median(self._mapping)
         return round(self.cores * ahead / max(ahead + mapping, 1e-9))
 
+    def _note(self, spent: deque[float], seconds: float) -> None:
+        with self._lock:
+            spent.append(seconds)
+
     @contextmanager
-    def _measured(self, cores: int, spent: deque[float], parallel: int) -> Iterator[None]:
+    def _with_threads(self, threads: int) -> Iterator[None]:
+        """For the kernels that the calling thread calls."""
         before = numba.get_num_threads()
-        numba.set_num_threads(max(cores, 1))  # of the kernels that this thread calls
-        began = time.thread_time()
+        numba.set_num_threads(threads)
         try:
             yield
         finally:
             numba.set_num_threads(before)
-            with self._lock:
-                spent.append(max(parallel, 1) * (time.thread_time() - began))

@@ -6,9 +6,9 @@ import gc
 import signal
 import time
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager, nullcontext
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, replace
 from itertools import repeat
 from typing import TypeVar, cast
@@ -16,7 +16,7 @@ from typing import TypeVar, cast
 import numba
 
 from framework.core_sharing import CoreSharing
-from framework.data import Detections, Frame, Pose
+from framework.data import Array, Detections, Frame, Pose
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.frame_stream import FrameStream, stream_of
@@ -79,18 +79,23 @@ class Pipeline:
                     self.map_all(video, journal, interruption)
             except BaseException as stop:
                 journal.stopped_by = stop
+            places = self.places(journal)
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
             if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
                 journal.stopped_by = None  # that is how it ends; a second signal is another Interrupted
-            return self.result(journal)
-        if journal.frames_in_map == 0 or self.fuser.scene.voxel_count == 0:
+        elif journal.frames_in_map == 0 or self.fuser.scene.voxel_count == 0:
             raise DataError(f"{video.name}: {self.why_nothing(journal)}")
-        return self.result(journal)
+        return replace(journal.result(), places=places)
 
-    def result(self, journal: Journal) -> RunResult:
-        return replace(journal.result(), places=self.tracker.places())
+    def places(self, journal: Journal) -> Mapping[str, Array]:
+        """What the tracker remembers; a fault of the last frame's place, which is told only now, ends the run, too."""
+        try:
+            return self.tracker.places()
+        except Exception as fault:
+            journal.stopped_by = journal.stopped_by or fault
+            return self.tracker.places()
 
     def why_nothing(self, journal: Journal) -> str:
         """What became of the frames of a run whose map is empty."""
@@ -116,11 +121,11 @@ class Pipeline:
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""
-        sharing = CoreSharing()
+        sharing = CoreSharing(with_a_thread_ahead=self.ahead > 0)
         with closing(self.detect_ahead(video, journal, interruption, sharing)) as detected:
             for frame, detections in detected:
                 try:
-                    with sharing.mapping() if self.ahead else nullcontext():
+                    with sharing.mapping():
                         self.map_frame(frame, detections, journal)
                 except FrameError as error:
                     journal.frame_skipped(error)
@@ -138,7 +143,7 @@ class Pipeline:
         ahead = self.ahead if stream.most_ahead is None else min(self.ahead, stream.most_ahead)
 
         def work(stream: FrameStream) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-            with sharing.ahead() if ahead else nullcontext():
+            with sharing.ahead():
                 return self.read_and_detect(stream)
 
         # the stream ends first: the worker may be waiting for its next frame

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -77,9 +78,17 @@ def dequantised(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
     return tensor.permute(0, 3, 1, 2) if tensor.ndim == 4 else tensor  # a permuted view is channels last already
 
 
+@cache
 def has_int8_kernels() -> bool:
-    """Whether torch computes convolutions of integers on this CPU."""
-    return bool(torch.backends.mkldnn.is_available() and torch.backends.quantized.engine == "x86")
+    """Whether torch computes convolutions of integers here, and the largest numbers right."""
+    if not (torch.backends.mkldnn.is_available() and torch.backends.quantized.engine == "x86"):
+        return False
+    channels = 16
+    kernel = torch.full((1, channels, 1, 1), float(MOST_OF_WEIGHTS))
+    window = [1, 1], [0, 0], [1, 1], 1
+    convolution = Int8Convolution(kernel, torch.zeros(1), 1.0, window, Quantisation(1.0, 0), None, False)
+    found = convolution(torch.full((1, channels, 8, 8), MOST, dtype=torch.uint8))
+    return bool((found == channels * MOST_OF_WEIGHTS * MOST).all())
 
 
 def float_network(
@@ -177,6 +186,8 @@ def _int8_steps(
         kind, name, blobs = operator["type"], operator["outputs"][0], _blobs(operator, tensors)
         if kind in (*CONVOLUTIONS, "Int8ConvTranspose") and name not in outputs:
             (blob,) = blobs
+            if blob not in quantisations:
+                raise DataError(f"graph.json: {blob} goes into a convolution, and its integers have no scale")
             if blob not in in_integers and blob not in rounded:
                 rounded[blob] = f"{blob}, rounded"
                 yield Step(quantisations[blob].quantised, blobs, rounded[blob])

@@ -3,7 +3,7 @@
 A cluster's pixels vote for the instances that the map holds at the surface measured there. Which pairs may match is
 said by their overlap, by default over the smaller of the two, so that a part of an object still finds the whole; among
 those, one cluster gets at most one instance and the reverse, best IoU first, so that a table does not get the book that
-lies on it.
+lies on it. A cluster that finds none there looks for one among the next likeliest ones, before it makes another.
 """
 
 from __future__ import annotations
@@ -237,7 +237,8 @@ class Association:
     split: bool = True  # whether two clusters on one instance split it: the better one keeps it, the other is new
     merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
-    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate)
+    merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate); so must those
+    # of a cluster and of an instance that another one hides
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -290,7 +291,7 @@ class Association:
         """Fills in instance_ids (N,) the instances of clusters that may create one, and have one under another already.
 
         A keyboard on a desk that was known before it is such an instance, until enough has been said for it. A new one
-        every time would never be more.
+        in every frame would never get enough to be seen.
         """
         free = ~np.isin(hidden.instance_ids, instance_ids)
         allowed = may_create[:, None] & free & (hidden.by(self.overlap_rule, self.create_points) > self.overlap)

@@ -39,7 +39,7 @@ from framework.mapping.integration import SeenBlocks
 from framework.mapping.pages import PagesAhead
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more, reserved
 
-Integers = npt.NDArray[Any]  # of int16 or int64
+Integers = npt.NDArray[Any]  # of int16, int32 or int64
 
 INSTANCE_SLOTS, CLASS_SLOTS = 4, 16  # labels that a voxel can tell apart in compact storage
 RESERVED = 128  # voxels with slots for each block of the budget: most have fewer, and slots for more are made
@@ -124,13 +124,13 @@ def named_classes(evidence: Float64, logarithmic: bool) -> tuple[Float64, UInt8,
     return gains, np.concatenate([named, again], axis=1).astype(np.uint8), bits
 
 
-def class_said(gains: Float64, units: int, named_bit: UInt8, exact: bool = False) -> Integers:
+def class_said(gains: Float64, units: int, named_bit: UInt8, kind: type[np.signedinteger[Any]]) -> Integers:
     """What clusters say of each class in one number, so that a voxel looks up one: the `gains` (N, C) over those that
     the cluster does not name, in whole units, times 2^NEW_CLASSES, and in the lowest bits the class's `named_bit`.
     """
     said = named_bit.astype(np.int64)
     said[:, : gains.shape[1]] += np.rint(gains * units).astype(np.int64) << NEW_CLASSES
-    return said if exact else said.astype(np.int32)
+    return said.astype(kind)
 
 
 @device
@@ -374,10 +374,10 @@ def _update(grid, seen, evidence, measurement, first_point, new, evicted):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _label_new(grid, seen, evidence, measurement, first_point, new, first_new, free_classes):
+def _label_new(grid, seen, evidence, measurement, first_point, new, first_new, free_classes, evicted):
     """Gives the new (A,) voxels of each block their slots, from first_new (A,) on, and has them updated.
 
-    free_classes (T,) is what slots for classes hold before.
+    free_classes (T,) is what slots for classes hold before; slots given away are added to evicted (A,).
     """
     for a in prange(seen.blocks.shape[0]):
         voxel = first_new[a]
@@ -386,7 +386,7 @@ def _label_new(grid, seen, evidence, measurement, first_point, new, first_new, f
             point, n = first_point[seen.near_pixel[a, i]], seen.near_voxel[a, i]
             if evidence.labeled[row, n] < 0 and _is_named(measurement, point):
                 _label(evidence, row, n, voxel, free_classes)
-                update_voxel(evidence, voxel, measurement, point)
+                evicted[a] += update_voxel(evidence, voxel, measurement, point)
                 voxel += np.int32(1)
 
 
@@ -450,7 +450,7 @@ class EvidenceRows:
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what is only reserved, which is gigabytes."""
-        return {**vars(self), "evidence": self.in_use()}
+        return {**vars(self), "evidence": self.in_use(), "_pages": PagesAhead()}
 
     @property
     def byte_count(self) -> int:
@@ -494,7 +494,7 @@ class EvidenceRows:
         grid, free_classes = self.voxels.grid, self._free_classes()
         _update(grid, seen, self.evidence, measurement, first_point, new, evicted)
         first_new = self._make_room(seen.blocks, new)
-        _label_new(grid, seen, self.evidence, measurement, first_point, new, first_new, free_classes)
+        _label_new(grid, seen, self.evidence, measurement, first_point, new, first_new, free_classes, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:

@@ -14,7 +14,7 @@ and 0.5 colours; what is left waits for the memory although the next block is as
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -205,9 +205,9 @@ class SeenBlocks(NamedTuple):
     """The A blocks that a frame has updated, and their voxels near the measured surface; valid until the next frame."""
 
     blocks: Int32  # (A,) their numbers
-    near_count: Int32  # (A,) voxels near the surface, which are the first so many of
-    near_voxel: UInt16  # (A, 512) in their order
-    near_pixel: Int32  # (A, 512) the number v * width + u of the pixel that sees each
+    near_count: Int32  # (A,) how many voxels of each block lie near the surface
+    near_voxel: UInt16  # (A, 512) their numbers in the block, ascending; the first near_count of a row are set
+    near_pixel: Int32  # (A, 512) the number v * width + u of the pixel that sees each of these
 
 
 class Integrator:
@@ -220,6 +220,10 @@ class Integrator:
         self._allocator = Allocator(voxels, sensor)
         self._near_voxel = np.empty((0, BLOCK_VOXELS), np.uint16)
         self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what the next frame overwrites."""
+        return {**vars(self), "_near_voxel": self._near_voxel[:0], "_near_pixel": self._near_pixel[:0]}
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near_band: float) -> SeenBlocks:
         """Integrates one frame and tells what it saw within near_band m of the measured surface.

@@ -121,7 +121,7 @@ class LabeledVoxels:
             instance_gain=evidence.instances,
             absence=np.float32(evidence.absence),
             matched=matched,
-            class_said=class_said(class_gain, units, bits, exact=not compact),
+            class_said=class_said(class_gain, units, bits, np.int32 if compact else np.int64),
             named_classes=named,
             combine=int(rule.combine),
             most_units=MOST_UNITS if compact else 1 << 62,

@@ -306,7 +306,7 @@ class VoxelGrid:
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what is only reserved, which is gigabytes."""
         blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
-        return {**vars(self), "grid": self.grid._replace(**blocks)}
+        return {**vars(self), "grid": self.grid._replace(**blocks), "_pages": PagesAhead()}
 
     @property
     def byte_count(self) -> int:

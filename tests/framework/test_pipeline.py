@@ -8,13 +8,14 @@ import os
 import signal
 import sys
 import threading
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pytest
 from tqdm import TMonitor
 
-from framework.data import Detections, Frame, PointClusters, Pose
+from framework.data import Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import SceneMap
 from framework.journal import RunResult
@@ -224,6 +225,28 @@ def test_a_fault_is_raised_and_what_it_left_is_there_for_who_asks(room: CornerRo
     result = pipeline(fuser=_Fails()).run_to_any_end(room)
     assert isinstance(result.stopped_by, MemoryError)
     assert (result.frames, len(result.tracked), len(mapped(result).vertices)) == (4, 4, 3)
+
+
+@dataclass
+class ForgetsOnce(GivenPose):
+    """What it has begun to remember fails when somebody first asks, after the last frame."""
+
+    asked: int = 0
+
+    def places(self) -> Mapping[str, Array]:
+        self.asked += 1
+        if self.asked == 1:
+            raise MemoryError("no memory for features")
+        return {}
+
+
+def test_a_fault_of_the_last_place_keeps_the_map(room: CornerRoom) -> None:
+    result = pipeline(tracker=ForgetsOnce()).run_to_any_end(room)
+    assert isinstance(result.stopped_by, MemoryError)
+    assert (result.frames, len(result.tracked)) == (6, 6)
+    assert len(mapped(result).vertices) > 0
+    result = pipeline(tracker=ForgetsOnce(), fuser=_Fails()).run_to_any_end(room)
+    assert "40 GiB" in str(result.stopped_by), "what came first"
 
 
 @AHEAD

@@ -1,5 +1,9 @@
 """Networks of 8-bit integers: each operator against its definition, in float and in integers."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -136,6 +140,18 @@ def test_integers_are_convolved_exactly_and_rounded_once(kind, stride, pad, grou
 
 
 @in_integers
+def test_products_that_overflow_are_noticed():
+    """Without VNNI, oneDNN adds pairs of products in 16 bits. It takes the variable when it is loaded."""
+    asked = "from framework.detection.caffe2_network import has_int8_kernels; print(has_int8_kernels())"
+    for instructions, expected in (("AVX2", "False"), ("DEFAULT", "True")):
+        environment = {**os.environ, "ONEDNN_MAX_CPU_ISA": instructions}
+        answer = subprocess.run(
+            [sys.executable, "-c", asked], env=environment, capture_output=True, text=True, check=True
+        )
+        assert answer.stdout.strip() == expected, instructions
+
+
+@in_integers
 def test_weights_that_do_not_fit_into_int8_are_rounded_in_their_channel_alone():
     rng = np.random.default_rng(12)
     image = rng.integers(0, 256, (1, 4, 3, 3))
@@ -182,3 +198,12 @@ def test_a_blob_between_blocks_is_rounded_for_a_convolution_and_not_for_a_sum():
     network = int8_network(graph, tensors, {"w": 1.0}, ("image",), ("y",))
     x = torch.tensor([[[[0.011, 0.5, 1.2345]]]])
     np.testing.assert_allclose(network(x)[0], x + torch.round(x / 0.02) * 0.02, atol=1e-6)
+
+
+@in_integers
+def test_integers_without_a_scale_are_refused():
+    tensors = {"w": torch.ones(1, 1, 1, 1), "b": torch.zeros(1)}
+    args = {"kernel": 1, "stride": 1, "pad": 0, "Y_scale": 0.1, "Y_zero_point": 0}
+    graph = [{"type": "Int8Conv", "inputs": ["x", "w", "b"], "outputs": ["y"], "args": args}, LAST]
+    with pytest.raises(DataError, match="x goes into a convolution, and its integers have no scale"):
+        int8_network(graph, tensors, {"w": 1.0}, ("x",), ("z",))

@@ -70,7 +70,7 @@ def measured(
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
         matched,
-        class_said(gains, UNITS, bits, exact=True),
+        class_said(gains, UNITS, bits, np.int64),
         named,
         int(Combine.SUM),
         1 << 62,
@@ -85,7 +85,7 @@ def voted(ids: list[int], weights: list[float], classes: list[int], combine: Com
     every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
     return every._replace(
         instance_gain=np.array(weights, np.float32),
-        class_said=class_said(gains, 100, bits, exact=True),
+        class_said=class_said(gains, 100, bits, np.int64),
         named_classes=named,
         combine=int(combine),
     )
@@ -293,7 +293,7 @@ def test_small_numbers_saturate_and_do_not_wrap() -> None:
     gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
     bits = (said.class_said & ALL_NAMED).astype(np.uint8)
     for _ in range(40):
-        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits)), np.int32(0))
+        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits, np.int32)), np.int32(0))
     assert evidence.class_value[0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
     assert best_class(evidence, 0) == 2
 
@@ -306,7 +306,7 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
     gains, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = measured([1], [0.9], p, 1.0, 1)._replace(
-        class_said=class_said(gains, 64, bits), named_classes=named, most_units=MOST_UNITS
+        class_said=class_said(gains, 64, bits, np.int32), named_classes=named, most_units=MOST_UNITS
     )
     for _ in range(1000):
         update_voxel(evidence, 0, said, np.int32(0))
@@ -369,6 +369,7 @@ def _updated(max_blocks: int) -> Evidence:
     rows.begin(6)
     rows.voxels.allocate(np.array([[k, 0, 0] for k in range(4)], np.int32))
     by_voxel: dict[tuple[int, int], Evidence] = {}
+    evicted = 0
     for _ in range(5):
         instances = [0, 1, 2, int(rng.integers(3, 8))]
         said = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
@@ -391,14 +392,36 @@ def _updated(max_blocks: int) -> Evidence:
                 while p >= 0:
                     named, p = named or bool(said.instance_id[cluster[p]]), following[p]
                 if pixels[a, n] >= 0 and (named or key in by_voxel):
-                    update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(point))
+                    evicted += update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(point))
     evidence = rows.in_use()
     assert len(by_voxel) == rows.voxel_count > 100
     for (block, n), own in by_voxel.items():
         voxel = evidence.labeled[rows.voxels.grid.label_row[block], n]
         for name in SLOTS:
             np.testing.assert_array_equal(getattr(evidence, name)[voxel], getattr(own, name)[0], err_msg=name)
+    assert rows.evicted == evicted
     return evidence
+
+
+def test_slots_that_a_new_voxel_gives_away_count() -> None:
+    said = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
+    expected = update_voxel(blank(), 0, said, np.int32(0))
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
+    rows.begin(6)
+    rows.voxels.allocate(np.zeros((1, 3), np.int32))
+    rows.update(at_pixel(0, 5), said)
+    assert rows.evicted == expected == 2
+
+
+def test_both_kinds_of_integers_say_the_same() -> None:
+    """The largest gains that compact storage allows."""
+    gains = np.array([[MOST_GAIN, -MOST_GAIN, 0.4, -0.6]])
+    bits = np.zeros((1, NO_CLASS + 1), np.uint8)
+    bits[0, :4] = 1 << np.arange(4)
+    narrow, wide = (class_said(gains, 1, bits, kind) for kind in (np.int32, np.int64))
+    assert narrow.dtype == np.int32
+    np.testing.assert_array_equal(narrow, wide)
+    assert (wide[0, :4] >> NEW_CLASSES).tolist() == [MOST_GAIN, -MOST_GAIN, 0, -1]
 
 
 def test_exact_storage_never_forgets() -> None:
