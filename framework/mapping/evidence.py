@@ -234,7 +234,12 @@ def _rank(label, value):
 
 @device
 def best_class_first(classes, units):
-    """best_first() of class slots, which are many: without a branch, until one is found to be out of place."""
+    """best_first() of class slots, which are many: without a branch, until one may be out of place."""
+    most = units[len(classes) - 1]
+    for s in range(1, len(classes) - 1):
+        most = max(most, units[s])
+    if units[0] > most:
+        return
     best = _rank(classes[0], units[0])
     for s in range(1, len(classes)):
         best = max(best, _rank(classes[s], units[s]))
