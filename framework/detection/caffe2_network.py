@@ -1,8 +1,8 @@
 """Networks that Caffe2 wrote in 8-bit integers, computed in these integers on a CPU, or in float on any device.
 
 A number q of a blob stands for scale * (q - zero point) (Jacob et al., "Quantization and Training of Neural Networks
-for Efficient Integer-Arithmetic-Only Inference", 2018). Convolutions of integers are oneDNN's, through torch; where a
-processor would overflow when it adds products of 8 bits, oneDNN leaves the weights' lowest bit out.
+for Efficient Integer-Arithmetic-Only Inference", 2018). Convolutions of integers are oneDNN's, through torch, on
+x86 processors with VNNI: on others, sums of products of 8 bits overflow 16 bits.
 """
 
 from __future__ import annotations
