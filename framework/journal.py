@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
-import sys
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
@@ -12,12 +10,12 @@ from dataclasses import dataclass, field
 from types import TracebackType
 
 import numpy as np
-from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from framework.data import Array, Float64, Frame, Pose
 from framework.errors import FrameError, NoPoseError
 from framework.interfaces import PoseTracker, SceneMap
+from framework.progress import Progress
 
 log = logging.getLogger(__name__)
 
@@ -87,7 +85,7 @@ class RunResult:
 
 @dataclass
 class Journal:
-    """Keeps the record of a run while it goes on, and shows its progress where a terminal is watching."""
+    """Keeps the record of a run while it goes on, and shows its progress."""
 
     scene: SceneMap
     frames_expected: int | None  # None = of a live video, which goes on as long as it likes
@@ -107,11 +105,7 @@ class Journal:
 
     def __enter__(self) -> Journal:
         self._screen = ExitStack()
-        # tqdm itself does not look where `disable` is given; a program without a console has no stderr
-        quiet = os.environ.get("TQDM_DISABLE") == "1" or sys.stderr is None
-        self._bar = self._screen.enter_context(
-            tqdm(total=self.frames_expected, unit=" frames", disable=quiet or None, dynamic_ncols=True)
-        )
+        self._bar = self._screen.enter_context(Progress(self.frames_expected, " frames"))
         if not self._bar.disable:
             self._screen.enter_context(logging_redirect_tqdm())
         self._counted_at = self._started = time.perf_counter()
@@ -149,6 +143,9 @@ class Journal:
                 counts["dropped"] = self.frames_dropped
             self._bar.set_postfix(counts, refresh=False)
             self._counted_at = time.perf_counter()
+        if self._bar.line_is_due():
+            of_all = "" if self.frames_expected is None else f" of {self.frames_expected}"
+            log.info("frame %d%s, %d instances", self.frames, of_all, self.scene.instance_count)
 
     def frame_skipped(self, error: FrameError) -> None:
         """Counts a frame that cannot be used."""

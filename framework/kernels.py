@@ -13,7 +13,6 @@ import queue
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -27,9 +26,9 @@ from typing import Any
 from filelock import FileLock, Timeout
 from numba import types
 from numba.core.dispatcher import Dispatcher
-from tqdm import tqdm
 
 from framework.errors import DataError
+from framework.progress import Progress
 from framework.settings import available_cores
 
 log = logging.getLogger(__name__)
@@ -39,7 +38,6 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 DEFAULT, OTHERS = "# a run with the default stages", "# what other stages add"
 MOST_WORKERS = 4  # each compiles anew what kernels share, and takes 0.5 GB
 SECONDS_EACH = 0.65  # of a core, an AMD EPYC (Zen 5) with 2 cores: for a guess of how long it takes
-SIGN_OF_LIFE = 3.0  # s, from one line to the next where no bar is shown
 
 
 @dataclass(frozen=True)
@@ -199,9 +197,8 @@ def _watch(
     count: int, threads: list[threading.Thread], told: queue.SimpleQueue[tuple[str, str]], faults: list[str]
 ) -> None:
     """Shows how many kernels are left until all are done: a bar, or a line every few seconds where there is none."""
-    quiet = os.environ.get("TQDM_DISABLE") == "1" or sys.stderr is None
-    left, spoken = count, time.monotonic()
-    with tqdm(total=count, unit=" kernels", disable=quiet or None, dynamic_ncols=True) as bar:
+    left = count
+    with Progress(count, " kernels") as bar:
         while left:
             try:
                 event, text = told.get(timeout=1.0)
@@ -216,9 +213,8 @@ def _watch(
             elif event == "begun":
                 bar.set_description_str(f"{left} left, {text}", refresh=False)
             bar.refresh()
-            if bar.disable and not quiet and time.monotonic() - spoken > SIGN_OF_LIFE:
+            if bar.line_is_due():
                 log.info("%d of %d kernels are left", left, count)
-                spoken = time.monotonic()
 
 
 @contextmanager

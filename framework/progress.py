@@ -1,0 +1,40 @@
+"""Progress of long work: a bar on a terminal, else a line in the log now and then."""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from typing import Any
+
+from tqdm import tqdm
+
+SIGN_OF_LIFE, LONGEST = 3.0, 60.0  # s, the least and the most from one line to the next
+
+
+class Progress(tqdm):  # type: ignore[type-arg]  # of counts, not of an iterable
+    """tqdm's bar of `total` things (None = nobody knows), and when it is time for a line where no bar is shown."""
+
+    def __init__(self, total: int | None, unit: str, **options: Any) -> None:
+        # tqdm itself does not look where `disable` is given; a program without a console has no stderr
+        self.quiet = os.environ.get("TQDM_DISABLE") == "1" or sys.stderr is None
+        wide = self.quiet or not sys.stderr.isatty() or _columns() > 0
+        super().__init__(total=total, unit=unit, disable=self.quiet or None, dynamic_ncols=wide, **options)
+        self._begun = self._spoken = time.monotonic()
+
+    def line_is_due(self) -> bool:
+        """Whether it is time for a line, as no bar is shown: every few seconds, and more rarely the longer it takes."""
+        now = time.monotonic()
+        interval = min(max(SIGN_OF_LIFE, 0.1 * (now - self._begun)), LONGEST)
+        if not self.disable or self.quiet or now - self._spoken < interval:
+            return False
+        self._spoken = now
+        return True
+
+
+def _columns() -> int:
+    """Of the terminal at standard error; 0 = it does not say, and tqdm would show nothing."""
+    try:
+        return os.get_terminal_size(sys.stderr.fileno()).columns
+    except (OSError, ValueError):
+        return 0
