@@ -115,8 +115,8 @@ def int8_network(
     """The same in integers; `spacings` has the distance between neighboring numbers of each kernel.
 
     As the graph has it, but for what costs little: the few linear channels from block to block (Sandler et al.,
-    "MobileNetV2", 2018), whose rounding errors would add up, what leaves the network, means and fully connected
-    layers are not rounded. Mask R-CNN 2Go's features are off by 0.037 of their standard deviation from those in float
+    "MobileNetV2", 2018), whose rounding errors would add up, what leaves the network, means, fully connected layers
+    and transposed convolutions are not rounded. Mask R-CNN 2Go's features are off by 0.037 of their standard deviation from those in float
     (six frames of redkitchen and replica_floor2).
 
     Raises DataError for an operator that is not known.
@@ -184,14 +184,14 @@ def _int8_steps(
     rounded: dict[str, str] = {}  # blobs in float to their names in integers
     for operator in operators:
         kind, name, blobs = operator["type"], operator["outputs"][0], _blobs(operator, tensors)
-        if kind in (*CONVOLUTIONS, "Int8ConvTranspose") and name not in outputs:
+        if kind in CONVOLUTIONS and name not in outputs:
             (blob,) = blobs
             if blob not in quantisations:
                 raise DataError(f"graph.json: {blob} goes into a convolution, and its integers have no scale")
             if blob not in in_integers and blob not in rounded:
                 rounded[blob] = f"{blob}, rounded"
                 yield Step(quantisations[blob].quantised, blobs, rounded[blob])
-            linear = kind == "Int8ConvTranspose" or (kind == "Int8Conv" and operator["args"].get("group", 1) == 1)
+            linear = kind == "Int8Conv" and operator["args"].get("group", 1) == 1
             if not linear:
                 in_integers.add(name)
             spacing = spacings[operator["inputs"][1]]
@@ -216,17 +216,8 @@ def _in_integers(
     """A convolution from uint8 to uint8 or, without `result`, to float32; `spacing` is the kernel's."""
     args = operator["args"]
     kernel, bias = _weights(operator, tensors)
-    if operator["type"] != "Int8ConvTranspose":
-        window = [args["stride"]] * 2, [args["pad"]] * 2, [1, 1], args.get("group", 1)
-        return Int8Convolution(kernel, bias, spacing, window, source, result, operator["type"] == "Int8ConvRelu")
-    _, out, cell, _ = kernel.shape
-    if cell != args["stride"] or args["pad"]:
-        raise DataError(f"graph.json: a transposed convolution of {cell} px and stride {args['stride']} is not known")
-    # without overlaps it is a convolution to all places of a cell, which are then spread out
-    places = kernel.permute(1, 2, 3, 0).reshape(out * cell * cell, -1, 1, 1)
-    biases = bias.repeat_interleave(cell * cell)
-    convolution = Int8Convolution(places, biases, spacing, ([1, 1], [0, 0], [1, 1], 1), source, result, False)
-    return lambda q: functional.pixel_shuffle(convolution(q), cell)
+    window = [args["stride"]] * 2, [args["pad"]] * 2, [1, 1], args.get("group", 1)
+    return Int8Convolution(kernel, bias, spacing, window, source, result, operator["type"] == "Int8ConvRelu")
 
 
 class Int8Convolution:

@@ -49,7 +49,7 @@ class Overlaps:
     votes: Int32  # (N, M) pixels of both
     seen: Int32  # (h, w) the instance at every `stride`-th pixel of every `stride`-th row, 0 = none
     stride: int
-    hidden: Overlaps | None = None  # likewise, with the instances that are the next likeliest where they are
+    hidden: Int32 | None = None  # (h, w) likewise the next likeliest ones; None = the map does not tell
 
     def by(self, rule: OverlapRule, least: int) -> npt.NDArray[np.float64]:
         """(N, M) overlaps in [0, 1] by one of the rules, with `least` as in `over_smaller`."""
@@ -257,10 +257,8 @@ class Association:
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the instances that the map has at the measured surface."""
         stride = vote_stride(frame.camera)
-        overlaps, *hidden = (
-            count_overlaps(clusters, instance_ids, stride)
-            for instance_ids in scene.instances_seen(frame, pose.T_world_camera, stride)
-        )
+        seen, *hidden = scene.instances_seen(frame, pose.T_world_camera, stride)
+        overlaps = count_overlaps(clusters, seen, stride)
         return replace(overlaps, hidden=hidden[0]) if hidden else overlaps
 
     def associate(
@@ -279,8 +277,9 @@ class Association:
             may_create &= ~allowed.any(axis=1)
         if may_create.any():
             may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
-        if overlaps.hidden is not None:
-            self._find_hidden(table, overlaps.hidden, clusters, may_create, instance_ids)
+        if overlaps.hidden is not None and may_create.any():
+            hidden = count_overlaps(clusters, overlaps.hidden, overlaps.stride)
+            self._find_hidden(table, hidden, clusters, may_create, instance_ids)
         for k in np.flatnonzero(may_create & (instance_ids == 0)):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id
         return Matches(frame_index, clusters, overlaps, instance_ids)

@@ -168,21 +168,6 @@ def test_weights_that_do_not_fit_into_int8_are_rounded_in_their_channel_alone():
 
 
 @in_integers
-def test_a_transposed_convolution_of_integers_fills_the_cells():
-    rng = np.random.default_rng(13)
-    image = rng.integers(0, 256, (1, 3, 4, 5))
-    weight = rng.integers(20, 220, (3, 2, 2, 4)).astype(np.uint8)
-    bias = rng.normal(0, 1, 4).astype(np.float32)
-    args = {"kernel": 2, "stride": 2, "pad": 0}
-    network, _ = integer_network("Int8ConvTranspose", args, weight, (0.001, 120), bias)
-    z = network(torch.from_numpy(((image - 110) * 0.02).astype(np.float32)))[0].numpy()
-    spread = np.einsum("chw,cyxo->ohywx", image[0] - 110, weight.astype(int) - 120) * 0.00002
-    np.testing.assert_allclose(z[0], np.maximum(spread.reshape(4, 8, 10) + bias[:, None, None], 0), atol=1e-4)
-    with pytest.raises(DataError, match="a transposed convolution of 2 px and stride 1 is not known"):
-        integer_network("Int8ConvTranspose", {**args, "stride": 1}, weight, (0.001, 120), bias)
-
-
-@in_integers
 def test_a_blob_between_blocks_is_rounded_for_a_convolution_and_not_for_a_sum():
     """y = x + linear(relu(x)): the sum takes x as it is."""
     one = {"Y_scale": 0.02, "Y_zero_point": 100}
