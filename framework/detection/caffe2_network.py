@@ -116,8 +116,8 @@ def int8_network(
 
     As the graph has it, but for what costs little: the few linear channels from block to block (Sandler et al.,
     "MobileNetV2", 2018), whose rounding errors would add up, what leaves the network, means, fully connected layers
-    and transposed convolutions are not rounded. Mask R-CNN 2Go's features are off by 0.037 of their standard deviation from those in float
-    (six frames of redkitchen and replica_floor2).
+    and transposed convolutions are not rounded. Mask R-CNN 2Go's features are off by 0.037 of their standard deviation
+    from those in float (six frames of redkitchen and replica_floor2).
 
     Raises DataError for an operator that is not known.
     """

@@ -12,6 +12,7 @@ from PIL import Image, ImageDraw, ImageFont
 from framework.data import Float64, InstanceMesh, Int32, UInt8
 from framework.files.whole_files import written_whole
 from framework.rendering.camera_path import CameraPath
+from framework.rendering.labels import draw_labels, place_labels, text_size
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
 from framework.rendering.surface import Surface
@@ -23,8 +24,6 @@ LEGEND_ROW = 30  # px
 LEGEND_COLUMNS, LEGEND_ROWS = 9, 4
 PNG_LEVEL = 3  # of zlib: 6, the default, takes 2.4 times as long for a file 3% smaller
 LABEL_PX, LEGEND_PX, TITLE_PX = 17, 17, 22
-LABEL_MOVES_PIXELS = 1500  # the name of an object that shows less stays on it or is left out
-LABEL_MIN_PIXELS = 250  # an object that shows less gets no name in the picture, only in the legend
 
 
 def write_overview(
@@ -67,30 +66,9 @@ def _panels(
     right = Image.fromarray(view.in_instances(mesh.colors, ids, colors))
     path.draw(left)
     path.draw(right)
-    _draw_names(right, view.hits.nearest(ids), names)
+    font = _font(LABEL_PX)
+    draw_labels(right, place_labels(view.hits.nearest(ids), names, lambda text: text_size(text, font)), font)
     return np.concatenate([np.asarray(left), np.asarray(right)], axis=1)
-
-
-def _draw_names(image: Image.Image, ids: Int32, names: Mapping[int, str]) -> None:
-    """Writes each object's name where it shows, the large ones first; a name moves aside for those already there."""
-    canvas, font = ImageDraw.Draw(image), _font(LABEL_PX)
-    pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
-    taken: list[tuple[float, float, float, float]] = []
-    for key in sorted(names, key=lambda key: -pixels[key]):
-        if pixels[key] < LABEL_MIN_PIXELS:
-            break
-        v, u = np.argwhere(ids == key).mean(axis=0)
-        left, top, right, bottom = canvas.textbbox((u, v), names[key], font, anchor="mm")
-        for shift in (0, -18, 18) if pixels[key] > LABEL_MOVES_PIXELS else (0,):
-            box = (left - 2, top + shift - 1, right + 2, bottom + shift + 1)
-            if not any(_overlap(box, other) for other in taken):
-                taken.append(box)
-                canvas.text((u, v + shift), names[key], INK, font, anchor="mm", stroke_width=3, stroke_fill=PAPER)
-                break
-
-
-def _overlap(a: tuple[float, ...], b: tuple[float, ...]) -> bool:
-    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
 def _title(text: str) -> UInt8:

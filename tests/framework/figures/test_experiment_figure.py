@@ -241,3 +241,19 @@ def test_a_sweep_ends_with_the_picture_but_for_ctrl_c(
         if error is not None:
             raise error
     assert len(list(maps.glob("figure.*"))) == (0 if isinstance(error, KeyboardInterrupt) else 2)
+
+
+def test_nothing_written_is_cut_off_with_one_line_and_a_long_name(tmp_path: Path) -> None:
+    root = experiment(tmp_path / "figure4", kind="maps", names={"part": "in progress"})
+    name = "rgbd_dataset_freiburg3_long_office_household_validation"
+    for row in ROWS:
+        run(root, row, name)
+    pictured = Pictured.below(root)
+    figure = DRAWN[pictured.choice.kind](pictured).figure
+    figure.canvas.draw()
+    for text in figure.texts:
+        box = text.get_window_extent()
+        assert box.x0 >= 0, text.get_text()
+        assert box.y0 >= 0, text.get_text()
+        assert box.x1 <= figure.bbox.width, text.get_text()
+        assert box.y1 <= figure.bbox.height, text.get_text()

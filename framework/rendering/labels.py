@@ -1,0 +1,155 @@
+"""Names in a picture of objects: on those that have room for them, beside the others with a line to them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from framework.data import Bool, Float64, Int32
+from framework.rendering.palette import INK, PAPER
+
+MIN_PIXELS = 60  # an object that shows less gets no name in the picture
+ROOM = 0.75  # of a name's height, from the middle of an object's widest part to its border: less would cover the object
+NEAREST, FARTHEST, STEP = 24, 160, 8  # px, from an object's middle to that of a name beside it
+DIRECTIONS = 32
+ABOUT = 0.9  # of the largest distance from the border
+ON_OTHERS = 0.1  # of the box of a name that stands on its object, which other objects may have at most
+COVERING = 150.0  # px that a name goes rather than cover objects, its own one too, with all of its box
+CROSSING = 100.0  # px that it goes rather than have all of its line on other objects
+SAMPLES = 24  # points of a line that are looked at
+DOT = 2.5  # px, the radius of a line's end on the object
+AROUND = 3  # px that stay free around a name
+HALO = 3  # px
+
+Box = tuple[float, float, float, float]  # left, top, right, bottom, px
+
+
+@dataclass(frozen=True)
+class Label:
+    """A name, its place, and the point of the object that a line leads to."""
+
+    text: str
+    u: float  # px, the middle
+    v: float  # px
+    target: tuple[float, float] | None = None  # u, v, px; None = the name stands on the object
+
+
+def place_labels(ids: Int32, names: Mapping[int, str], size: Callable[[str], tuple[float, float]]) -> list[Label]:
+    """Where the `names` by id go in a picture whose pixels show `ids` (H, W), 0 = none.
+
+    The large objects come first. Names lie inside the picture, and none over another; one without a place is left out.
+    `size` tells a text's width and height, px.
+    """
+    pixels = np.bincount(ids.ravel(), minlength=max([0, *names]) + 1)
+    shown = sorted((key for key in names if pixels[key] >= MIN_PIXELS), key=lambda key: (-pixels[key], key))
+    widest = {key: _widest_part(ids == key) for key in shown}
+    objects = np.isin(ids, shown)
+    boxes: list[Box] = []
+    labels: dict[int, Label] = {}
+    for key in shown:
+        u, v, room = widest[key]
+        width, height = size(names[key])
+        box = _box(u, v, width, height)
+        if room < ROOM * height or not _is_free(box, boxes, ids.shape):
+            continue
+        if (objects & (ids != key))[_pixels(box)].mean() <= ON_OTHERS:
+            boxes.append(box)
+            labels[key] = Label(names[key], u, v)
+    for key in shown:
+        if key not in labels:
+            u, v, _ = widest[key]
+            if place := _place_beside(u, v, size(names[key]), boxes, objects, objects & (ids != key)):
+                boxes.append(_box(*place, *size(names[key])))
+                labels[key] = Label(names[key], *place, (u, v))
+    return [labels[key] for key in shown if key in labels]
+
+
+def draw_labels(image: Image.Image, labels: Sequence[Label], font: ImageFont.FreeTypeFont) -> None:
+    """Draws the names and their lines."""
+    canvas = ImageDraw.Draw(image)
+    for label in labels:
+        if label.target is not None:
+            u, v = label.target
+            end = _nearest_point(_box(label.u, label.v, *text_size(label.text, font)), u, v)
+            canvas.line([(u, v), end], PAPER, 4)
+            canvas.line([(u, v), end], INK, 1)
+            canvas.ellipse((u - DOT, v - DOT, u + DOT, v + DOT), INK, PAPER)
+    for label in labels:
+        canvas.text((label.u, label.v), label.text, INK, font, anchor="mm", stroke_width=HALO, stroke_fill=PAPER)
+
+
+def text_size(text: str, font: ImageFont.FreeTypeFont) -> tuple[float, float]:
+    """Width and height of a name, px."""
+    left, _, right, _ = font.getbbox(text, anchor="mm")
+    return right - left, float(font.size)
+
+
+def _widest_part(mask: Bool) -> tuple[float, float, float]:
+    """The point (u, v) that is farthest from the border of mask (H, W), and how far that is, px.
+
+    Of those about as far, the nearest to the middle.
+    """
+    u, v, width, height = cv2.boundingRect(mask.astype(np.uint8))
+    framed = np.pad(mask[v : v + height, u : u + width], 1).astype(np.uint8)
+    distance = cv2.distanceTransform(framed, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    wide = np.argwhere(distance >= ABOUT * distance.max())
+    row, column = wide[np.linalg.norm(wide - np.argwhere(framed).mean(axis=0), axis=1).argmin()]
+    return float(u + column - 1), float(v + row - 1), float(distance[row, column])
+
+
+def _place_beside(
+    u: float, v: float, size: tuple[float, float], boxes: Sequence[Box], objects: Bool, others: Bool
+) -> tuple[float, float] | None:
+    """The best free place for a name of an object at (u, v): near, over few `objects` (H, W), its line over few
+    `others`.
+    """
+    best, least = None, np.inf
+    for distance, a, b in _around(u, v, size):
+        box = _box(a, b, *size)
+        if distance >= least or not _is_free(box, boxes, others.shape):
+            continue
+        line = np.linspace((u, v), _nearest_point(box, u, v), SAMPLES)
+        if any(_is_in(other, line).any() for other in boxes):
+            continue
+        columns, rows = np.rint(line).astype(int).T
+        cost = distance + COVERING * objects[_pixels(box)].mean() + CROSSING * others[rows, columns].mean()
+        if cost < least:
+            best, least = (a, b), cost
+    return best
+
+
+def _around(u: float, v: float, size: tuple[float, float]) -> Iterator[tuple[float, float, float]]:
+    """Distances (px) from (u, v) and middles of names there, in rings that leave the point itself free."""
+    for distance in range(NEAREST, FARTHEST, STEP):
+        for k in range(DIRECTIONS):
+            angle = 2 * np.pi * k / DIRECTIONS
+            yield distance, u + np.cos(angle) * (distance + size[0] / 2), v - np.sin(angle) * distance
+
+
+def _box(u: float, v: float, width: float, height: float) -> Box:
+    return (u - width / 2 - AROUND, v - height / 2 - AROUND, u + width / 2 + AROUND, v + height / 2 + AROUND)
+
+
+def _pixels(box: Box) -> tuple[slice, slice]:
+    left, top, right, bottom = (round(edge) for edge in box)
+    return slice(top, bottom), slice(left, right)
+
+
+def _is_free(box: Box, taken: Sequence[Box], shape: tuple[int, ...]) -> bool:
+    left, top, right, bottom = box
+    inside = left >= 0 and top >= 0 and right <= shape[1] - 1 and bottom <= shape[0] - 1
+    return inside and not any(left < o[2] and o[0] < right and top < o[3] and o[1] < bottom for o in taken)
+
+
+def _is_in(box: Box, points: Float64) -> Bool:
+    """(N,) which of the points (N, 2) lie in the box."""
+    return np.asarray(((points >= box[:2]) & (points <= box[2:])).all(axis=1))
+
+
+def _nearest_point(box: Box, u: float, v: float) -> tuple[float, float]:
+    """The point of a box that is nearest to (u, v)."""
+    return min(max(u, box[0]), box[2]), min(max(v, box[1]), box[3])
