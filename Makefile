@@ -63,6 +63,7 @@ $(INSTALLED): pyproject.toml
 	@touch $(INSTALLED)
 
 $(INSTALLED_DEV): $(INSTALLED)
+	@$(MAKE) --no-print-directory browser
 	@echo "installing what the tests need"
 	@$(PIP_INSTALL) --editable '.[dev]'
 	@touch $(INSTALLED_DEV)
@@ -78,6 +79,15 @@ grep -q 'libGL\.so\.1' <<<"$$libraries" || missing="$$missing libgl1"; \
 grep -q 'libEGL\.so\.1' <<<"$$libraries" || missing="$$missing libegl1"; \
 grep -q 'libgomp\.so\.1' <<<"$$libraries" || missing="$$missing libgomp1"
 endef
+
+# Chromium, in which tests open the pages that are written; without it they are skipped. Ubuntu's package is a stub.
+.PHONY: browser
+browser:
+	@if ! command -v chromium google-chrome >/dev/null && command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
+		echo "installing chromium, for tests"; \
+		{ apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install --yes --no-install-recommends \
+			chromium fonts-dejavu-core; } >/dev/null || echo "without chromium some tests are skipped"; \
+	fi
 
 .PHONY: system-libraries
 system-libraries: ## install the system packages that are missing, with apt
