@@ -22,7 +22,6 @@ from framework.mapping.voxel_grid import (
     NO_KEY,
     VoxelGrid,
     device,
-    find_block,
     grown,
     pack_key,
     unpack_key,
@@ -122,16 +121,14 @@ def _sees_through(depth, sensor, z0, pixels):
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _number_blocks(grid, coords, region_count, depth, camera, sensor, stamp, frame, active):
-    """The blocks at `coords` and those that the frame sees through, each once, into `active`; returns how many.
+def _choose_blocks(grid, found, region_count, depth, camera, sensor, stamp, frame, active):
+    """The blocks `found` (N,) and those that the frame sees through, each once, into `active`; returns how many.
 
     `camera` holds T_camera_world.
     """
     n = 0
-    key = np.int64(-2)
-    last_region = np.int32(-1)
-    for i in range(coords.shape[0]):
-        block, key, last_region = find_block(grid, coords[i, 0], coords[i, 1], coords[i, 2], key, last_region)
+    for i in range(found.shape[0]):
+        block = found[i]
         if stamp[block] != frame:
             stamp[block] = frame
             active[n] = block
@@ -169,14 +166,14 @@ class Allocator:
         Raises MapFullError when the block budget is reached.
         """
         self._frames += 1
-        coords = self.allocate(frame.camera, frame.depth, T_world_camera)
+        found = self.allocate(frame.camera, frame.depth, T_world_camera)
         capacity = len(self.voxels.grid.block_coords)
         if len(self._stamp) < capacity:
             self._stamp = grown(self._stamp, capacity, zeros=True)
         active = np.empty(self.voxels.block_count, np.int32)
-        count = _number_blocks(
+        count = _choose_blocks(
             self.voxels.grid,
-            coords,
+            found,
             self.voxels.region_count,
             frame.depth,
             pinhole(frame.camera, inverse(T_world_camera)),
@@ -188,14 +185,12 @@ class Allocator:
         return active[:count].copy()
 
     def allocate(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
-        """(N, 3) coordinates of the blocks along the truncation band of the readings `depth` (H, W) m, allocated here.
+        """(N,) the blocks along the truncation band of the readings `depth` (H, W) m, allocated here; some repeatedly.
 
         Raises MapFullError when the block budget is reached, and before memory is asked for where a single frame asks
         for more than it; FrameError for a pose beyond where blocks can be.
         """
-        coords = self._surface_coords(camera, depth, T_world_camera)
-        self.voxels.allocate(coords)
-        return coords
+        return self.voxels.allocate(self._surface_coords(camera, depth, T_world_camera))
 
     def _surface_coords(self, camera: Camera, depth: Float32, T_world_camera: Float64) -> Int32:
         block_size = BLOCK_SIDE * float(self.voxels.grid.voxel_size)

@@ -37,6 +37,7 @@ from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.errors import DataError
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.pages import PagesAhead
+from framework.mapping.prefetching import prefetch_line
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more, reserved
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
@@ -46,6 +47,7 @@ RESERVED = 128  # voxels with slots for each block of the budget: most have fewe
 NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 NO_CLASS = 255  # in a free slot
+AHEAD = 4  # near voxels from the one in work to the one whose slots are asked for
 MERGED_AT_ONCE = 512  # voxels: where none of them knows an instance, they are passed over
 MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
 MOST_GAIN = 2**15 - 1 - MOST_UNITS  # units that one cluster may add there: what int16 has room for
@@ -360,6 +362,16 @@ def _label(evidence, row, n, voxel, free_classes):
         evidence.class_value[voxel, s] = 0
 
 
+@device
+def _ask_for_slots(evidence, voxel):
+    """Has a labelled voxel's slots loaded while the processor goes on."""
+    i = np.int64(voxel)
+    prefetch_line(evidence.instance_ids, i * evidence.instance_ids.shape[1] * evidence.instance_ids.itemsize)
+    prefetch_line(evidence.instance_value, i * evidence.instance_value.shape[1] * evidence.instance_value.itemsize)
+    prefetch_line(evidence.class_ids, i * evidence.class_ids.shape[1])
+    prefetch_line(evidence.class_value, i * evidence.class_value.shape[1] * evidence.class_value.itemsize)
+
+
 @njit(cache=True, nogil=True, parallel=True)
 def _update(grid, seen, evidence, measurement, first_point, new, evicted):
     """Updates the near voxels of the seen blocks that have slots.
@@ -369,7 +381,11 @@ def _update(grid, seen, evidence, measurement, first_point, new, evicted):
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = new[a] = 0
         row = grid.label_row[seen.blocks[a]]
+        last = seen.near_count[a] - 1
         for i in range(seen.near_count[a]):
+            later = evidence.labeled[row, seen.near_voxel[a, min(i + AHEAD, last)]] if row >= 0 else np.int32(-1)
+            if later >= 0:
+                _ask_for_slots(evidence, later)
             point = first_point[seen.near_pixel[a, i]]
             voxel = evidence.labeled[row, seen.near_voxel[a, i]] if row >= 0 else np.int32(-1)
             if voxel >= 0:

@@ -23,6 +23,7 @@ from numba import njit, prange
 from framework.data import Bool, Float64, Frame, Int32, UInt16
 from framework.geometry import inverse
 from framework.mapping.allocation import Allocator
+from framework.mapping.bit_slices import ONE, lowest_bit
 from framework.mapping.prefetching import prefetch_row
 from framework.mapping.sensor import Sensor, pinhole
 from framework.mapping.voxel_grid import (
@@ -126,37 +127,59 @@ def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_ban
 
 
 @device
-def _average_colors(packed, seen, rounding, scratch):
-    """The running average of the packed colours (512,) of a block with those seen (512,), RGBA in their bytes."""
+def _average_colors(packed, color, pixel, first, rounding, scratch, seen):
+    """The running average of the packed colours (512,) of a block, in the layer from voxel `first` on, with those
+    of its pixels (512,) in `color`, RGBA in their bytes.
+
+    scratch[512:] holds the share of each voxel's new observation, 0 where there is none; seen (64,) gets the colours.
+    """
     byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
     zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
     no_color = np.uint32(0)
-    for n in range(BLOCK_VOXELS):
-        share = scratch[n + BLOCK_VOXELS]
-        first = (share > zero) & ((packed[n] & COLORED) == no_color)  # air has weight, but no colour to average with
-        share = one if first else share
+    for n in range(LAYER_VOXELS):
+        seen[n] = color[np.uint32(pixel[first + n])]
+    for n in range(LAYER_VOXELS):
+        old, share = packed[first + n], scratch[first + n + BLOCK_VOXELS]
+        fresh = (share > zero) & ((old & COLORED) == no_color)  # air has weight, but no colour to average with
+        share = one if fresh else share
         new = np.int32(seen[n])
-        red, green, blue = unpack_color(packed[n])
+        red, green, blue = unpack_color(old)
         red += share * (four * np.float32(np.int32(new & byte)) - red)
         green += share * (four * np.float32(np.int32((new >> one_byte) & byte)) - green)
         blue += share * (four * np.float32(np.int32((new >> two_bytes) & byte)) - blue)
         mean = pack_color(
             min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
         )
-        packed[n] = mean if share > zero else packed[n]
+        packed[first + n] = mean if share > zero else old
+
+
+@device
+def _is_colored(scratch, first):
+    """Whether the frame has a colour for a voxel of the layer that begins at voxel `first`, scratch as above."""
+    largest = np.float32(0.0)
+    for n in range(LAYER_VOXELS):
+        largest = max(largest, scratch[first + n + BLOCK_VOXELS])
+    return largest > np.float32(0.0)
 
 
 @device
 def _list_near(pixel, near_band, near_voxel, near_pixel, scratch):
     """Lists the voxels whose distance to the measured surface in scratch[:512] is at most near_band, with their pixels.
 
-    Each is written behind the last one found and stays if it is near: without a branch, which nobody could foretell.
+    A layer's comparisons are gathered in the bits of a word, which the compiler vectorises.
     """
     found = np.int32(0)
-    for n in range(BLOCK_VOXELS):
-        near_voxel[found] = np.uint16(n)
-        near_pixel[found] = pixel[n]
-        found = one_more(found, abs(scratch[n]) <= near_band)
+    for layer in range(BLOCK_SIDE):
+        first = layer * LAYER_VOXELS
+        word = np.uint64(0)
+        for n in range(LAYER_VOXELS):
+            word |= np.uint64(abs(scratch[first + n]) <= near_band) << np.uint64(n)
+        while word != np.uint64(0):
+            n = first + lowest_bit(word)
+            word &= word - ONE
+            near_voxel[found] = np.uint16(n)
+            near_pixel[found] = pixel[n]
+            found += np.int32(1)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -192,10 +215,10 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
         )
         solid[block] = is_solid(tsdf)
         if colored_voxels > 0:
-            seen = np.empty(BLOCK_VOXELS, np.uint32)
-            for n in range(BLOCK_VOXELS):
-                seen[n] = color[np.uint32(pixel[n])]
-            _average_colors(packed, seen, rounding, scratch)
+            seen = np.empty(LAYER_VOXELS, np.uint32)
+            for layer in range(BLOCK_SIDE):
+                if _is_colored(scratch, layer * LAYER_VOXELS):
+                    _average_colors(packed, color, pixel, layer * LAYER_VOXELS, rounding, scratch, seen)
         near_count[a] = near_voxels
         if near_voxels > 0:
             _list_near(pixel, near_band, near_voxel[a], near_pixel[a], scratch)

@@ -16,7 +16,7 @@ _READ, _KEEP, _DATA = 0, 2, 1  # llvm.prefetch: for reading; into the second lev
 
 
 @intrinsic
-def _prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
+def prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
     """Has the cache line loaded that is `offset` bytes after the beginning of a C-contiguous array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
@@ -37,4 +37,4 @@ def prefetch_row(array, row):
     if 0 <= row < array.shape[0]:
         bytes_a_row = array.itemsize * (array.size // array.shape[0])
         for line in range(0, bytes_a_row, CACHE_LINE):
-            _prefetch_line(array, row * bytes_a_row + line)
+            prefetch_line(array, row * bytes_a_row + line)

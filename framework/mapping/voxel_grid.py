@@ -146,21 +146,24 @@ def find_block(grid, bx, by, bz, last_key, last_region):
 
 
 @njit(cache=True, nogil=True)
-def insert_blocks(grid, coords, start, region_count, block_count):
-    """Allocates the blocks of coords[start:] that do not exist yet, in order.
+def insert_blocks(grid, coords, start, region_count, block_count, blocks):
+    """Allocates the blocks of coords[start:] that do not exist yet, in order, and fills in their numbers, blocks (N,).
 
     Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call
     again.
     """
     size = grid.table_keys.shape[0]
+    region, last_key = np.int32(-1), np.int64(NO_KEY)
     for i in range(start, coords.shape[0]):
         bx, by, bz = coords[i, 0], coords[i, 1], coords[i, 2]
         key = pack_key(bx >> 3, by >> 3, bz >> 3)
-        region = find_region(grid, key)
+        if key != last_key:  # neighbors lie in the same region, mostly
+            region = find_region(grid, key)
+            last_key = key
         if region < 0:
             if region_count == grid.region_blocks.shape[0] or 2 * (region_count + 1) > size:
                 return i, region_count, block_count
-            region = region_count
+            region = np.int32(region_count)
             region_count += 1
             slot = _slot(key, size)
             while grid.table_keys[slot] != NO_KEY:
@@ -186,6 +189,7 @@ def insert_blocks(grid, coords, start, region_count, block_count):
             grid.label_row[block_count] = -1
             _link_neighbors(grid, block_count)
             block_count += 1
+        blocks[i] = grid.region_blocks[region, child]
     return coords.shape[0], region_count, block_count
 
 
@@ -321,19 +325,19 @@ class VoxelGrid:
             + sum(array[: self.block_count].nbytes for array in blocks)
         )
 
-    def allocate(self, coords: Int32) -> None:
-        """Makes sure that the blocks at `coords` (N, 3) exist, numbering new ones in the order given.
+    def allocate(self, coords: Int32) -> Int32:
+        """The numbers (N,) of the blocks at `coords` (N, 3); those that do not exist yet get theirs in the order given.
 
         Raises MapFullError when that takes more than `max_blocks`; the blocks before stay.
         """
-        done = 0
+        done, blocks = 0, np.empty(len(coords), np.int32)
         while True:
             done, self.region_count, self.block_count = insert_blocks(
-                self.grid, coords, done, self.region_count, self.block_count
+                self.grid, coords, done, self.region_count, self.block_count, blocks
             )
             if done == len(coords):
                 self._pages.ask_for_one((getattr(self.grid, name) for name in OF_BLOCKS), self.block_count)
-                return
+                return blocks
             if self.block_count == self.max_blocks:
                 raise MapFullError(
                     f"the map is full: {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
