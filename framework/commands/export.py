@@ -1,0 +1,63 @@
+"""`python -m framework export RUN --to glb usd ...`: what a run found, in the formats of other programs."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from pathlib import Path
+
+from framework.commands.command_line import arguments, one_line_errors
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="Writes a run's scene, its objects by themselves (upright, standing on the origin, metres), a "
+        "floor plan or a scene graph in the formats of other programs.",
+    )
+    parser.add_argument("run", metavar="RUN", type=Path, help="the directory of a run, also of one that ended early")
+    parser.add_argument(
+        "--to",
+        nargs="+",
+        required=True,
+        choices=("glb", "ply", "usd", "obj", "floorplan", "graph"),
+        help="one or several",
+    )
+    parser.add_argument("--out", metavar="DIR", type=Path, help="where the files go, default: RUN/export")
+    parser.add_argument(
+        "--object",
+        metavar="OBJECT",
+        action="append",
+        default=[],
+        help="an id, or a class for all of it: these objects only; may be given several times",
+    )
+    parser.add_argument(
+        "--min-confidence", metavar="P", type=float, default=0.3, help="of objects, default: 0.3; an id is not asked"
+    )
+    parser.add_argument("--up", metavar=("X", "Y", "Z"), nargs=3, type=float, help="where the run does not tell")
+    parser.add_argument("--floor", metavar="M", type=float, help="how high the floor is along up, likewise")
+    surfaces = parser.add_argument_group("surfaces")
+    surfaces.add_argument(
+        "--triangles", metavar="N", type=int, help="of the scene, and of each object's own file: fewer by decimation"
+    )
+    surfaces.add_argument(
+        "--colors", choices=("appearance", "instance", "class"), default="appearance", help="what colours tell"
+    )
+    surfaces.add_argument(
+        "--collision", choices=("hull", "box"), default="hull", help="what objects collide by, in USD; default: hull"
+    )
+    asked = arguments(parser)
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    with one_line_errors():
+        from framework.exporting.coloring import Coloring  # here: what is wrong with the arguments is said at once
+        from framework.exporting.export import Chosen, Format, export
+        from framework.exporting.usd import Collision
+
+        chosen = Chosen(
+            tuple(asked.object),
+            asked.min_confidence,
+            asked.triangles,
+            Coloring(asked.colors),
+            Collision(asked.collision),
+        )
+        for path in export(asked.run, map(Format, asked.to), asked.out, chosen, asked.up, asked.floor):
+            print(path)

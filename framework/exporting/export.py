@@ -1,0 +1,117 @@
+"""A run's exports: which files there are, and what is in each."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+from framework.errors import DataError
+from framework.exporting.coloring import Coloring
+from framework.exporting.glb import glb
+from framework.exporting.mesh_files import write_parts_obj, write_parts_ply
+from framework.exporting.object_meshes import Part, object_parts, parts
+from framework.exporting.room import Room, read_room
+from framework.exporting.usd import Collision, check_usd, write_usd
+from framework.files.whole_files import written_whole
+from framework.parameters import check_bounds
+
+log = logging.getLogger(__name__)
+
+LIKELY = 0.3  # confidence from which on an object is exported, as pictures show it
+
+
+class Format(Enum):
+    """What a run is exported to."""
+
+    GLB = "glb"
+    PLY = "ply"
+    USD = "usd"
+    OBJ = "obj"
+    FLOORPLAN = "floorplan"
+    GRAPH = "graph"
+
+
+MESHES = {Format.GLB: ".glb", Format.PLY: ".ply", Format.USD: ".usdc", Format.OBJ: ".obj"}
+"""Formats of surfaces, and how the names of their files end."""
+
+
+@dataclass(frozen=True)
+class Chosen:
+    """What of a room is exported, and how."""
+
+    objects: Sequence[str] = ()  # ids or classes; () = the whole room
+    min_confidence: float = LIKELY  # in [0, 1]
+    triangles: int | None = None  # >= 4, of the scene and of each object's own file; None = as many as there are
+    coloring: Coloring = Coloring.APPEARANCE
+    collision: Collision = Collision.HULL
+
+    def __post_init__(self) -> None:
+        check_bounds(self, min_confidence=(0.0, 1.0))
+        if self.triangles is not None and self.triangles < 4:
+            raise DataError(f"triangles must be at least 4, found {self.triangles}")
+
+
+def export(
+    run: Path,
+    formats: Iterable[Format],
+    out: Path | None = None,
+    chosen: Chosen | None = None,
+    up: Sequence[float] | None = None,
+    floor: float | None = None,
+) -> list[Path]:
+    """Writes what a run found in other programs' formats, into `out`, None = `export` in the run's directory.
+
+    Returns the files, each written whole or not at all; the same run gives the same bytes. `up` (3,) and `floor`, m
+    along up, say what the run's record does not tell. Raises DataError where there is no run, or not what is asked for.
+    """
+    formats, chosen = list(dict.fromkeys(formats)), chosen or Chosen()
+    if Format.USD in formats:
+        check_usd()
+    room = read_room(run, up, floor)
+    if not room.up_known:
+        log.warning("%s does not tell which way is up: the world's z is taken for it; --up X Y Z says another", run)
+    room = room.chosen(chosen.objects, chosen.min_confidence)
+    directory = run / "export" if out is None else out
+    directory.mkdir(parents=True, exist_ok=True)
+    written: list[Path] = []
+    surfaces = [one for one in formats if one in MESHES]
+    if surfaces:
+        written += _write_surfaces(room, surfaces, directory, chosen)
+    return written
+
+
+def _write_surfaces(room: Room, formats: Sequence[Format], directory: Path, chosen: Chosen) -> list[Path]:
+    """The scene, unless some objects only are asked for, and each object by itself."""
+    files: list[tuple[str, list[Part]]] = []
+    if not chosen.objects:
+        if not len(room.mesh.triangles):
+            raise DataError("nothing was mapped: there is no surface to export")
+        files.append(("scene", parts(room, chosen.triangles)))
+    files += [(f"objects/{part.name}", [part.alone]) for part in object_parts(room, chosen.triangles)]
+    written = []
+    for kind in formats:
+        write = _writer(kind, chosen)
+        for name, shown in files:
+            path = directory / f"{name}{MESHES[kind]}"
+            path.parent.mkdir(exist_ok=True)
+            write(path, shown)
+            written.append(path)
+    return written
+
+
+def _writer(kind: Format, chosen: Chosen) -> Callable[[Path, Sequence[Part]], None]:
+    if kind is Format.PLY:
+        return lambda path, shown: write_parts_ply(path, shown, chosen.coloring)
+    if kind is Format.OBJ:
+        return lambda path, shown: write_parts_obj(path, shown, chosen.coloring)
+    if kind is Format.USD:
+        return lambda path, shown: write_usd(path, shown, chosen.coloring, chosen.collision)
+    return lambda path, shown: _write_glb(path, shown, chosen.coloring)
+
+
+def _write_glb(path: Path, shown: Sequence[Part], coloring: Coloring) -> None:
+    with written_whole(path) as temporary:
+        temporary.write_bytes(glb(shown, coloring))
