@@ -45,6 +45,15 @@ def main() -> None:
     surfaces.add_argument(
         "--collision", choices=("hull", "box"), default="hull", help="what objects collide by, in USD; default: hull"
     )
+    plans = parser.add_argument_group("floor plan and ROS map")
+    plans.add_argument("--resolution", metavar="M", type=float, default=0.05, help="side of a cell, default: 0.05")
+    plans.add_argument(
+        "--robot-height",
+        metavar="M",
+        type=float,
+        default=1.0,
+        help="free is where nothing is, and all was seen to be empty, up to this height above the floor, default: 1",
+    )
     asked = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
@@ -58,6 +67,8 @@ def main() -> None:
             asked.triangles,
             Coloring(asked.colors),
             Collision(asked.collision),
+            asked.resolution,
+            asked.robot_height,
         )
         for path in export(asked.run, map(Format, asked.to), asked.out, chosen, asked.up, asked.floor):
             print(path)

@@ -10,10 +10,15 @@ from pathlib import Path
 
 from framework.errors import DataError
 from framework.exporting.coloring import Coloring
+from framework.exporting.floor_plan import write_floor_plan
+from framework.exporting.geojson import write_geojson
 from framework.exporting.glb import glb
 from framework.exporting.mesh_files import write_parts_obj, write_parts_ply
 from framework.exporting.object_meshes import Part, object_parts, parts
+from framework.exporting.occupancy import plan
 from framework.exporting.room import Room, read_room
+from framework.exporting.ros_map import write_ros_map
+from framework.exporting.scene_graph import write_scene_graph
 from framework.exporting.usd import Collision, check_usd, write_usd
 from framework.files.whole_files import written_whole
 from framework.parameters import check_bounds
@@ -47,9 +52,11 @@ class Chosen:
     triangles: int | None = None  # >= 4, of the scene and of each object's own file; None = as many as there are
     coloring: Coloring = Coloring.APPEARANCE
     collision: Collision = Collision.HULL
+    resolution: float = 0.05  # m, in [0.005, 1], of a plan's cells
+    robot_height: float = 1.0  # m, in [0.1, 3], of the robot that a place is free for
 
     def __post_init__(self) -> None:
-        check_bounds(self, min_confidence=(0.0, 1.0))
+        check_bounds(self, min_confidence=(0.0, 1.0), resolution=(0.005, 1.0), robot_height=(0.1, 3.0))
         if self.triangles is not None and self.triangles < 4:
             raise DataError(f"triangles must be at least 4, found {self.triangles}")
 
@@ -71,8 +78,7 @@ def export(
     if Format.USD in formats:
         check_usd()
     room = read_room(run, up, floor)
-    if not room.up_known:
-        log.warning("%s does not tell which way is up: the world's z is taken for it; --up X Y Z says another", run)
+    _check_known(run, room, formats)
     room = room.chosen(chosen.objects, chosen.min_confidence)
     directory = run / "export" if out is None else out
     directory.mkdir(parents=True, exist_ok=True)
@@ -80,7 +86,29 @@ def export(
     surfaces = [one for one in formats if one in MESHES]
     if surfaces:
         written += _write_surfaces(room, surfaces, directory, chosen)
+    asked = [one for one in formats if one not in MESHES]
+    found = plan(room, chosen.resolution, chosen.robot_height) if asked and room.floor_known else None
+    if Format.FLOORPLAN in asked and found is not None:
+        write_floor_plan(directory / "floor_plan.png", room, found, chosen.robot_height)
+        write_geojson(directory / "floor_plan.geojson", room)
+        written += [directory / "floor_plan.png", directory / "floor_plan.geojson", *write_ros_map(directory, found)]
+    if Format.GRAPH in asked:
+        write_scene_graph(directory / "scene_graph.json", room, found)
+        written.append(directory / "scene_graph.json")
     return written
+
+
+def _check_known(run: Path, room: Room, formats: Sequence[Format]) -> None:
+    """Raises DataError where a run does not tell what a format needs; surfaces do without."""
+    flat = [one.value for one in formats if one not in MESHES]
+    if not room.up_known and flat:
+        raise DataError(f"{run} does not tell which way is up, which {flat[0]} needs: --up X Y Z --floor M say it")
+    if not room.up_known:
+        log.warning("%s does not tell which way is up: the world's z is taken for it; --up X Y Z says another", run)
+    elif not room.floor_known and Format.FLOORPLAN in formats:
+        raise DataError(f"{run} does not tell how high the floor is, which floorplan needs: --floor M says it")
+    elif not room.floor_known and Format.GRAPH in formats:
+        log.warning("%s does not tell how high the floor is: the graph is without floor, walls and rooms", run)
 
 
 def _write_surfaces(room: Room, formats: Sequence[Format], directory: Path, chosen: Chosen) -> list[Path]:
