@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import trimesh
 
-from framework.data import UInt8, UInt16
+from framework.data import Float32, UInt8, UInt16
 from framework.exporting.coloring import Coloring, linear, part_colors
 from framework.exporting.object_meshes import Part, parts
 from framework.exporting.room import Room
+from framework.rendering.surface import Surface
 
 T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 COLOR = "_LINEAR"  # as trimesh gets the colours, whose own have 8 bits: too few for dark ones that are linear
@@ -33,21 +34,22 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
     A part without triangles is a node without a mesh.
     """
+    lit = coloring is not Coloring.APPEARANCE
     scene = trimesh.Scene(base_frame="world")
     for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
         T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
         if not len(part.mesh.triangles):
             scene.graph.update(part.name, matrix=T_gltf_part, metadata=extras(part))
             continue
+        turned = Surface(part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T, part.mesh.triangles)
         mesh = trimesh.Trimesh(
-            part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T,
-            part.mesh.triangles,
+            turned.vertices,
+            turned.triangles,
+            vertex_normals=_unit(turned.vertex_normals) if lit else None,
             vertex_attributes={COLOR: _shorts(colors)},
             process=False,
         )
         scene.add_geometry(mesh, part.name, part.name, transform=T_gltf_part, metadata=extras(part))
-
-    lit = coloring is not Coloring.APPEARANCE
 
     def finish(tree: dict[str, Any]) -> None:
         _with_materials(tree, lit, {part.name for part in shown if part.object is None})
@@ -63,6 +65,11 @@ def extras(part: Part) -> dict[str, Any]:
     return {"id": one.id, "class": one.class_name, "probability": one.probability, "confidence": one.confidence}
 
 
+def _unit(normals: Float32) -> Float32:
+    """(V, 3) with something for vertices whose triangles have no area: glTF knows no normals of length 0."""
+    return np.where(np.abs(normals).max(axis=1, keepdims=True) > 0.1, normals, np.array([0, 1, 0], np.float32))
+
+
 def _shorts(colors: UInt8) -> UInt16:
     """(V, 4) linear RGBA in 16 bits."""
     full = np.full((len(colors), 4), np.iinfo(np.uint16).max, np.uint16)
@@ -75,16 +82,18 @@ def _with_materials(tree: dict[str, Any], lit: bool, one_sided: set[str]) -> Non
     plain: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
     if not lit:
         plain["extensions"] = {UNLIT: {}}
-        tree["extensionsUsed"] = [UNLIT]
-    tree["materials"] = [{"name": "room", **plain}, {"name": "object", **plain, "doubleSided": True}]
+    used: dict[str, dict[str, Any]] = {}
     for mesh in tree.get("meshes", []):
+        kind = "room" if mesh["name"] in one_sided else "object"
+        used.setdefault(kind, {"name": kind, **plain, "doubleSided": kind == "object"})
         for primitive in mesh["primitives"]:
-            primitive["material"] = 0 if mesh["name"] in one_sided else 1
+            primitive["material"] = list(used).index(kind)
             attributes = primitive["attributes"]
             attributes["COLOR_0"] = attributes.pop(COLOR)
             accessor = tree["accessors"][attributes["COLOR_0"]]
             assert accessor["componentType"] == UNSIGNED_SHORT
             accessor["normalized"] = True
-    if not tree.get("meshes"):
-        for key in ("materials", "extensionsUsed"):
-            tree.pop(key, None)
+    if used:
+        tree["materials"] = list(used.values())
+        if not lit:
+            tree["extensionsUsed"] = [UNLIT]

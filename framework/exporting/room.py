@@ -15,6 +15,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
 from framework.data import Box, Float64, InstanceMesh, Int32
 from framework.errors import DataError
@@ -30,6 +32,7 @@ from framework.rendering.surface import Surface
 
 LONGEST_NAME = 60  # characters of a class, in the names of files and of nodes
 UP = np.array([0.0, 0.0, 1.0])
+SPECK = 0.01  # of an object's vertices: labels leak through edges of depth, and would widen its box
 SHORTEST_UP = 1e-6  # of a vector that may say what is up
 
 
@@ -41,7 +44,7 @@ class RoomObject:
     class_name: str
     confidence: float  # in [0, 1]
     probability: float | None  # of its class, in [0, 1]; None = the record does not tell
-    vertices: Int32  # (M,) of the room's mesh, M > 0
+    vertices: Int32  # (M,) of the room's mesh, M > 0, without specks
     box: Box  # upright, in the room
 
     @property
@@ -133,16 +136,28 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
 
 
 def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple[RoomObject, ...]:
-    """Those that have vertices in a room's mesh, by id."""
+    """Those that have vertices in a room's mesh, by id, without their specks: loose pieces of less than SPECK."""
+    pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
     found = []
     for one in sorted(instances, key=lambda one: one.id):
         own = order[np.searchsorted(ids, one.id) : np.searchsorted(ids, one.id, side="right")]
         if len(own):
+            _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
+            own = own[(sizes >= SPECK * len(own))[piece]]
             box = facing(upright_box(mesh.vertices[own], UP))
             found.append(RoomObject(one.id, one.class_name, one.confidence, one.probability, own, box))
     return tuple(found)
+
+
+def _pieces(mesh: InstanceMesh) -> Int32:
+    """(V,) the number of the piece that each vertex is in: what triangles join whose corners are of one object."""
+    ids = mesh.instance_ids[mesh.triangles]
+    joined = mesh.triangles[(ids > 0).all(axis=1) & (ids == ids[:, :1]).all(axis=1)]
+    edges = np.concatenate([joined[:, :2], joined[:, 1:]]).T
+    graph = coo_array((np.ones(edges.shape[1], np.bool_), tuple(edges)), shape=(len(mesh.vertices),) * 2)
+    return np.asarray(connected_components(graph, directed=False)[1], np.int32)
 
 
 def facing(box: Box) -> Box:

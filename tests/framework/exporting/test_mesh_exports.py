@@ -216,6 +216,33 @@ def test_hulls_face_out() -> None:
     assert convex_hull(corners[corners[:, 2] == 0]) is None
 
 
+def test_normals_of_lit_colors_have_length_1(room: Room) -> None:
+    """Also where triangles have no area, which Khronos' validator calls an error."""
+    mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
+    own = room.objects[1].vertices
+    mesh.vertices[own[:50]] = mesh.vertices[own[0]]
+    scene = trimesh.load(
+        trimesh.util.wrap_as_stream(glb(parts(replace(room, mesh=mesh)), Coloring.CLASS)),
+        file_type="glb",
+        process=False,
+    )
+    for part in scene.geometry.values():
+        np.testing.assert_allclose(np.linalg.norm(part.vertex_normals, axis=1), 1, atol=1e-5)
+
+
+def test_specks_are_of_the_room_and_not_of_the_object(tmp_path: Path) -> None:
+    """Labels leak through edges of depth; a leg is no speck."""
+    table = [(0.8, 1.0, 0.7, 2.0, 1.8, 0.75), (0.8, 1.0, 0, 0.85, 1.05, 0.65)]
+    speck = (3.5, 2.5, 0.9, 3.51, 2.51, 0.91)
+    run = ExportedRoom(things={"dining table": [*table, speck]}).write(tmp_path / "run")
+    [found] = read_room(run).objects
+    assert found.box.extent == pytest.approx((1.2, 0.8, 0.75), abs=1e-4)
+    [loaded] = export(run, [Format.PLY], tmp_path, Chosen(("1",)))
+    assert len(read_mesh(loaded).vertices) == len(found.vertices)
+    whole = export(run, [Format.PLY], tmp_path)[0]
+    assert len(read_mesh(whole).triangles) == len(read_mesh(run / "mesh.ply").triangles)
+
+
 def test_fewer_triangles_keep_shape_colors_and_labels(room: Room) -> None:
     fewer = parts(room, 400)
     assert 200 < sum(len(part.mesh.triangles) for part in fewer) <= 420
