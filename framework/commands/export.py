@@ -57,18 +57,16 @@ def main() -> None:
     asked = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
-        from framework.exporting.coloring import Coloring  # here: what is wrong with the arguments is said at once
-        from framework.exporting.export import Chosen, Format, export
-        from framework.exporting.usd import Collision
+        from framework.exporting.export import Chosen, Format, export  # here: wrong arguments are told at once
 
-        chosen = Chosen(
-            tuple(asked.object),
-            asked.min_confidence,
-            asked.triangles,
-            Coloring(asked.colors),
-            Collision(asked.collision),
-            asked.resolution,
-            asked.robot_height,
+        chosen = Chosen.named(
+            asked.object,
+            min_confidence=asked.min_confidence,
+            triangles=asked.triangles,
+            coloring=asked.colors,
+            collision=asked.collision,
+            resolution=asked.resolution,
+            robot_height=asked.robot_height,
         )
         for path in export(asked.run, map(Format, asked.to), asked.out, chosen, asked.up, asked.floor):
             print(path)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import Enum
 from pathlib import Path
+from typing import Any, TypeVar
 
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.exporting.coloring import Coloring
 from framework.exporting.floor_plan import write_floor_plan
 from framework.exporting.geojson import write_geojson
@@ -59,6 +60,27 @@ class Chosen:
         check_bounds(self, min_confidence=(0.0, 1.0), resolution=(0.005, 1.0), robot_height=(0.1, 3.0))
         if self.triangles is not None and self.triangles < 4:
             raise DataError(f"triangles must be at least 4, found {self.triangles}")
+
+    @classmethod
+    def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
+        """The same with words for what is one of several: `coloring="class"`. Raises ConfigError for others."""
+        for name, kind in (("coloring", Coloring), ("collision", Collision)):
+            if name in choices:
+                choices[name] = one_of(kind, name, choices[name])
+        if unknown := choices.keys() - {field.name for field in fields(cls)}:
+            raise ConfigError(f"export has no choice {min(unknown)!r}; it has {', '.join(f.name for f in fields(cls))}")
+        return cls(tuple(map(str, objects)), **choices)
+
+
+Option = TypeVar("Option", bound=Enum)
+
+
+def one_of(kind: type[Option], name: str, value: object) -> Option:
+    """The member with this value. Raises ConfigError, which lists them, where there is none."""
+    found = next((option for option in kind if option.value == value), None)
+    if found is None:
+        raise ConfigError(f"{name} must be one of {', '.join(option.value for option in kind)}, found {value!r:.60}")
+    return found
 
 
 def export(

@@ -32,6 +32,7 @@ from framework.rendering.surface import Surface
 
 LONGEST_NAME = 60  # characters of a class, in the names of files and of nodes
 UP = np.array([0.0, 0.0, 1.0])
+HIGHEST = 1e4  # m, of a floor; vertices are float32
 SPECK = 0.01  # of an object's vertices: labels leak through edges of depth, and would widen its box
 SHORTEST_UP = 1e-6  # of a vector that may say what is up
 
@@ -121,7 +122,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
     else:  # of a run that ended early
         mesh = read_mesh(run / MESH)
     direction = _direction(f"{run}: map.up", figures) if up is None else _unit("up", up)
-    height = figures.get("map.floor_m") if floor is None and up is None else floor
+    height = _height(f"{run}: map.floor_m", figures.get("map.floor_m") if floor is None and up is None else floor)
     T_room_world = upright(UP if direction is None else direction, height or 0.0)
     _, poses = read_tum(run / TRAJECTORY) if is_there(run / TRAJECTORY) else (None, np.zeros((0, 4, 4)))
     placed = replace(mesh, vertices=transform(T_room_world, mesh.vertices.astype(np.float64)).astype(np.float32))
@@ -184,6 +185,12 @@ def upright(up: Float64, floor: float) -> Float64:
 def _direction(where: str, figures: Mapping[str, Any]) -> Float64 | None:
     values = [figures.get(f"map.up.{axis}") for axis in "xyz"]
     return None if None in values else _unit(where, values)
+
+
+def _height(name: str, value: float | None) -> float | None:
+    if value is not None and not abs(value) <= HIGHEST:
+        raise DataError(f"{name}, the floor, must be a height within {HIGHEST:g} m, found {value!r:.60}")
+    return value
 
 
 def _unit(name: str, values: Sequence[Any]) -> Float64:
