@@ -29,7 +29,7 @@ TONES = {
     "not seen": UNSEEN,
 }
 DPI = 150
-TINT = 0.7  # of an object's colour in its cells
+TINT = 0.6  # of an object's colour in its cells
 DARKER = 0.65  # and in its outline
 LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # inches of paper, of the plan
 FOOT = 0.72  # inches below it, for what the tones mean

@@ -10,7 +10,7 @@ from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.errors import DataError
 from framework.exporting.room import Room
 
-MOST_POINTS = 2**26  # of a room; one of 100 m^2 of surface has 4 million, a voxel of 1 cm giving 2 triangles
+MOST_POINTS = 2**24  # of a room; one of 100 m^2 of surface has 4 million, a voxel of 1 cm giving 2 triangles
 LEVEL = float(np.cos(np.radians(30.0)))  # z of a normal, from which on a surface is one that things may stand on
 UPRIGHT = float(np.sin(np.radians(20.0)))  # |z| of a normal, up to which it is that of a wall
 
@@ -44,7 +44,9 @@ def surface_points(room: Room, spacing: float) -> SurfacePoints:
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1, initial=0)
     cuts = np.maximum(np.ceil(longest / spacing), 1)
     if float((cuts**2).sum()) > MOST_POINTS:
-        raise DataError(f"the surface is too large for points {spacing:g} m apart: raise the resolution")
+        raise DataError(
+            f"the surface is too large for points {spacing:g} m apart: raise the resolution, or map with larger voxels"
+        )
     normals = room.surface.face_normals
     normal_z = (normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-20)).astype(np.float32)
     owner = np.zeros(len(vertices), np.int32)
