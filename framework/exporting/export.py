@@ -22,7 +22,7 @@ from framework.exporting.ros_map import write_ros_map
 from framework.exporting.scene_graph import write_scene_graph
 from framework.exporting.usd import Collision, check_usd, write_usd
 from framework.files.whole_files import written_whole
-from framework.parameters import check_bounds
+from framework.parameters import require
 
 log = logging.getLogger(__name__)
 
@@ -53,11 +53,13 @@ class Chosen:
     triangles: int | None = None  # >= 4, of the scene and of each object's own file; None = as many as there are
     coloring: Coloring = Coloring.APPEARANCE
     collision: Collision = Collision.HULL
-    resolution: float = 0.05  # m, in [0.005, 1], of a plan's cells
+    resolution: float = 0.05  # m, in [0.01, 1], of a plan's cells
     robot_height: float = 1.0  # m, in [0.1, 3], of the robot that a place is free for
 
     def __post_init__(self) -> None:
-        check_bounds(self, min_confidence=(0.0, 1.0), resolution=(0.005, 1.0), robot_height=(0.1, 3.0))
+        for name, low, high in (("min_confidence", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
+            value = getattr(self, name)
+            require(low <= value <= high, name, value, f"in [{low:g}, {high:g}]")
         if self.triangles is not None and self.triangles < 4:
             raise DataError(f"triangles must be at least 4, found {self.triangles}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -43,8 +44,11 @@ MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1
 
 def write_floor_plan(path: Path, room: Room, plan: Plan, robot_height: float) -> None:
     """Draws the plan to a PNG; the same room gives the same bytes."""
-    figure = _drawn(room, plan, robot_height)
-    with written_whole(path) as temporary:
+    with warnings.catch_warnings(), written_whole(path) as temporary:
+        warnings.filterwarnings(
+            "ignore", "Glyph .* missing from font", UserWarning
+        )  # of names; they are drawn as boxes
+        figure = _drawn(room, plan, robot_height)
         figure.savefig(temporary, dpi=DPI)
 
 

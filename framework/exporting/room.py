@@ -146,7 +146,7 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
         own = order[np.searchsorted(ids, one.id) : np.searchsorted(ids, one.id, side="right")]
         if len(own):
             _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
-            own = own[(sizes >= SPECK * len(own))[piece]]
+            own = own[(sizes >= min(SPECK * len(own), sizes.max()))[piece]]
             box = facing(upright_box(mesh.vertices[own], UP))
             found.append(RoomObject(one.id, one.class_name, one.confidence, one.probability, own, box))
     return tuple(found)

@@ -295,6 +295,18 @@ def test_an_object_of_three_vertices_is_exported(tmp_path: Path) -> None:
     assert len(read_mesh(tmp_path / "out/objects/cube_2.ply").vertices) == 3
 
 
+def test_loose_vertices_are_objects_too(tmp_path: Path) -> None:
+    """Of a mesh without triangles: every vertex would be a speck."""
+    run = ExportedRoom().write(tmp_path / "run")
+    mesh = read_mesh(run / "mesh.ply")
+    write_mesh(run / "mesh.ply", replace(mesh, triangles=mesh.triangles[:0]))
+    written = export(run, [Format.GLB, Format.USD, Format.PLY, Format.OBJ], tmp_path / "out", Chosen(("cube",)))
+    assert len(read_mesh(tmp_path / "out" / "objects" / "cube_2.ply").vertices) == (mesh.instance_ids == 2).sum()
+    assert len(written) == 4
+    with pytest.raises(DataError, match="nothing was mapped"):
+        export(run, [Format.GLB], tmp_path / "out")
+
+
 def test_runs_that_ended_early_or_have_no_objects_are_exported(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     (run / "metrics.json").rename(run / "metrics.partial.json")

@@ -179,6 +179,29 @@ def test_the_plan_is_a_picture_of_the_room(run: Path, tmp_path: Path) -> None:
     assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50  # tones, objects, letters
 
 
+@pytest.mark.filterwarnings("error")
+def test_any_name_can_be_written_on_a_plan(tmp_path: Path) -> None:
+    names = ("日本 $x_1$", "a" * 3000, "")
+    run = ExportedRoom().write(tmp_path / "run")
+    entries = json.loads((run / "instances.json").read_text())
+    for entry, name in zip(entries, names, strict=True):
+        entry["class"] = name
+    (run / "instances.json").write_text(json.dumps(entries))
+    export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
+    found = json.loads((tmp_path / "scene_graph.json").read_text())
+    jsonschema.validate(found, SCHEMA)
+    assert tuple(node["class"] for node in found["nodes"][:3]) == names
+
+
+def test_a_room_without_objects_has_a_plan(tmp_path: Path) -> None:
+    run = ExportedRoom().write(tmp_path / "run")
+    (run / "instances.json").unlink()
+    assert len(export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))) == 5
+    found = json.loads((tmp_path / "scene_graph.json").read_text())
+    assert [node["kind"] for node in found["nodes"]] == ["floor", "walls", "room"]
+    assert found["edges"] == []
+
+
 def test_a_cube_is_on_the_table_and_the_table_on_the_floor(room: Room, low: Plan) -> None:
     found = relations(room, low)
     assert told(found, 2) == [("on", 1)]
