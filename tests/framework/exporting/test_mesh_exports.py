@@ -14,14 +14,16 @@ import pytest
 import trimesh
 from PIL import ImageColor
 
+from framework.data import Box
 from framework.errors import DataError
 from framework.exporting.coloring import Coloring, linear
 from framework.exporting.decimation import decimated
 from framework.exporting.export import Chosen, Format, export
 from framework.exporting.glb import glb
 from framework.exporting.object_meshes import parts
-from framework.exporting.room import Room, read_room
+from framework.exporting.room import Room, facing, objects_of, read_room
 from framework.exporting.usd import Collision, convex_hull
+from framework.records.instances_file import StoredInstance
 from framework.records.mesh_file import read_mesh, write_mesh
 from tests.scenes.exported_room import Y_UP, ExportedRoom
 
@@ -97,6 +99,27 @@ def test_the_scene_has_everything_and_each_object_where_it_stands(run: Path, tmp
         found = trimesh.load(tmp_path / f"scene.{ending}", process=False, force="mesh")
         np.testing.assert_allclose(found.bounds[:, 2], (0, 2.5), atol=1e-4)
         assert len(found.faces) == len(whole.triangles)
+        original = trimesh.Trimesh(whole.vertices, whole.triangles, process=False)
+        assert found.area == pytest.approx(original.area, rel=1e-4)
+
+
+def test_triangles_between_objects_are_of_the_room(room: Room) -> None:
+    ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
+    mesh = replace(room.mesh, instance_ids=ids)
+    two = [StoredInstance(key, "half", 0.5, int((ids == key).sum())) for key in (1, 2)]
+    found = parts(replace(room, mesh=mesh, objects=objects_of(mesh, two)))
+    seams = len(found[0].mesh.triangles)
+    assert seams >= 2 * (4 * 3 / 0.1)  # across floor and ceiling, at least
+    assert sum(len(part.mesh.triangles) for part in found) == len(mesh.triangles)
+
+
+@pytest.mark.parametrize(("degrees", "yaw", "swapped"), [(80, -10, True), (10, 10, False), (190, 10, False)])
+def test_boxes_face_the_rooms_x_axis(degrees: float, yaw: float, swapped: bool) -> None:
+    angle = np.radians(degrees)
+    rotation = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    found = facing(Box(np.zeros(3), np.array([1.0, 2.0, 3.0]), rotation))
+    assert found.extent.tolist() == ([2, 1, 3] if swapped else [1, 2, 3])
+    assert np.degrees(np.arctan2(found.rotation[1, 0], found.rotation[0, 0])) == pytest.approx(yaw)
 
 
 def test_glb_nodes_say_what_objects_are(room: Room) -> None:

@@ -104,6 +104,12 @@ def test_who_looks_under_the_table_knows_that_it_is_free_there(tmp_path: Path) -
     assert at(low, 1.4, 1.4) == (False, True)
 
 
+def test_the_highest_object_of_a_cell_is_what_is_seen_from_above(low: Plan) -> None:
+    for (x, y), key in (((1.3, 1.3), 2), ((1.0, 1.2), 1), ((3.5, 1.0), 0)):
+        [[row, column]] = low.cells(np.array([[x + OFF, y + OFF]]))
+        assert low.highest[row, column] == key
+
+
 def test_walls_are_where_they_stand(low: Plan) -> None:
     assert low.wall[1:-1, [1, -2]].all()
     assert low.wall[[1, -2], 1:-1].sum() >= 76  # but behind the picture
@@ -264,6 +270,17 @@ def test_what_a_cupboard_or_a_box_holds_is_in_it(tmp_path: Path) -> None:
     assert told(found, 2) == [("in", 1)]
     assert told(found, 4) == [("in", 3)]
     assert told(found, 5) == [("on", 1)]
+
+
+SEAT: list[Block] = [(1.0, 1.0, 0.0, 2.0, 1.8, 0.4), (1.0, 1.7, 0.4, 2.0, 1.8, 0.9)]
+ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0.7)]
+
+
+@pytest.mark.parametrize("seat", [SEAT, SEAT + ARMS])
+def test_a_pillow_is_on_a_chair_and_not_in_it(seat: list[Block], tmp_path: Path) -> None:
+    """Whose top is not what it stands on."""
+    things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
+    assert told(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
 
 
 def test_a_bag_under_a_table_is_not_in_it(tmp_path: Path) -> None:
