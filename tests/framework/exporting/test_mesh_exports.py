@@ -22,6 +22,7 @@ from framework.exporting.export import Chosen, Format, export
 from framework.exporting.glb import glb
 from framework.exporting.object_meshes import parts
 from framework.exporting.room import Room, facing, objects_of, read_room
+from framework.exporting.surface_points import surface_points
 from framework.exporting.usd import Collision, convex_hull
 from framework.records.instances_file import StoredInstance
 from framework.records.mesh_file import read_mesh, write_mesh
@@ -107,10 +108,12 @@ def test_triangles_between_objects_are_of_the_room(room: Room) -> None:
     ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
     mesh = replace(room.mesh, instance_ids=ids)
     two = [StoredInstance(key, "half", 0.5, int((ids == key).sum())) for key in (1, 2)]
-    found = parts(replace(room, mesh=mesh, objects=objects_of(mesh, two)))
+    halves = replace(room, mesh=mesh, objects=objects_of(mesh, two))
+    found = parts(halves)
     seams = len(found[0].mesh.triangles)
     assert seams >= 2 * (4 * 3 / 0.1)  # across floor and ceiling, at least
     assert sum(len(part.mesh.triangles) for part in found) == len(mesh.triangles)
+    assert (surface_points(halves, 1.0).owner == 0).sum() == seams
 
 
 @pytest.mark.parametrize(("degrees", "yaw", "swapped"), [(80, -10, True), (10, 10, False), (190, 10, False)])
@@ -350,6 +353,7 @@ def test_what_is_asked_for_and_not_there_is_told(run: Path, tmp_path: Path) -> N
     with pytest.raises(DataError, match=r"no 'cube' has a confidence of 0.9; the highest is 0.80"):
         export(run, [Format.GLB], tmp_path, Chosen(("cube",), min_confidence=0.9))
     assert export(run, [Format.GLB], tmp_path, Chosen(("2",), min_confidence=0.9)) == [tmp_path / "objects/cube_2.glb"]
+    assert export(run, [Format.GLB], tmp_path, Chosen(min_confidence=0.9)) == [tmp_path / "scene.glb"]
     with pytest.raises(DataError, match="triangles must be at least 4, found 0"):
         Chosen(triangles=0)
 

@@ -22,7 +22,7 @@ from framework.exporting.rooms import rooms
 from framework.exporting.ros_map import FREE, OCCUPIED, UNKNOWN, levels
 from framework.exporting.surface_points import middles, surface_points
 from framework.rendering.viewpoint import looking
-from tests.scenes.exported_room import TABLE, Y_UP, Block, ExportedRoom
+from tests.scenes.exported_room import CUBE, TABLE, Y_UP, Block, ExportedRoom
 
 SCHEMA = json.loads((Path(scene_graph.__file__).parent / "scene_graph.schema.json").read_text())
 RESOLUTION = 0.1
@@ -104,10 +104,13 @@ def test_who_looks_under_the_table_knows_that_it_is_free_there(tmp_path: Path) -
     assert at(low, 1.4, 1.4) == (False, True)
 
 
-def test_the_highest_object_of_a_cell_is_what_is_seen_from_above(low: Plan) -> None:
+def test_the_highest_object_of_a_cell_is_what_is_seen_from_above(low: Plan, tmp_path: Path) -> None:
+    """In whichever order they are."""
+    turned = plan(stored(tmp_path, things={"cube": CUBE, "table": TABLE}, shift=(OFF, OFF, 0.0)), RESOLUTION, 0.5)
     for (x, y), key in (((1.3, 1.3), 2), ((1.0, 1.2), 1), ((3.5, 1.0), 0)):
         [[row, column]] = low.cells(np.array([[x + OFF, y + OFF]]))
         assert low.highest[row, column] == key
+        assert turned.highest[row, column] == (0, 2, 1)[key]
 
 
 def test_walls_are_where_they_stand(low: Plan) -> None:
