@@ -21,12 +21,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
 from framework.data import Float32, Int32, UInt8
-from framework.errors import DataError, in_one_line
+from framework.errors import DataError
 from framework.exporting.coloring import Coloring, linear, part_colors
 from framework.exporting.object_meshes import Part
 from framework.files.whole_files import written_whole
 
 MISSING = "USD files need the package usd-core: pip install instancemap[usd]"
+NOT_WRITTEN = "USD could not; the disk may be full"
 THINNEST = 0.002  # m, of a box that things collide with: what was seen from one side may be flat
 GRAVITY = 9.81  # m/s^2
 
@@ -78,9 +79,9 @@ def write_usd(
         try:
             written = stage.GetRootLayer().Export(str(temporary))
         except Tf.ErrorException as error:
-            raise OSError(in_one_line(error)) from error
+            raise OSError(NOT_WRITTEN) from error
         if not written:
-            raise OSError("USD could not write it; the disk may be full")
+            raise OSError(NOT_WRITTEN)
 
 
 def _add_rest(stage: Any, part: Part, colors: UInt8) -> None:
