@@ -21,6 +21,8 @@
     mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex; scene.mesh(it) of one object
     view = scene.view(camera, T_world_camera)  # depth, normals, colour and instances, as the camera would see them
 
+`export("outputs/demo", "glb", "usd")` writes a run for other programs.
+
 Several threads may ask one Mapper, while it maps, too: questions wait for the frame in work.
 
 Metres, seconds, radians; camera axes x right, y down, z forward; `T_a_b` maps coordinates in b to coordinates in a;

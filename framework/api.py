@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -63,6 +64,7 @@ __all__ = [
     "RGBDSequence",
     "SceneMap",
     "View",
+    "export",
     "load_map",
     "open_dataset",
 ]
@@ -243,6 +245,30 @@ def load_map(path: Path | str) -> Map:
     Raises DataError when the file is none or was damaged.
     """
     return Map(load_scene(path))
+
+
+def export(
+    run: Path | str,
+    *formats: str,
+    out: Path | str | None = None,
+    objects: Sequence[str | int] = (),
+    up: Sequence[float] | None = None,
+    floor: float | None = None,
+    **choices: object,
+) -> list[Path]:
+    """Writes what a run found as "glb", "ply", "usd", "obj", "floorplan" or "graph", and returns the files.
+
+    `export("outputs/demo", "glb", objects=["chair", 7])`: `objects` are classes or ids, () = all and the room around
+    them; `out` is a folder, None = `export` in the run's. `choices` are min_confidence, triangles, coloring, collision,
+    resolution and robot_height, as `instancemap export --help` says of them. `up` (3,) and `floor`, m along up, say
+    what the run does not tell. Raises ConfigError for a word that there is not, DataError for a run that cannot be
+    exported.
+    """
+    from framework.exporting import export as exports
+
+    kinds = [exports.one_of(exports.Format, "a format", one) for one in formats]
+    chosen = exports.Chosen.named(objects, **choices)
+    return exports.export(Path(run), kinds, None if out is None else Path(out), chosen, up, floor)
 
 
 def load_scene(path: Path | str) -> SceneMap:

@@ -147,7 +147,7 @@ DEFAULTS = "python -m framework"
 RUNNABLE = {  # what to append, by a command that then takes seconds
     # twice as large: of what is left of a noisy room in a quarter of 160x120, tracking is not to be had
     DEFAULTS: [*SMALL, "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
-    "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=simulated"],
+    "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=outputs/demo"],
     "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
     "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
     "python -m framework detection_cache=read_write refiner=kmeans": [*OWN, "hydra.run.dir=cached"],
@@ -161,10 +161,17 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     ],
     "python -m framework tables outputs/table3_map": [],  # of the sweep above
     "python -m framework evaluate outputs/table3_map": [],
+    "python -m framework export outputs/demo --to glb usd ply obj": [],
+    "python -m framework export outputs/demo --to floorplan graph --robot-height 0.5": [],
     "python -m framework plugins": [],
     "python -m framework plugins detector": [],
 }
-LEFT_BEHIND = ["detections.json", "refinement.png", *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own"))]
+LEFT_BEHIND = [
+    "detections.json",
+    "refinement.png",
+    *(f"{run}/metrics.json" for run in ("outputs/demo", "coarse", "own")),
+    *(f"outputs/demo/export/{name}" for name in ("scene.glb", "scene.usdc", "map.yaml", "scene_graph.json")),
+]
 RUN = """
 import json, sys
 from framework.__main__ import main

@@ -23,6 +23,7 @@ class StoredInstance:
     class_name: str
     confidence: float  # in [0, 1]
     vertices: int  # of the mesh
+    probability: float | None = None  # of that class, in [0, 1]; None = the file does not tell
 
 
 def write_instances(
@@ -71,11 +72,16 @@ def read_instances(path: Path) -> list[StoredInstance]:
 def _stored(where: str, entry: Any) -> StoredInstance:
     if not isinstance(entry, dict):
         raise DataError(f"{where}: expected an object with id, class, confidence and vertices, found {entry!r:.40}")
+    name, probabilities = _string(where, entry, "class"), entry.get("class_probabilities")
+    likely = None
+    if isinstance(probabilities, dict) and name in probabilities:
+        likely = _fraction(f"{where}, class_probabilities", probabilities, name)
     return StoredInstance(
         id=_integer(where, entry, "id", 1),
-        class_name=_string(where, entry, "class"),
+        class_name=name,
         confidence=_fraction(where, entry, "confidence"),
         vertices=_integer(where, entry, "vertices", 0),
+        probability=likely,
     )
 
 

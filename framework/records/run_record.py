@@ -35,7 +35,17 @@ from framework.records.metrics import (
     trajectory_metrics,
 )
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES, TRAJECTORY
+from framework.records.stored_runs import (
+    CONFIG,
+    INSTANCES,
+    MAP,
+    MAPPED,
+    MESH,
+    METRICS,
+    PARTIAL_METRICS,
+    PLACES,
+    TRAJECTORY,
+)
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.tracking.places_file import write_places
@@ -99,12 +109,12 @@ class RunRecord:
         figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
         found = attempt(_found, scene)
         if found is not None:
-            attempt(write_instances, self.directory / "instances.json", *found, scene.classes)
+            attempt(write_instances, self.directory / INSTANCES, *found, scene.classes)
             figures |= attempt(room_metrics, scene, found[0]) or {}
             figures["instances.count"] = len(found[1])
         attempt(self._write_partial, video, figures, attempt.fault)
         if found is not None:
-            attempt(write_mesh, self.directory / "mesh.ply", found[0])
+            attempt(write_mesh, self.directory / MESH, found[0])
         attempt(scene.save, self.directory / MAP)
         if result.places:
             attempt(write_places, self.directory / PLACES, result.places)

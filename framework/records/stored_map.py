@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
 from framework.files.tum_trajectory import read_tum
 from framework.records.instances_file import StoredInstance, read_instances
 from framework.records.mesh_file import read_mesh
-from framework.records.stored_runs import METRICS, TRAJECTORY, Record
+from framework.records.stored_runs import INSTANCES, MESH, METRICS, TRAJECTORY, Record
 
 
 @dataclass(frozen=True)
@@ -44,13 +45,19 @@ class StoredMap:
 
 def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
     """mesh.ply and instances.json. Raises DataError when they are not of this run."""
-    mesh_path, instances_path = record.directory / "mesh.ply", record.directory / "instances.json"
-    instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
+    mesh, instances = read_labeled_mesh(record.directory)
     if len(instances) != record.metrics.get("instances.count"):
         raise DataError(
-            f"{instances_path} lists {len(instances)} instances, but {METRICS} counts "
+            f"{record.directory / INSTANCES} lists {len(instances)} instances, but {METRICS} counts "
             f"{record.metrics.get('instances.count')}: they are not of one run; run it again"
         )
+    return mesh, instances
+
+
+def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstance]]:
+    """The same of a run that may have ended early. Raises DataError when the two files are not of one run."""
+    mesh_path, instances_path = directory / MESH, directory / INSTANCES
+    instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
     ids, counts = np.unique(mesh.instance_ids, return_counts=True)
     vertices = dict(zip(ids.tolist(), counts.tolist(), strict=True))
     for instance in instances:

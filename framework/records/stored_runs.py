@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import DataError
 from framework.files.json_file import read_json
-from framework.files.whole_files import MOST_TEXT, read_bytes
+from framework.files.whole_files import MOST_TEXT, is_there, read_bytes
 from framework.files.yaml_file import load_yaml
 from framework.records.inputs import INPUTS, inputs_sha256
 from framework.records.provenance import code_version, config_hash, environment, shows_speed, speed_settings
@@ -26,9 +26,11 @@ METRICS = "metrics.json"  # there exactly when the run completed
 PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended early, with the reason under `partial`
 LOG = "instancemap.log"
 MAP = "map.npz"
+MESH = "mesh.ply"
+INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 PLACES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
-MAPPED = (TRAJECTORY, "timings.csv", "instances.json", "mesh.ply", MAP, "overview.png")
+MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 """What is written of a map, in this order: on a disk that is full the small ones still find a place."""
 
 EVALUATION = "evaluation."  # before the keys that name the code that evaluated anew; absent where it is that of the run
@@ -171,6 +173,14 @@ def _with_text_keys(node: Any) -> Any:
     if isinstance(node, dict):
         return {str(key): _with_text_keys(value) for key, value in node.items()}
     return [_with_text_keys(one) for one in node] if isinstance(node, list) else node
+
+
+def read_figures(directory: Path) -> dict[str, Any]:
+    """metrics.json, or metrics.partial.json of a run that ended early. Raises DataError where there is neither."""
+    for name in (METRICS, PARTIAL_METRICS):
+        if is_there(directory / name):
+            return _read_flat(directory / name)
+    raise DataError(f"there is no {directory / METRICS}, nor a {PARTIAL_METRICS}: expected the directory of a run")
 
 
 def _read_flat(path: Path) -> dict[str, Any]:

@@ -30,6 +30,7 @@ LAYERS = [
     ["records", "training"],
     ["tables"],
     ["figures"],
+    ["exporting"],
     ["api"],
     ["commands"],
     ["__main__"],
@@ -50,6 +51,7 @@ OPTIONAL = {
     "OpenEXR",
     "lzfse",
     "rosbags",
+    "pxr",
 }
 MODULES = sorted(path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py"))
 

@@ -45,7 +45,9 @@ def test_what_is_evaluated_reads_back_exactly(tmp_path: Path) -> None:
     write_instances(tmp_path / "instances.json", mesh, found, CLASSES)
     stored = read_instances(tmp_path / "instances.json")
     assert stored == [
-        StoredInstance(key, "couch", instance.confidence, len(instance.vertices)) for key, instance in found.items()
+        StoredInstance(key, "couch", instance.confidence, len(instance.vertices), float(str(likely)))
+        for key, instance in found.items()
+        if (likely := instance.class_probabilities[CLASSES.index("couch")])
     ]
     again = PredictedInstances.on_mesh(
         mesh, [one.id for one in stored], [one.confidence for one in stored], [one.class_name for one in stored]

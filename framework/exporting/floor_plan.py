@@ -1,0 +1,174 @@
+"""floor_plan.png: a room from above for people, with the footprints of objects, their names and a scale bar."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Polygon, Rectangle
+from matplotlib.patheffects import withStroke
+from matplotlib.transforms import Bbox
+
+from framework.data import UInt8
+from framework.exporting.geojson import outline
+from framework.exporting.occupancy import Plan
+from framework.exporting.room import Room, RoomObject
+from framework.files.whole_files import written_whole
+from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
+
+UNSEEN, FLOOR, FREE, OCCUPIED, WALL = (214, 216, 218), (240, 232, 206), PAPER, (150, 154, 160), INK
+TONES = {
+    "wall": WALL,
+    "occupied": OCCUPIED,
+    "free": FREE,
+    "floor, not all air above it seen": FLOOR,
+    "not seen": UNSEEN,
+}
+DPI = 150
+TINT = 0.6  # of an object's colour in its cells
+DARKER = 0.65  # and in its outline
+LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # inches of paper, of the plan
+FOOT = 0.72  # inches below it, for what the tones mean
+EDGE = 0.15  # inches
+TEXT_PT, SMALL_PT = 8.0, 7.0
+BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # m, that a scale bar may have
+BAR_SHARE = 0.25  # of the plan's width, at most
+MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
+"""How a name moves aside, in its own widths and heights."""
+
+
+def write_floor_plan(path: Path, room: Room, plan: Plan, robot_height: float) -> None:
+    """Draws the plan to a PNG; the same room gives the same bytes."""
+    with warnings.catch_warnings(), written_whole(path) as temporary:
+        warnings.filterwarnings(
+            "ignore", "Glyph .* missing from font", UserWarning
+        )  # of names; they are drawn as boxes
+        figure = _drawn(room, plan, robot_height)
+        figure.savefig(temporary, dpi=DPI)
+
+
+def tones(plan: Plan) -> UInt8:
+    """(H, W, 3) RGB of the cells, row 0 with the lowest y."""
+    image = np.empty((*plan.shape, 3), np.uint8)
+    image[:] = UNSEEN
+    for chosen, tone in ((plan.floor, FLOOR), (plan.free, FREE), (plan.occupied, OCCUPIED), (plan.wall, WALL)):
+        image[chosen] = tone
+    return image
+
+
+def _drawn(room: Room, plan: Plan, robot_height: float) -> Figure:
+    left, right, bottom, top = plan.extent
+    scale = LONGER_SIDE / max(right - left, top - bottom)
+    width, height = max((right - left) * scale, SHORTEST_SIDE), max((top - bottom) * scale, SHORTEST_SIDE / 2)
+    page = width + 2 * EDGE, height + FOOT + EDGE
+    figure = Figure(page, facecolor=_share(PAPER))
+    FigureCanvasAgg(figure)
+    axes = figure.add_axes(
+        (EDGE / page[0], FOOT / page[1], width / page[0], height / page[1]), facecolor=_share(UNSEEN)
+    )
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    for side in axes.spines.values():
+        side.set_visible(False)
+    centers = np.array([one.box.center for one in room.objects]).reshape(-1, 3)
+    colors = {one.id: color for one, color in zip(room.objects, instance_colors(centers), strict=True)}
+    image = tones(plan)
+    for key, color in colors.items():
+        image[plan.highest == key] = (1 - TINT) * np.array(PAPER) + TINT * color
+    axes.imshow(image, origin="lower", extent=plan.extent, interpolation="nearest")
+    _draw_outlines(axes, room, colors)
+    _draw_names(axes, room.objects)
+    _draw_bar(axes)
+    _draw_foot(figure, page, plan, robot_height)
+    return figure
+
+
+def _draw_outlines(axes: Axes, room: Room, colors: Mapping[int, UInt8]) -> None:
+    """The hulls of the objects, the low ones first, so that what stands on another is seen."""
+    for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
+        dark = _share([round(DARKER * channel) for channel in colors[one.id].tolist()])
+        axes.add_patch(Polygon(outline(room, one), fill=False, edgecolor=dark, linewidth=1.0, joinstyle="round"))
+
+
+def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
+    """The large ones first; a name moves aside for those already there, and is left to its number at last."""
+    figure = axes.figure
+    assert isinstance(figure, Figure)
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    taken: list[Bbox] = []
+    inside = axes.get_window_extent(renderer)
+    for one in sorted(objects, key=lambda one: (-float(np.prod(one.box.extent[:2])), one.id)):
+        words = (f"{one.class_name} {one.id}", str(one.id))
+        for text, moves in zip(words, (MOVES, ((0, 0), *MOVES[1:5])), strict=True):
+            center_x, center_y, _ = one.box.center.tolist()
+            said = axes.text(
+                center_x,
+                center_y,
+                text.replace("$", r"\$"),
+                fontsize=TEXT_PT,
+                color=_share(INK),
+                ha="center",
+                va="center",
+                path_effects=[withStroke(linewidth=2.2, foreground=_share(PAPER))],
+            )
+            box = said.get_window_extent(renderer)
+            place = axes.transData.transform(one.box.center[:2])
+            moved = [box.translated(x * box.width, y * box.height) for x, y in moves]
+            free = next((k for k, at in enumerate(moved) if _fits(at, taken, inside)), None)
+            if free is not None:
+                shift = np.array(moves[free]) * (box.width, box.height)
+                x, y = axes.transData.inverted().transform(place + shift).tolist()
+                said.set_position((x, y))
+                taken.append(moved[free])
+                break
+            said.remove()
+
+
+def _fits(box: Bbox, taken: Sequence[Bbox], inside: Bbox) -> bool:
+    if box.x0 < inside.x0 or box.x1 > inside.x1 or box.y0 < inside.y0 or box.y1 > inside.y1:
+        return False
+    return not any(box.overlaps(other) for other in taken)
+
+
+def _draw_bar(axes: Axes) -> None:
+    """A scale bar in the lower left corner, on a patch of paper."""
+    (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    length = max([bar for bar in BARS if bar <= BAR_SHARE * (right - left)], default=BARS[0])
+    unit = 0.012 * (right - left)
+    x, y = left + 2 * unit, bottom + 2.2 * unit
+    patch = (left + unit, bottom + unit), length + 2 * unit, 4.2 * unit
+    axes.add_patch(Rectangle(*patch, color=_share(PAPER), zorder=4, alpha=0.85))
+    axes.add_patch(Rectangle((x, y), length, 0.6 * unit, color=_share(INK), zorder=5))
+    axes.text(x + length / 2, y + unit, f"{length:g} m", fontsize=SMALL_PT, ha="center", va="bottom", zorder=5)
+    axes.set_xlim(left, right)
+    axes.set_ylim(bottom, top)
+
+
+def _draw_foot(figure: Figure, page: tuple[float, float], plan: Plan, robot_height: float) -> None:
+    edge = _share(FAINT_INK)
+    patches = [Patch(facecolor=_share(tone), edgecolor=edge, linewidth=0.4, label=name) for name, tone in TONES.items()]
+    figure.legend(
+        handles=patches,
+        loc="upper left",
+        bbox_to_anchor=(EDGE / page[0], (FOOT - 0.06) / page[1]),
+        ncols=3,
+        frameon=False,
+        fontsize=SMALL_PT,
+        borderaxespad=0,
+        handlelength=1.4,
+        columnspacing=1.6,
+    )
+    note = f"cells of {plan.resolution:g} m; free: for a robot of {robot_height:g} m"
+    figure.text(EDGE / page[0], 0.1 / page[1], note, fontsize=SMALL_PT, color=edge, va="bottom")
+
+
+def _share(color: Sequence[int]) -> tuple[float, float, float]:
+    """An RGB colour as matplotlib takes it."""
+    red, green, blue = (channel / 255 for channel in color)
+    return red, green, blue

@@ -1,0 +1,99 @@
+"""Binary glTF 2.0: a node for each object, with what is known of it in `extras`, and one for the rest of the room.
+
+glTF has y up. Colours are linear and unlit (KHR_materials_unlit), as a photograph has its light in it; those that tell
+objects or classes are lit. The rest of the room shows its front only, so that one looks into it from outside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import trimesh
+
+from framework.data import Float32, UInt8, UInt16
+from framework.exporting.coloring import Coloring, linear, part_colors
+from framework.exporting.object_meshes import Part, parts
+from framework.exporting.room import Room
+from framework.rendering.surface import Surface
+
+T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+COLOR = "_LINEAR"  # as trimesh gets the colours, whose own have 8 bits: too few for dark ones that are linear
+UNLIT = "KHR_materials_unlit"
+UNSIGNED_SHORT = 5123
+
+
+def room_glb(room: Room, coloring: Coloring = Coloring.APPEARANCE, triangles: int | None = None) -> bytes:
+    """A room and its objects as one GLB file, with about so many triangles, None = as many as there are."""
+    return glb(parts(room, triangles), coloring)
+
+
+def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
+    """Parts of a room as a GLB file, each where it stands in the room. The same parts give the same bytes.
+
+    A part without triangles is a node without a mesh.
+    """
+    lit = coloring is not Coloring.APPEARANCE
+    scene = trimesh.Scene(base_frame="world")
+    for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
+        T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
+        if not len(part.mesh.triangles):
+            scene.graph.update(part.name, matrix=T_gltf_part, metadata=extras(part))
+            continue
+        turned = Surface(part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T, part.mesh.triangles)
+        mesh = trimesh.Trimesh(
+            turned.vertices,
+            turned.triangles,
+            vertex_normals=_unit(turned.vertex_normals) if lit else None,
+            vertex_attributes={COLOR: _shorts(colors)},
+            process=False,
+        )
+        scene.add_geometry(mesh, part.name, part.name, transform=T_gltf_part, metadata=extras(part))
+
+    def finish(tree: dict[str, Any]) -> None:
+        _with_materials(tree, lit, {part.name for part in shown if part.object is None})
+
+    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=lit, tree_postprocessor=finish))
+
+
+def extras(part: Part) -> dict[str, Any]:
+    """What a node says of an object; nothing of the rest of the room."""
+    one = part.object
+    if one is None:
+        return {}
+    return {"id": one.id, "class": one.class_name, "probability": one.probability, "confidence": one.confidence}
+
+
+def _unit(normals: Float32) -> Float32:
+    """(V, 3) with something for vertices whose triangles have no area: glTF knows no normals of length 0."""
+    return np.where(np.abs(normals).max(axis=1, keepdims=True) > 0.1, normals, np.array([0, 1, 0], np.float32))
+
+
+def _shorts(colors: UInt8) -> UInt16:
+    """(V, 4) linear RGBA in 16 bits."""
+    full = np.full((len(colors), 4), np.iinfo(np.uint16).max, np.uint16)
+    full[:, :3] = np.rint(linear(colors) * np.float32(np.iinfo(np.uint16).max))
+    return full
+
+
+def _with_materials(tree: dict[str, Any], lit: bool, one_sided: set[str]) -> None:
+    """Has the vertices' colours be colours, and gives the meshes their materials."""
+    plain: dict[str, Any] = {"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.9}}
+    if not lit:
+        plain["extensions"] = {UNLIT: {}}
+    used: dict[str, dict[str, Any]] = {}
+    for mesh in tree.get("meshes", []):
+        kind = "room" if mesh["name"] in one_sided else "object"
+        used.setdefault(kind, {"name": kind, **plain, "doubleSided": kind == "object"})
+        for primitive in mesh["primitives"]:
+            primitive["material"] = list(used).index(kind)
+            attributes = primitive["attributes"]
+            attributes["COLOR_0"] = attributes.pop(COLOR)
+            accessor = tree["accessors"][attributes["COLOR_0"]]
+            assert accessor["componentType"] == UNSIGNED_SHORT
+            accessor["normalized"] = True
+    if used:
+        tree["materials"] = list(used.values())
+        if not lit:
+            tree["extensionsUsed"] = [UNLIT]

@@ -1,0 +1,96 @@
+"""A room cut into its objects and the rest of it; each object stands upright on the origin of its own frame."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from framework.data import Bool, Float64, InstanceMesh
+from framework.exporting.decimation import decimated
+from framework.exporting.room import Room, RoomObject
+from framework.geometry import inverse, transform
+
+REST = "room"  # the name of what is of no object
+
+
+@dataclass(frozen=True)
+class Part:
+    """An object, or the rest of the room."""
+
+    mesh: InstanceMesh  # in the part's own frame
+    T_room_part: Float64  # (4, 4)
+    object: RoomObject | None  # None = the rest of the room
+
+    @property
+    def name(self) -> str:
+        return REST if self.object is None else self.object.name
+
+    @property
+    def alone(self) -> Part:
+        """By itself: it stands on the origin."""
+        return replace(self, T_room_part=np.eye(4))
+
+
+def parts(room: Room, triangles: int | None = None) -> list[Part]:
+    """The rest of the room, then its objects; together with about so many triangles, None = as many as there are."""
+    return _with_fewer([rest(room), *(object_part(room, one) for one in room.objects)], triangles)
+
+
+def object_parts(room: Room, triangles: int | None = None) -> list[Part]:
+    """Each object, with at most about so many triangles."""
+    found = [object_part(room, one) for one in room.objects]
+    if triangles is None:
+        return found
+    return [replace(part, mesh=decimated(part.mesh, triangles)) for part in found]
+
+
+def object_part(room: Room, one: RoomObject) -> Part:
+    """An object's mesh in its own frame: upright, along the sides of its box, whose base has its middle at 0."""
+    T_room_part = np.eye(4)
+    T_room_part[:3, :3] = one.box.rotation
+    T_room_part[:3, 3] = one.box.center - (0.0, 0.0, one.box.extent[2] / 2)
+    mesh = _submesh(room.mesh, _marked(room.mesh, [one]).astype(np.bool_))
+    placed = transform(inverse(T_room_part), mesh.vertices.astype(np.float64)).astype(np.float32)
+    return Part(replace(mesh, vertices=placed), T_room_part, one)
+
+
+def rest(room: Room) -> Part:
+    """What is of none of the room's objects, with the triangles between them, so that there is no gap."""
+    owner = _marked(room.mesh, room.objects)
+    corners = owner[room.mesh.triangles]
+    outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)
+    used = np.zeros(len(owner), np.bool_)
+    used[room.mesh.triangles[outside]] = True
+    return Part(_submesh(room.mesh, used | (owner == 0), outside), np.eye(4), None)
+
+
+def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
+    """(V,) the number of the object that each vertex is of, from 1; 0 = none."""
+    owner = np.zeros(len(mesh.vertices), np.int32)
+    for number, one in enumerate(objects, start=1):
+        owner[one.vertices] = number
+    return owner
+
+
+def _submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
+    """The vertices (V,) that are kept, and of the triangles (F,), None = all, those between them."""
+    number = np.cumsum(kept, dtype=np.int32) - 1
+    chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
+    return InstanceMesh(
+        mesh.vertices[kept],
+        number[mesh.triangles[chosen]].astype(np.int32),
+        mesh.colors[kept],
+        mesh.instance_ids[kept],
+        mesh.class_ids[kept],
+        mesh.classes,
+    )
+
+
+def _with_fewer(found: list[Part], triangles: int | None) -> list[Part]:
+    total = sum(len(part.mesh.triangles) for part in found)
+    if triangles is None or total <= triangles:
+        return found
+    share = triangles / total
+    return [replace(part, mesh=decimated(part.mesh, round(share * len(part.mesh.triangles)))) for part in found]

@@ -1,0 +1,147 @@
+"""Where a robot may drive, by what a run saw: free, occupied, or unknown.
+
+A map keeps the air only near to surfaces: blocks of voxels are allocated along the truncation band of what was
+measured, and no others, so that `map.npz` does not tell of most of the room whether it is empty. What does tell are the
+cameras: what stands before the surface that one of them saw, it has looked through. So the surface is drawn from poses
+spread over the whole trajectory, and a place is free where all of this holds:
+
+- the floor was seen there,
+- nothing of the surface is between `CLEARANCE` and the robot's height above it,
+- all of the air between these was looked through, from one of the poses.
+
+Occupied is where something of the surface is between these heights, all else is unknown. The camera's own field of
+view is not in a run's record: that of `object_changes.EYE`, a Kinect, stands for it. What no depth camera sees, such as
+glass and mirrors, is not in the map, and the place may then be called free; what moves was mapped where it was.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from framework.data import Bool, Float64, Int32, Int64
+from framework.errors import DataError
+from framework.exporting.room import Room
+from framework.exporting.surface_points import SurfacePoints, surface_points
+from framework.geometry import inverse, project, transform
+from framework.object_changes import EYE, LOOKS
+from framework.rendering.rasterizer import Rasterizer
+
+CLEARANCE = 0.08  # m above the floor, below which nothing counts: floors are noisy by some cm
+LEVEL_STEP = 0.1  # m, of the heights at which the air is asked
+SLACK = 0.03  # m, that a surface must lie behind a place to be seen through it
+FARTHEST = 5.0  # m, that a camera measures: the default of fuser.max_depth
+WALL_SPAN = 1.0  # m of height, of an upright surface of no object: so much of it is a wall
+MOST_CELLS = 2**24  # of a plan
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A grid over the floor, seen from above. Row 0 has the lowest y, column 0 the lowest x."""
+
+    resolution: float  # m, > 0, the side of a cell
+    origin: Float64  # (2,) m, the lower left corner of the first cell
+    occupied: Bool  # (H, W)
+    free: Bool  # (H, W)
+    floor: Bool  # (H, W) where the floor was seen
+    wall: Bool  # (H, W)
+    highest: Int32  # (H, W) the id of the object whose surface is the highest there, 0 = none
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return self.free.shape[0], self.free.shape[1]
+
+    def cells(self, xy: Float64) -> Int64:
+        """(P, 2) row and column of points (P, 2) m; those outside get the nearest cell."""
+        columns, rows = np.floor((xy - self.origin) / self.resolution).astype(np.int64).T
+        return np.stack([np.clip(rows, 0, self.shape[0] - 1), np.clip(columns, 0, self.shape[1] - 1)], axis=1)
+
+    @property
+    def extent(self) -> tuple[float, float, float, float]:
+        """m: lowest and highest x, lowest and highest y."""
+        rows, columns = self.shape
+        x, y = self.origin.tolist()
+        return x, x + columns * self.resolution, y, y + rows * self.resolution
+
+
+def plan(room: Room, resolution: float, robot_height: float) -> Plan:
+    """The floor of a room, whose height is known, with cells of `resolution` m, for a robot of `robot_height` m.
+
+    Raises DataError where nothing was mapped, or there are too many cells.
+    """
+    found = surface_points(room, resolution / 2)
+    if not len(found.points):
+        raise DataError("nothing was mapped: there is no floor to plan")
+    low, high = found.points[:, :2].min(axis=0).astype(np.float64), found.points[:, :2].max(axis=0).astype(np.float64)
+    origin = (np.floor(low / resolution) - 1) * resolution
+    columns, rows = (np.floor((high - origin) / resolution) + 2).astype(np.int64).tolist()
+    if rows * columns > MOST_CELLS:
+        raise DataError(f"a plan of {columns} x {rows} cells is too large: raise the resolution of {resolution:g} m")
+    number = _cell_numbers(found, origin, resolution, columns)
+    heights = found.points[:, 2]
+
+    def any_of(chosen: Bool) -> Bool:
+        return np.asarray(np.bincount(number[chosen], minlength=rows * columns) > 0).reshape(rows, columns)
+
+    occupied = any_of((heights > CLEARANCE) & (heights < robot_height))
+    floor = any_of((np.abs(heights) <= CLEARANCE) & found.level)
+    wall = _walls(found, number, rows * columns).reshape(rows, columns)
+    highest = _highest(found, number, rows * columns).reshape(rows, columns)
+    drawn = Plan(resolution, origin, occupied, np.zeros_like(floor), floor, wall, highest)
+    return replace(drawn, free=_free(room, drawn, robot_height))
+
+
+def _free(room: Room, drawn: Plan, robot_height: float) -> Bool:
+    """(H, W), see the module."""
+    free = drawn.floor & ~drawn.occupied
+    rows, columns = np.nonzero(free)
+    levels = np.arange(CLEARANCE, robot_height, LEVEL_STEP) + LEVEL_STEP / 2
+    levels = np.minimum(levels, robot_height)
+    xy = (np.stack([columns, rows], axis=1) + 0.5) * drawn.resolution + drawn.origin
+    places = np.concatenate([np.repeat(xy, len(levels), axis=0), np.tile(levels, len(xy))[:, None]], axis=1)
+    free[rows, columns] = looked_through(room, places).reshape(-1, len(levels)).all(axis=1)
+    return free
+
+
+def looked_through(room: Room, places: Float64) -> Bool:
+    """(P,) whether a camera of the run saw a surface behind a place (P, 3) m of the room, and none before it."""
+    through = np.zeros(len(places), np.bool_)
+    rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)
+    for k in np.unique(np.linspace(0, len(room.poses) - 1, LOOKS).round().astype(int)) if len(room.poses) else []:
+        asked = np.flatnonzero(~through)
+        if not len(asked):
+            break
+        depth = rasterizer.draw(EYE, room.poses[k]).depth
+        in_camera = transform(inverse(room.poses[k]), places[asked])
+        ahead = np.flatnonzero(in_camera[:, 2] > 0)
+        u, v = np.rint(project(EYE, in_camera[ahead])).T
+        inside = (u >= 0) & (u < EYE.width) & (v >= 0) & (v < EYE.height)
+        at = ahead[inside]
+        surface = depth[v[inside].astype(np.int64), u[inside].astype(np.int64)]
+        through[asked[at[(surface > in_camera[at, 2] + SLACK) & (surface < FARTHEST)]]] = True
+    return through
+
+
+def _cell_numbers(found: SurfacePoints, origin: Float64, resolution: float, columns: int) -> Int64:
+    """(P,) the number of the cell that each point is over."""
+    column, row = np.floor((found.points[:, :2] - origin) / resolution).astype(np.int64).T
+    return np.asarray(row * columns + column)
+
+
+def _walls(found: SurfacePoints, number: Int64, cells: int) -> Bool:
+    """(cells,) where upright surface of no object is at so many heights that they are WALL_SPAN together."""
+    chosen = found.upright & (found.owner == 0)
+    step = np.floor(found.points[chosen, 2] / LEVEL_STEP).astype(np.int64)
+    lowest, highest = step.min(initial=0), step.max(initial=0)
+    filled = np.unique(number[chosen] * (highest - lowest + 1) + step - lowest) // (highest - lowest + 1)
+    return np.asarray(np.bincount(filled, minlength=cells) * LEVEL_STEP >= WALL_SPAN)
+
+
+def _highest(found: SurfacePoints, number: Int64, cells: int) -> Int32:
+    """(cells,) see Plan."""
+    chosen = np.flatnonzero(found.owner > 0)
+    rising = chosen[np.argsort(found.points[chosen, 2], kind="stable")]
+    ids = np.zeros(cells, np.int32)
+    ids[number[rising]] = found.owner[rising]  # of several writes, the last one stays
+    return ids

@@ -1,0 +1,117 @@
+"""Rooms: the known floor of a plan, cut where walls leave no more than a door between them.
+
+What lies farther than half a door from every wall is the inside of rooms; its connected pieces grow back towards each
+other and meet in the doors. Only walls cut: furniture and places that nobody saw do not. So where walls were hardly
+seen there is one room.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+from scipy import ndimage
+
+from framework.data import Bool, Float64, Int32
+from framework.exporting.occupancy import Plan
+
+DOOR = 1.0  # m, the widest opening that separates rooms; most doors have 0.7 to 0.95
+GAP = 0.3  # m, of what was not seen between known places, that is taken for known
+LEAST_INSIDE = 0.5  # m^2 of a room's inside, farther than DOOR / 2 from its walls
+
+
+@dataclass(frozen=True)
+class Door:
+    """Where two rooms meet."""
+
+    rooms: tuple[int, int]
+    place: Float64  # (2,) m
+    width: float  # m
+
+
+@dataclass(frozen=True)
+class Rooms:
+    """The rooms of a plan, numbered from 1 by falling area."""
+
+    labels: Int32  # (H, W) 0 = of none
+    doors: tuple[Door, ...]
+    plan: Plan
+
+    @property
+    def count(self) -> int:
+        return int(self.labels.max(initial=0))
+
+    def area(self, room: int) -> float:
+        """m^2"""
+        return float(np.count_nonzero(self.labels == room)) * self.plan.resolution**2
+
+    def center(self, room: int) -> Float64:
+        """(2,) m"""
+        return _place(self.plan, self.labels == room)
+
+    def of(self, xy: Float64) -> int:
+        """The room that most of some points (P, 2) m, P > 0, are in or next to; 0 where there is none."""
+        if not self.count:
+            return 0
+        nearest = ndimage.distance_transform_edt(self.labels == 0, return_distances=False, return_indices=True)
+        rows, columns = self.plan.cells(xy).T
+        found = self.labels[nearest[0][rows, columns], nearest[1][rows, columns]]
+        return int(np.bincount(found).argmax())
+
+
+def rooms(plan: Plan) -> Rooms:
+    """The rooms of a plan; none where nothing is known."""
+    known = plan.floor | plan.free | plan.occupied
+    margin = int(np.ceil(GAP / plan.resolution))
+    round_ = _disk(GAP / plan.resolution)
+    closed = ndimage.binary_closing(np.pad(known, margin), round_)[margin:-margin, margin:-margin]
+    domain = closed & ~plan.wall
+    from_walls = ndimage.distance_transform_edt(~plan.wall) * plan.resolution if plan.wall.any() else np.inf
+    inside, count = ndimage.label(domain & (from_walls > DOOR / 2))
+    areas = np.bincount(inside.ravel(), minlength=count + 1)[1:] * plan.resolution**2
+    kept = np.flatnonzero(areas >= LEAST_INSIDE) + 1
+    if len(kept) < 2:
+        return Rooms(domain.astype(np.int32), (), plan)
+    grown = _grown(np.where(np.isin(inside, kept), inside, 0).astype(np.int32), domain)
+    sizes = np.bincount(grown.ravel())
+    number = np.zeros(len(sizes), np.int32)
+    number[sorted(kept.tolist(), key=lambda key: -int(sizes[key]))] = np.arange(1, len(kept) + 1)
+    labels = number[grown]
+    return Rooms(labels, _doors(labels, plan), plan)
+
+
+def _grown(labels: Int32, domain: Bool) -> Int32:
+    """Labels (H, W) that spread over the domain (H, W) cell by cell, until they meet."""
+    cross = ndimage.generate_binary_structure(2, 1)
+    while True:
+        spread = np.where((labels == 0) & domain, ndimage.maximum_filter(labels, footprint=cross), labels)
+        if np.array_equal(spread, labels):
+            return labels
+        labels = spread
+
+
+def _doors(labels: Int32, plan: Plan) -> tuple[Door, ...]:
+    """A door for each connected line along which two rooms meet."""
+    doors = []
+    every = np.ones((3, 3), np.bool_)
+    for a, b in combinations(range(1, int(labels.max()) + 1), 2):
+        beside = (labels == a) & ndimage.binary_dilation(labels == b)
+        lines, count = ndimage.label(beside, every)
+        for k in range(1, count + 1):
+            rows, columns = np.nonzero(lines == k)
+            width = max(np.ptp(rows), np.ptp(columns)) + 1
+            doors.append(Door((a, b), _place(plan, lines == k), float(width * plan.resolution)))
+    return tuple(doors)
+
+
+def _place(plan: Plan, cells: Bool) -> Float64:
+    """(2,) m, the middle of cells (H, W)."""
+    rows, columns = np.nonzero(cells)
+    return np.asarray((np.array([columns.mean(), rows.mean()]) + 0.5) * plan.resolution + plan.origin)
+
+
+def _disk(radius: float) -> Bool:
+    n = int(np.ceil(radius))
+    y, x = np.mgrid[-n : n + 1, -n : n + 1]
+    return np.asarray(x * x + y * y <= radius * radius)

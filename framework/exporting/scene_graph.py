@@ -1,0 +1,90 @@
+"""scene_graph.json: objects, surfaces and rooms, and how they stand to each other; scene_graph.schema.json says how."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from framework.exporting.occupancy import Plan
+from framework.exporting.relations import Relation, relations
+from framework.exporting.room import Room, RoomObject
+from framework.exporting.rooms import Rooms, rooms
+from framework.files.json_file import write_json
+
+DIGITS = 4  # behind the point, of metres
+
+
+def write_scene_graph(path: Path, room: Room, plan: Plan | None) -> None:
+    """Writes the graph of a room; without a plan, as where the floor is not known, without floor, walls and rooms."""
+    write_json(path, scene_graph(room, plan))
+
+
+def scene_graph(room: Room, plan: Plan | None) -> dict[str, Any]:
+    """The graph as JSON has it."""
+    divided = rooms(plan) if plan is not None else None
+    nodes = [_object_node(one) for one in room.objects]
+    edges = _edges(room, relations(room, plan))
+    if divided is not None:
+        nodes += [{"id": "floor", "kind": "floor"}, {"id": "walls", "kind": "walls"}, *_room_nodes(divided)]
+        edges += _room_edges(room, divided)
+    return {"T_room_world": room.T_room_world.tolist(), "nodes": nodes, "edges": edges}
+
+
+def _object_node(one: RoomObject) -> dict[str, Any]:
+    return {
+        "id": one.name,
+        "kind": "object",
+        "instance": one.id,
+        "class": one.class_name,
+        "probability": one.probability,
+        "confidence": one.confidence,
+        "obb": {
+            "center": np.round(one.box.center, DIGITS).tolist(),
+            "extent": np.round(one.box.extent, DIGITS).tolist(),
+            "rotation": one.box.rotation.tolist(),
+        },
+    }
+
+
+def _room_nodes(divided: Rooms) -> list[dict[str, Any]]:
+    return [
+        {
+            "id": f"room_{k}",
+            "kind": "room",
+            "area": round(divided.area(k), DIGITS),
+            "center": np.round(divided.center(k), DIGITS).tolist(),
+        }
+        for k in range(1, divided.count + 1)
+    ]
+
+
+def _edges(room: Room, found: list[Relation]) -> list[dict[str, Any]]:
+    names: dict[int | str, str] = {one.id: one.name for one in room.objects}
+    return [
+        {
+            "source": names[one.source],
+            "relation": one.name,
+            "target": names.get(one.target, str(one.target)),
+            **{key: round(value, DIGITS) for key, value in one.measures.items()},
+        }
+        for one in found
+    ]
+
+
+def _room_edges(room: Room, divided: Rooms) -> list[dict[str, Any]]:
+    """Which room each object is in, and which rooms have a door between them."""
+    inside = [(one, divided.of(room.mesh.vertices[one.vertices, :2].astype(np.float64))) for one in room.objects]
+    placed = [{"source": one.name, "relation": "in", "target": f"room_{k}"} for one, k in inside if k]
+    doors = [
+        {
+            "source": f"room_{door.rooms[0]}",
+            "relation": "door",
+            "target": f"room_{door.rooms[1]}",
+            "place": np.round(door.place, DIGITS).tolist(),
+            "width": round(door.width, DIGITS),
+        }
+        for door in divided.doors
+    ]
+    return placed + doors

@@ -1,0 +1,172 @@
+"""Universal Scene Description for simulators: visible meshes, collision proxies and semantic labels.
+
+    /World                      kind = assembly, z up, metres
+      PhysicsScene              gravity
+      room                      the rest of the room: its own triangles collide, as what stands fast
+      chair_7                   kind = component; UsdSemantics label "class"; UsdPhysics rigid body, not enabled
+        visual                  Mesh with displayColor, linear
+        collision               Mesh (convex hull) or Cube, purpose = guide
+
+An object stands on the origin of its own prim. It stays where it is until `physics:rigidBodyEnabled` is set.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from framework.data import Float32, Int32, UInt8
+from framework.errors import DataError
+from framework.exporting.coloring import Coloring, linear, part_colors
+from framework.exporting.object_meshes import Part
+from framework.files.whole_files import written_whole
+
+MISSING = "USD files need the package usd-core: pip install instancemap[usd]"
+NOT_WRITTEN = "USD could not; the disk may be full"
+THINNEST = 0.002  # m, of a box that things collide with: what was seen from one side may be flat
+GRAVITY = 9.81  # m/s^2
+
+
+class Collision(Enum):
+    """What an object collides by."""
+
+    HULL = "hull"  # its convex hull, or its box where it is flat
+    BOX = "box"
+
+
+def check_usd() -> None:
+    """Raises DataError, which says what to install, where USD is not."""
+    try:
+        import pxr  # noqa: F401
+    except ImportError as error:
+        raise DataError(MISSING) from error
+
+
+def write_usd(
+    path: Path,
+    parts: Sequence[Part],
+    coloring: Coloring = Coloring.APPEARANCE,
+    collision: Collision = Collision.HULL,
+) -> None:
+    """Writes parts as one stage, each where it stands; the same parts give the same bytes.
+
+    Raises DataError where usd-core is not installed, or the disk does not take the file.
+    """
+    check_usd()
+    from pxr import Gf, Kind, Tf, Usd, UsdGeom, UsdPhysics
+
+    stage = Usd.Stage.CreateInMemory()
+    UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    UsdPhysics.SetStageKilogramsPerUnit(stage, 1.0)
+    world = UsdGeom.Xform.Define(stage, "/World")
+    Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
+    stage.SetDefaultPrim(world.GetPrim())
+    physics = UsdPhysics.Scene.Define(stage, "/World/PhysicsScene")
+    physics.CreateGravityDirectionAttr(Gf.Vec3f(0, 0, -1))
+    physics.CreateGravityMagnitudeAttr(GRAVITY)
+    for part, colors in zip(parts, part_colors(parts, coloring), strict=True):
+        if part.object is None:
+            _add_rest(stage, part, colors)
+        else:
+            _add_object(stage, part, colors, collision)
+    with written_whole(path) as temporary:
+        try:
+            written = stage.GetRootLayer().Export(str(temporary))
+        except Tf.ErrorException as error:
+            raise OSError(NOT_WRITTEN) from error
+        if not written:
+            raise OSError(NOT_WRITTEN)
+
+
+def _add_rest(stage: Any, part: Part, colors: UInt8) -> None:
+    from pxr import UsdPhysics
+
+    if not len(part.mesh.triangles):
+        return
+    mesh = _add_mesh(stage, f"/World/{part.name}", part.mesh.vertices, part.mesh.triangles)
+    _color(mesh, colors)
+    UsdPhysics.CollisionAPI.Apply(mesh.GetPrim())
+    UsdPhysics.MeshCollisionAPI.Apply(mesh.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.none)
+
+
+def _add_object(stage: Any, part: Part, colors: UInt8, collision: Collision) -> None:
+    from pxr import Gf, Kind, Usd, UsdGeom, UsdPhysics, UsdSemantics, Vt
+
+    one = part.object
+    assert one is not None
+    root = UsdGeom.Xform.Define(stage, f"/World/{part.name}")
+    prim = root.GetPrim()
+    root.AddTransformOp().Set(Gf.Matrix4d(part.T_room_part.T.tolist()))  # rows there are columns here
+    Usd.ModelAPI(prim).SetKind(Kind.Tokens.component)
+    UsdSemantics.LabelsAPI.Apply(prim, "class").CreateLabelsAttr(Vt.TokenArray([one.class_name]))
+    prim.SetCustomDataByKey("instancemap:id", one.id)
+    prim.SetCustomDataByKey("instancemap:confidence", one.confidence)
+    if one.probability is not None:
+        prim.SetCustomDataByKey("instancemap:probability", one.probability)
+    UsdPhysics.RigidBodyAPI.Apply(prim).CreateRigidBodyEnabledAttr(False)
+    if len(part.mesh.triangles):
+        _color(_add_mesh(stage, f"{prim.GetPath()}/visual", part.mesh.vertices, part.mesh.triangles), colors)
+    _add_proxy(stage, f"{prim.GetPath()}/collision", part.mesh.vertices, collision)
+
+
+def _add_proxy(stage: Any, path: str, vertices: Float32, collision: Collision) -> None:
+    """What an object collides by, which is not rendered."""
+    from pxr import Gf, UsdGeom, UsdPhysics
+
+    hull = convex_hull(vertices) if collision is Collision.HULL else None
+    if hull is not None:
+        shape = _add_mesh(stage, path, *hull)
+        UsdPhysics.MeshCollisionAPI.Apply(shape.GetPrim()).CreateApproximationAttr(UsdPhysics.Tokens.convexHull)
+    else:
+        low, high = vertices.min(axis=0).astype(np.float64), vertices.max(axis=0).astype(np.float64)
+        shape = UsdGeom.Cube.Define(stage, path)
+        shape.CreateSizeAttr(1.0)
+        shape.CreateExtentAttr([(-0.5, -0.5, -0.5), (0.5, 0.5, 0.5)])
+        shape.AddTranslateOp().Set(Gf.Vec3d(*((low + high) / 2).tolist()))
+        shape.AddScaleOp().Set(Gf.Vec3f(*np.maximum(high - low, THINNEST).tolist()))
+    shape.CreatePurposeAttr(UsdGeom.Tokens.guide)
+    UsdPhysics.CollisionAPI.Apply(shape.GetPrim())
+
+
+def _add_mesh(stage: Any, path: str, vertices: Float32, triangles: Int32) -> Any:
+    from pxr import UsdGeom, Vt
+
+    mesh = UsdGeom.Mesh.Define(stage, path)
+    mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(vertices, np.float32)))
+    mesh.CreateFaceVertexCountsAttr(Vt.IntArray.FromNumpy(np.full(len(triangles), 3, np.int32)))
+    mesh.CreateFaceVertexIndicesAttr(Vt.IntArray.FromNumpy(np.ascontiguousarray(triangles.ravel(), np.int32)))
+    mesh.CreateExtentAttr([tuple(vertices.min(axis=0).tolist()), tuple(vertices.max(axis=0).tolist())])
+    mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
+    return mesh
+
+
+def _color(mesh: Any, colors: UInt8) -> None:
+    from pxr import UsdGeom, Vt
+
+    display = mesh.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
+    display.Set(Vt.Vec3fArray.FromNumpy(np.ascontiguousarray(linear(colors))))
+
+
+def convex_hull(vertices: Float32) -> tuple[Float32, Int32] | None:
+    """The vertices (H, 3) and the triangles, facing out, of the convex hull of points (M, 3) m.
+
+    None of what spans none: fewer than four points, or points in a plane.
+    """
+    try:
+        hull = ConvexHull(vertices.astype(np.float64))
+    except (QhullError, ValueError):
+        return None
+    points, outward = vertices[hull.vertices], hull.equations[:, :3]
+    number = np.zeros(len(vertices), np.int32)
+    number[hull.vertices] = np.arange(len(hull.vertices), dtype=np.int32)
+    a, b, c = (vertices[hull.simplices[:, k]].astype(np.float64) for k in range(3))
+    inward = (np.cross(b - a, c - a) * outward).sum(axis=1) < 0
+    triangles = number[hull.simplices]
+    triangles[inward] = triangles[inward][:, ::-1]
+    return points, triangles

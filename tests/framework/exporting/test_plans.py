@@ -1,0 +1,385 @@
+"""Floor plans, ROS maps and scene graphs of rooms whose every centimetre is known."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+import yaml
+from PIL import Image
+
+from framework.errors import DataError
+from framework.exporting import occupancy, scene_graph
+from framework.exporting.export import Chosen, Format, export
+from framework.exporting.occupancy import Plan, looked_through, plan
+from framework.exporting.relations import relations
+from framework.exporting.room import Room, read_room
+from framework.exporting.rooms import rooms
+from framework.exporting.ros_map import FREE, OCCUPIED, UNKNOWN, levels
+from framework.exporting.surface_points import middles, surface_points
+from framework.rendering.viewpoint import looking
+from tests.scenes.exported_room import CUBE, TABLE, Y_UP, Block, ExportedRoom
+
+SCHEMA = json.loads((Path(scene_graph.__file__).parent / "scene_graph.schema.json").read_text())
+RESOLUTION = 0.1
+OFF = 0.05  # m, by which the room is moved along x and y, so that no wall stands between two cells
+
+
+def stored(tmp_path: Path, **scene: object) -> Room:
+    return read_room(ExportedRoom(**scene).write(tmp_path / "run"))  # type: ignore[arg-type]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ExportedRoom(shift=(OFF, OFF, 0.0)).write(tmp_path_factory.mktemp("runs") / "room")
+
+
+@pytest.fixture(scope="module")
+def room(run: Path) -> Room:
+    return read_room(run)
+
+
+@pytest.fixture(scope="module")
+def low(room: Room) -> Plan:
+    """For a robot that drives under the table."""
+    return plan(room, RESOLUTION, 0.5)
+
+
+@pytest.fixture(scope="module")
+def high(room: Room) -> Plan:
+    return plan(room, RESOLUTION, 1.0)
+
+
+def at(found: Plan, x: float, y: float) -> tuple[bool, bool]:
+    """Whether a place is occupied, and free."""
+    [[row, column]] = found.cells(np.array([[x + OFF, y + OFF]]))
+    return bool(found.occupied[row, column]), bool(found.free[row, column])
+
+
+def told(found: list, source: int) -> list[tuple[str, int | str]]:
+    return [(relation.name, relation.target) for relation in found if relation.source == source]
+
+
+@pytest.mark.parametrize("n", [1, 2, 5])
+def test_pieces_of_a_triangle_are_equal(n: int) -> None:
+    weights = middles(n)
+    assert weights.shape == (n * n, 3)
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    np.testing.assert_allclose(weights.mean(axis=0), 1 / 3)
+    assert weights.min() > 0
+
+
+def test_surface_points_are_of_their_objects_and_as_near_as_asked(room: Room) -> None:
+    found = surface_points(room, 0.02)
+    cube = found.points[found.owner == 2]
+    np.testing.assert_allclose(cube.min(axis=0), (1.25, 1.25, 0.75), atol=0.01)
+    np.testing.assert_allclose(cube.max(axis=0), (1.45, 1.45, 0.95), atol=0.01)
+    top = found.points[(found.owner == 2) & found.level]
+    np.testing.assert_allclose(top[:, 2], 0.95, atol=1e-5)
+    with pytest.raises(DataError, match="raise the resolution"):
+        surface_points(room, 1e-5)
+
+
+def test_cells_are_occupied_where_something_stands(low: Plan, high: Plan) -> None:
+    inside = (slice(2, -2),) * 2
+    assert low.shape == (33, 43)  # 3 x 4 m, and a margin
+    assert at(low, 0.825, 1.025) == (True, False)  # a leg
+    assert at(low, 1.4, 1.4) == (False, False)  # under the table, where no camera looked through
+    assert at(high, 1.4, 1.4) == (True, False)
+    legs = [(0.825, 1.025), (1.975, 1.025), (0.825, 1.775), (1.975, 1.775)]
+    assert all(at(low, *leg)[0] for leg in legs)
+    assert 4 <= low.occupied[inside].sum() <= 16  # a leg of 5 cm is in one to four cells
+    table = high.occupied[inside].sum() * RESOLUTION**2
+    assert 1.2 * 0.8 <= table <= 1.4 * 1.0  # and what of cells its edges touch
+    assert low.occupied[1, 1:-1].all()
+    assert not low.occupied[0].any()
+
+
+def test_who_looks_under_the_table_knows_that_it_is_free_there(tmp_path: Path) -> None:
+    low = plan(stored(tmp_path, shift=(OFF, OFF, 0.0), eyes=((3.5, 1.4, 0.3), (0.3, 1.4, 0.3))), RESOLUTION, 0.5)
+    assert at(low, 1.4, 1.4) == (False, True)
+
+
+def test_the_highest_object_of_a_cell_is_what_is_seen_from_above(low: Plan, tmp_path: Path) -> None:
+    """In whichever order they are."""
+    turned = plan(stored(tmp_path, things={"cube": CUBE, "table": TABLE}, shift=(OFF, OFF, 0.0)), RESOLUTION, 0.5)
+    for (x, y), key in (((1.3, 1.3), 2), ((1.0, 1.2), 1), ((3.5, 1.0), 0)):
+        [[row, column]] = low.cells(np.array([[x + OFF, y + OFF]]))
+        assert low.highest[row, column] == key
+        assert turned.highest[row, column] == (0, 2, 1)[key]
+
+
+def test_walls_are_where_they_stand(low: Plan) -> None:
+    assert low.wall[1:-1, [1, -2]].all()
+    assert low.wall[[1, -2], 1:-1].sum() >= 76  # but behind the picture
+    assert low.wall.sum() == low.wall[1:-1, [1, -2]].sum() + low.wall[[1, -2], 2:-2].sum()
+
+
+def test_free_is_what_was_looked_through_above_a_floor_that_was_seen(room: Room, low: Plan) -> None:
+    open_floor = low.floor & ~low.occupied
+    assert low.free[open_floor].mean() > 0.95
+    assert not (low.free & ~open_floor).any()
+    blind = plan(replace(room, poses=room.poses[:0]), RESOLUTION, 0.5)
+    assert not blind.free.any()
+    np.testing.assert_array_equal(blind.occupied, low.occupied)
+
+
+def test_places_behind_a_surface_were_not_looked_through(room: Room) -> None:
+    """From one camera before a wall of the table's height, exactly on its optical axis and beyond."""
+    pose = np.eye(4)
+    pose[:3, :3] = looking(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+    pose[:3, 3] = (0.4, 1.35, 0.85)
+    places = np.array([(0.8, 1.35, 0.85), (1.15, 1.35, 0.85), (1.35, 1.35, 0.85), (1.8, 1.35, 0.85), (0.2, 1.35, 0.85)])
+    seen = looked_through(replace(room, poses=pose[None]), places)
+    assert seen.tolist() == [True, True, False, False, False]  # before the cube; in it, behind it, behind the camera
+
+
+def test_what_the_ros_map_says_is_what_map_server_reads(run: Path, low: Plan, tmp_path: Path) -> None:
+    written = export(run, [Format.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
+    assert [path.name for path in written] == ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
+    said = yaml.safe_load((tmp_path / "map.yaml").read_text())
+    image = Image.open(tmp_path / said["image"])
+    assert (image.format, image.mode, image.size) == ("PPM", "L", (43, 33))
+    grey = np.asarray(image)
+    np.testing.assert_array_equal(grey, levels(low))
+    # map_server: p = (255 - grey) / 255; occupied above one threshold, free below the other
+    p = (255 - grey.astype(float)) / 255
+    assert {level: bool(p[grey == level].max() < said["free_thresh"]) for level in (FREE, UNKNOWN, OCCUPIED)} == {
+        FREE: True,
+        UNKNOWN: False,
+        OCCUPIED: False,
+    }
+    assert (p[grey == OCCUPIED] > said["occupied_thresh"]).all()
+    assert (p[grey == UNKNOWN] < said["occupied_thresh"]).all()
+    # the pixel of a leg, by the origin of the lower left corner
+    x, y, turn = said["origin"]
+    assert turn == 0
+    column, row = int((0.825 + OFF - x) / said["resolution"]), int((1.025 + OFF - y) / said["resolution"])
+    assert grey[len(grey) - 1 - row, column] == OCCUPIED
+
+
+def test_footprints_are_polygons_in_metres(run: Path, tmp_path: Path) -> None:
+    export(run, [Format.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION))
+    found = json.loads((tmp_path / "floor_plan.geojson").read_text())
+    assert found["type"] == "FeatureCollection"
+    assert "not longitude and latitude" in found["coordinates_are"]
+    assert "crs" not in found
+    table, cube, _ = found["features"]
+    [ring] = cube["geometry"]["coordinates"]
+    assert ring[0] == ring[-1]
+    x, y = np.array(ring).T
+    assert float(np.sum(x[:-1] * y[1:] - x[1:] * y[:-1]) / 2) == pytest.approx(0.04, abs=1e-4)  # counterclockwise
+    assert (min(x), max(x), min(y), max(y)) == pytest.approx((1.25, 1.45, 1.25, 1.45), abs=1e-4)
+    assert cube["properties"]["class"] == "cube"
+    assert (table["properties"]["base"], table["properties"]["top"]) == pytest.approx((0, 0.75), abs=1e-4)
+
+
+def test_the_plan_is_a_picture_of_the_room(run: Path, tmp_path: Path) -> None:
+    export(run, [Format.FLOORPLAN], tmp_path / "a", Chosen(resolution=RESOLUTION))
+    export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path / "b", Chosen(resolution=RESOLUTION))
+    for name in ("floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+    image = np.asarray(Image.open(tmp_path / "a" / "floor_plan.png").convert("RGB"))
+    assert image.shape[1] > 1200
+    assert len(np.unique(image.reshape(-1, 3), axis=0)) > 50  # tones, objects, letters
+
+
+@pytest.mark.filterwarnings("error")
+def test_any_name_can_be_written_on_a_plan(tmp_path: Path) -> None:
+    names = ("日本 $x_1$", "a" * 3000, "")
+    run = ExportedRoom().write(tmp_path / "run")
+    entries = json.loads((run / "instances.json").read_text())
+    for entry, name in zip(entries, names, strict=True):
+        entry["class"] = name
+    (run / "instances.json").write_text(json.dumps(entries))
+    export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
+    found = json.loads((tmp_path / "scene_graph.json").read_text())
+    jsonschema.validate(found, SCHEMA)
+    assert tuple(node["class"] for node in found["nodes"][:3]) == names
+
+
+def test_a_room_without_objects_has_a_plan(tmp_path: Path) -> None:
+    run = ExportedRoom().write(tmp_path / "run")
+    (run / "instances.json").unlink()
+    assert len(export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))) == 5
+    found = json.loads((tmp_path / "scene_graph.json").read_text())
+    assert [node["kind"] for node in found["nodes"]] == ["floor", "walls", "room"]
+    assert found["edges"] == []
+
+
+def test_a_cube_is_on_the_table_and_the_table_on_the_floor(room: Room, low: Plan) -> None:
+    found = relations(room, low)
+    assert told(found, 2) == [("on", 1)]
+    assert told(found, 1) == [("on", "floor")]
+    assert told(found, 3) == [("attached_to", "walls")]
+    assert next(one for one in found if one.source == 2).measures["height"] == pytest.approx(0.75, abs=0.02)
+    without = relations(room, None)
+    assert told(without, 2) == [("on", 1)]
+    assert told(without, 1) == told(without, 3) == []
+
+
+def test_what_is_stacked_is_on_the_upper_one(tmp_path: Path) -> None:
+    """The lower one's top is not seen: it has none in the mesh."""
+    lower, upper = (1.2, 1.2, 0.75, 1.4, 1.4, 0.85), (1.2, 1.2, 0.85, 1.4, 1.4, 0.95)
+    room = stored(tmp_path, things={"dining table": TABLE, "book": [lower], "other": [upper]})
+    found = relations(room, None)
+    assert told(found, 2) == [("on", 1)]
+    assert told(found, 3) == [("on", 2)]
+
+
+def test_things_on_one_table_are_next_to_each_other(tmp_path: Path) -> None:
+    things = {
+        "dining table": TABLE,
+        "book": [(1.0, 1.2, 0.75, 1.2, 1.4, 0.79)],
+        "cup": [(1.4, 1.2, 0.75, 1.5, 1.3, 0.85)],
+        "far": [(3.2, 0.4, 0.0, 3.6, 0.8, 0.5)],
+    }
+    found = relations(stored(tmp_path, things=things), None)
+    assert told(found, 2) == [("on", 1), ("next_to", 3)]
+    assert told(found, 3) == [("on", 1)]
+    gap = next(one.measures["distance"] for one in found if one.name == "next_to")
+    assert gap == pytest.approx(0.2, abs=0.03)
+    assert not [one for one in found if 4 in (one.source, one.target)]
+
+
+CUPBOARD: list[Block] = [
+    (1.0, 2.6, 0.0, 1.02, 3.0, 1.0),
+    (1.98, 2.6, 0.0, 2.0, 3.0, 1.0),
+    (1.0, 2.98, 0.0, 2.0, 3.0, 1.0),
+    *((1.02, 2.6, z, 1.98, 2.98, z + 0.02) for z in (0.0, 0.5, 0.98)),
+]
+
+
+def test_what_a_cupboard_or_a_box_holds_is_in_it(tmp_path: Path) -> None:
+    box: list[Block] = [
+        (2.6, 0.6, 0.0, 3.2, 1.2, 0.02),
+        (2.6, 0.6, 0.0, 2.62, 1.2, 0.5),
+        (3.18, 0.6, 0.0, 3.2, 1.2, 0.5),
+        (2.62, 0.6, 0.0, 3.18, 0.62, 0.5),
+        (2.62, 1.18, 0.0, 3.18, 1.2, 0.5),
+    ]
+    things = {
+        "cupboard": CUPBOARD,
+        "book": [(1.4, 2.7, 0.52, 1.6, 2.9, 0.75)],
+        "box": box,
+        "ball": [(2.8, 0.8, 0.02, 3.0, 1.0, 0.22)],
+        "vase": [(1.4, 2.7, 1.0, 1.5, 2.8, 1.2)],
+    }
+    found = relations(stored(tmp_path, things=things), None)
+    assert told(found, 2) == [("in", 1)]
+    assert told(found, 4) == [("in", 3)]
+    assert told(found, 5) == [("on", 1)]
+
+
+SEAT: list[Block] = [(1.0, 1.0, 0.0, 2.0, 1.8, 0.4), (1.0, 1.7, 0.4, 2.0, 1.8, 0.9)]
+ARMS: list[Block] = [(1.0, 1.0, 0.4, 1.1, 1.7, 0.7), (1.9, 1.0, 0.4, 2.0, 1.7, 0.7)]
+
+
+@pytest.mark.parametrize("seat", [SEAT, SEAT + ARMS])
+def test_a_pillow_is_on_a_chair_and_not_in_it(seat: list[Block], tmp_path: Path) -> None:
+    """Whose top is not what it stands on."""
+    things = {"couch": seat, "pillow": [(1.3, 1.3, 0.4, 1.7, 1.6, 0.6)]}
+    assert told(relations(stored(tmp_path, things=things), None), 2) == [("on", 1)]
+
+
+def test_a_bag_under_a_table_is_not_in_it(tmp_path: Path) -> None:
+    things = {"dining table": TABLE, "bag": [(1.2, 1.2, 0.0, 1.5, 1.5, 0.3)]}
+    room = stored(tmp_path, things=things)
+    assert told(relations(room, plan(room, RESOLUTION, 0.5)), 2) == [("on", "floor")]
+
+
+def test_the_graph_keeps_its_schema(run: Path, tmp_path: Path) -> None:
+    jsonschema.Draft202012Validator.check_schema(SCHEMA)
+    [path] = export(run, [Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
+    graph = json.loads(path.read_text())
+    jsonschema.validate(graph, SCHEMA)
+    names = [node["id"] for node in graph["nodes"]]
+    assert names == ["dining_table_1", "cube_2", "picture_3", "floor", "walls", "room_1"]
+    edges = {(edge["source"], edge["relation"], edge["target"]) for edge in graph["edges"]}
+    assert ("cube_2", "on", "dining_table_1") in edges
+    assert ("cube_2", "in", "room_1") in edges
+    assert all(edge[0] in names and edge[2] in names for edge in edges)
+    assert graph["nodes"][-1]["area"] == pytest.approx(12, rel=0.1)
+    np.testing.assert_allclose(graph["nodes"][1]["obb"]["center"], (1.35, 1.35, 0.85), atol=1e-3)
+
+
+def divided(door: float) -> list[Block]:
+    """Two rooms of 4 x 3 m, as their walls are seen from inside, and what is between them at a door of some width."""
+    low, high = 1.5 - door / 2, 1.5 + door / 2
+    return [(4.0, 0.0, 0.0, 4.1, low, 2.5), (4.0, high, 0.0, 4.1, 3.0, 2.5)]
+
+
+TWO_ROOMS = {
+    "things": {"dining table": TABLE, "bed": [(6.0, 1.0, 0.0, 7.9, 2.5, 0.5)]},
+    "walls": [(0, 0, 0, 8, 3, 2.5)],
+    "eyes": ((0.4, 0.4, 1.5), (3.5, 2.5, 1.5), (4.6, 0.4, 1.5), (7.5, 2.6, 1.5)),
+}
+
+
+def test_a_door_separates_two_rooms(tmp_path: Path) -> None:
+    run = ExportedRoom(**TWO_ROOMS, blocks=divided(0.9), R_world_room=Y_UP).write(tmp_path / "run")  # type: ignore[arg-type]
+    [path] = export(run, [Format.GRAPH])
+    graph = json.loads(path.read_text())
+    jsonschema.validate(graph, SCHEMA)
+    assert [node["id"] for node in graph["nodes"] if node["kind"] == "room"] == ["room_1", "room_2"]
+    of = {edge["source"]: edge["target"] for edge in graph["edges"] if edge["target"].startswith("room")}
+    assert {of["dining_table_1"], of["bed_2"]} == {"room_1", "room_2"}
+    [door] = [edge for edge in graph["edges"] if edge["relation"] == "door"]
+    assert door["place"] == pytest.approx([4.05, 1.5], abs=0.15)
+    assert door["width"] == pytest.approx(0.9, abs=0.15)
+    areas = [node["area"] for node in graph["nodes"] if node["kind"] == "room"]
+    assert areas == pytest.approx([12, 12], rel=0.1)
+
+
+def test_a_wide_opening_does_not(tmp_path: Path) -> None:
+    room = stored(tmp_path, **TWO_ROOMS, blocks=divided(1.6))
+    assert rooms(plan(room, RESOLUTION, 1.0)).count == 1
+
+
+def by_hand(text: str) -> Plan:
+    """A plan with cells of 0.5 m: # wall, . free, o occupied, and nothing known."""
+    rows = np.array([list(row) for row in text.split("\n")])[::-1]
+    free, wall, occupied = rows == ".", rows == "#", rows == "o"
+    return Plan(0.5, np.zeros(2), occupied | wall, free, free, wall, np.zeros(rows.shape, np.int32))
+
+
+def test_furniture_and_gaps_do_not_separate_rooms() -> None:
+    one = by_hand(
+        "##############\n#......o.....#\n#......o.....#\n#......o.....#\n#............#\n#.. .........#\n##############"
+    )
+    assert rooms(one).count == 1
+    two = by_hand(
+        "##############\n#......#.....#\n#......#.....#\n#............#\n#......#.....#\n#......#.....#\n##############"
+    )
+    found = rooms(two)
+    assert found.count == 2
+    assert found.area(1) >= found.area(2) > 1
+    assert found.of(np.array([[1.1, 1.1]])) == 1
+    assert found.of(np.array([[5.2, 1.2]])) == 2
+    assert rooms(by_hand("    \n    ")).count == 0
+
+
+def test_what_a_plan_needs_to_know_is_asked_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    run = ExportedRoom().write(tmp_path / "run", figures=False)
+    for kind in (Format.FLOORPLAN, Format.GRAPH):
+        with pytest.raises(DataError, match=f"does not tell which way is up, which {kind.value} needs: --up X Y Z"):
+            export(run, [kind])
+    with pytest.raises(DataError, match="does not tell how high the floor is, which floorplan needs: --floor M"):
+        export(run, [Format.FLOORPLAN], up=(0, 0, 1))
+    [path] = export(run, [Format.GRAPH], up=(0, 0, 1))
+    assert "without floor, walls and rooms" in caplog.text
+    assert {node["kind"] for node in json.loads(path.read_text())["nodes"]} == {"object"}
+    assert len(export(run, [Format.FLOORPLAN], up=(0, 0, 1), floor=0)) == 4
+
+
+def test_plans_have_bounds(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    for wrong in ({"resolution": 0.0}, {"robot_height": 9.0}, {"min_confidence": float("nan")}):
+        with pytest.raises(Exception, match=f"{next(iter(wrong))}"):
+            Chosen(**wrong)
+    monkeypatch.setattr(occupancy, "MOST_CELLS", 100)
+    with pytest.raises(DataError, match="a plan of 43 x 33 cells is too large"):
+        plan(room, RESOLUTION, 1.0)
