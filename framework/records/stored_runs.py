@@ -100,6 +100,18 @@ def read_record(directory: Path) -> Record:
     return Record(directory, metrics, config, written)
 
 
+def read_partial(directory: Path) -> tuple[Record, str]:
+    """What there is of a run that ended early, and why it did.
+
+    Raises DataError, naming the file, when one cannot be read or the two are not of the same run.
+    """
+    path = directory / PARTIAL_METRICS
+    metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
+    if metrics.get("config_hash") != config_hash(config):
+        raise DataError(f"{path} is not of the config beside it: config_hash differs; run it again")
+    return Record(directory, metrics, config, path.stat().st_mtime), str(metrics.get("partial"))
+
+
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:
     """All runs at and below `root`, by path: those that completed, and the others."""
     records: list[Record] = []
