@@ -35,6 +35,7 @@ class MappedObject:
     first_frame: int
     last_frame: int
     vertices: int
+    centroid: Float64 | None  # (3,) m, world, of its vertices; None = it has none
     center: Float64  # (3,) m, world, of its oriented box
     extent: Float64  # (3,) m
     rotation: Float64  # (3, 3) the box's axes as columns
@@ -139,6 +140,7 @@ def _object(where: str, entry: Any) -> MappedObject:
         first_frame=_whole(where, entry, "first_frame"),
         last_frame=_whole(where, entry, "last_frame"),
         vertices=_whole(where, entry, "vertices"),
+        centroid=_array(where, entry, "centroid", (3,)) if entry.get("centroid") is not None else None,
         center=_array(where, box, "center", (3,)),
         extent=_array(where, box, "extent", (3,)),
         rotation=_array(where, box, "rotation", (3, 3)),
@@ -165,5 +167,5 @@ def _array(where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...
     except (TypeError, ValueError):
         values = np.zeros(0)
     if values.shape != shape or not np.isfinite(values).all():
-        raise DataError(f"{where}: obb.{key} must hold numbers of shape {shape}, found {entry.get(key)!r:.40}")
+        raise DataError(f"{where}: {key} must hold numbers of shape {shape}, found {entry.get(key)!r:.40}")
     return values

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
@@ -63,7 +64,7 @@ def top_view(ways: Sequence[Way], true_ways: Sequence[Float64], objects: Sequenc
         start, end = points[0].tolist(), points[-1].tolist()
         parts += [svg.element("circle", cx=start[0], cy=start[1], r=5, class_="start")]
         parts += [svg.element("circle", cx=end[0], cy=end[1], r=5, class_="end")]
-    length = svg.round_step(0.28 * WIDTH / scale, 1) / (2 if svg.round_step(0.28 * WIDTH / scale, 1) > 0 else 1)
+    length = svg.round_step(0.12 * WIDTH / scale, 1)
     bar = np.array([[16.0, HEIGHT - 16.0], [16.0 + length * scale, HEIGHT - 16.0]])
     label = f"{svg.number(length)} m" if length >= 1 else f"{svg.number(100 * length)} cm"
     parts += [svg.path(bar, class_="scale"), svg.text(16, HEIGHT - 24, label, class_="tick")]
@@ -116,6 +117,6 @@ def _footprint(one: Footprint, corners: Float64) -> str:
         outline = corners[ConvexHull(corners).vertices]
     except QhullError:  # an object that is a line from above
         return ""
-    title = svg.element("title", svg.escape(one.name))
+    title = svg.element("title", escape(one.name))
     shape = svg.path(outline, closed=True, class_="footprint", fill=one.color, stroke=one.color)
     return svg.element("g", title, shape)
