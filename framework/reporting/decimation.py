@@ -1,4 +1,4 @@
-"""Meshes made light enough to be shown in a browser: fewer triangles, with the objects kept finer than what is around."""
+"""Meshes made light enough for a browser: fewer triangles, with the objects kept finer than what is around them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ class LightMesh:
 def decimated(mesh: InstanceMesh, instance_ids: Int32, most_triangles: int) -> LightMesh:
     """The mesh with at most so many triangles: edges are collapsed where that changes the surface least.
 
-    Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997, by Open3D. Meshes that are
-    much too large are clustered in cubes before. Objects and what is around them are decimated apart, so that
+    Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997, by Open3D. Meshes that
+    are much too large are clustered in cubes before. Objects and what is around them are decimated apart, so that
     their border stays where it is; colours are averaged, and each vertex has the label of the nearest one before.
 
     Args:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import gzip
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -48,9 +49,7 @@ class MapScene:
         mesh = LightMesh(surface.vertices, surface.triangles, mesh.colors, mesh.instance_ids)
         camera = recording.camera or NOT_CAMERA
         up = contents.up if contents.up is not None else upward(contents.poses, surface)
-        return cls(
-            contents, mesh, surface, camera, sightings(mesh, mesh.instance_ids, contents.poses, camera), up
-        )
+        return cls(contents, mesh, surface, camera, sightings(mesh, mesh.instance_ids, contents.poses, camera), up)
 
     def glb(self) -> str:
         """The map as GLB, compressed by gzip, in base64: the same for the same record."""
@@ -59,11 +58,21 @@ class MapScene:
         content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names)
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
+    @property
+    def likely_labels(self) -> Int32:
+        """(V,) the objects of the vertices, 0 for what is unlikely."""
+        likely = np.isin(self.mesh.instance_ids, likely_ids(self.contents))
+        return np.where(likely, self.mesh.instance_ids, 0).astype(np.int32)
+
+    @cached_property
+    def view(self) -> tuple[Camera, Float64]:
+        """From where the map is looked at first: a camera and its T_world_camera."""
+        return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
+
     def data(self) -> dict[str, Any]:
         """What the viewer's script needs beside the GLB."""
-        ids = np.where(np.isin(self.mesh.instance_ids, likely_ids(self.contents)), self.mesh.instance_ids, 0)
         poses = self.contents.poses
-        _, T_world_camera = best_view(self.surface, ids.astype(np.int32), poses, VIEW_WIDTH, VIEW_HEIGHT)
+        _, T_world_camera = self.view
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
         distance = float(np.median((self.mesh.vertices - eye) @ forward))
         numbers = self.contents.tracked_frames or tuple(range(len(poses)))
@@ -103,8 +112,11 @@ def object_colors(objects: tuple[MappedObject, ...]) -> dict[int, UInt8]:
 
 
 def colors_of_classes(objects: tuple[MappedObject, ...]) -> dict[str, str]:
-    """#rrggbb by class."""
-    names = sorted({one.class_name for one in objects})
+    """#rrggbb by class; those of the likeliest objects are least like each other."""
+    most: dict[str, float] = {}
+    for one in objects:
+        most[one.class_name] = max(one.confidence, most.get(one.class_name, 0.0))
+    names = sorted(most, key=lambda name: (-most[name], name))
     return dict(zip(names, map(hex_color, instance_colors(np.zeros((len(names), 3)))), strict=True))
 
 

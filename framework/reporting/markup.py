@@ -16,7 +16,9 @@ from framework.errors import DataError
 ASSETS = files("framework.reporting") / "assets"
 STYLE = "report.css"
 SCRIPTS = ("three.min.js", "viewer.js", "table.js", "page.js")
-POLICY = "default-src 'none'; img-src data:; style-src '{style}'; script-src '{script}'; base-uri 'none'; form-action 'none'"
+POLICY = (
+    "default-src 'none'; img-src data:; style-src '{style}'; script-src '{script}'; base-uri 'none'; form-action 'none'"
+)
 
 
 def page(title: str, body: str, data: Mapping[str, Any], maps: Sequence[str]) -> str:
@@ -95,7 +97,9 @@ def section(anchor: str, title: str, *children: str, lead: str = "") -> str:
     )
 
 
-def table(heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = (), **attributes: object) -> str:
+def table(
+    heads: Sequence[str], rows: Sequence[Sequence[str]], numbers: Sequence[int] = (), **attributes: object
+) -> str:
     """A plain table; heads are text, cells are markup, `numbers` are the columns that are aligned as such."""
 
     def kind(k: int) -> str | None:

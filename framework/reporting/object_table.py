@@ -35,7 +35,7 @@ def above_floor(one: MappedObject, contents: RunContents) -> float | None:
     floor, up = contents.record.metrics.get("map.floor_m"), contents.up
     if not isinstance(floor, float) or up is None:
         return None
-    half = 0.5 * float(np.abs(one.rotation.T @ up) @ one.extent)
+    half = float(0.5 * np.abs(one.rotation.T @ up) @ one.extent)
     return float(one.center @ up) - half - floor
 
 
@@ -69,8 +69,14 @@ def _row(
     sides = sides_cm(one, contents.up)
     cells = [
         tag("td", image(picture, f"{one.class_name} {one.id}"), class_="picture"),
-        tag("td", swatch(color), tag("b", words(one.class_name)), tag("span", f" {one.id}", class_="faint"),
-            class_="name", data_value=f"{one.class_name} {one.id:08d}"),
+        tag(
+            "td",
+            swatch(color),
+            tag("b", words(one.class_name)),
+            tag("span", f" {one.id}", class_="faint"),
+            class_="name",
+            data_value=f"{one.class_name} {one.id:08d}",
+        ),
         tag("td", meter(one.confidence), f"{one.confidence:.2f}", class_="number", data_value=one.confidence),
         tag("td", words(size_words(one, contents.up)), class_="number", data_value=max(sides)),
         tag("td", str(one.observations), class_="number", data_value=one.observations),
@@ -114,8 +120,8 @@ def outcome_words(judgement: Judgement | None) -> str:
     if judgement is None:
         return ""
     if judgement.outcome is Outcome.WRONG_CLASS:
-        return f"is a {judgement.truth_class}"
-    return judgement.outcome.value
+        return f"truth: {judgement.truth_class}"
+    return str(judgement.outcome.value)
 
 
 def image(picture: Picture | None, alt: str) -> str:

@@ -34,7 +34,7 @@ class Recording:
         if any("${" in str(value) for _, value in leaves({"dataset": config.get("dataset")})):
             return cls(contents, None, "its config is not resolved")
         try:
-            video = build(RGBDVideo, OmegaConf.create(dict(config)).get("dataset"))  # type: ignore[type-abstract]
+            video = build(RGBDVideo, OmegaConf.create(dict(config)).get("dataset"))
         except (InstanceMapError, OSError) as error:
             return cls(contents, None, str(error))
         if not isinstance(video, RGBDSequence):
@@ -84,7 +84,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class TruePath:
-    """Where the camera really was, in the map's world: moved rigidly so that it fits the trajectory best, as for ATE."""
+    """Where the camera really was, in the map's world: moved rigidly so that it fits the trajectory, as for ATE."""
 
     chosen: list[int]  # poses of the trajectory, n
     positions: Float64  # (n, 3) m

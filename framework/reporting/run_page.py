@@ -17,9 +17,10 @@ from framework.records.provenance import leaves
 from framework.records.run_record import LIKELY
 from framework.records.stored_runs import is_number
 from framework.registry import STAGES
-from framework.reporting.map_scene import MapScene, colors_of_classes, hex_color, likely_ids, object_colors
+from framework.reporting.growth_pictures import GrowthPicture, growth_pictures
+from framework.reporting.map_scene import MapScene, hex_color, likely_ids, object_colors
 from framework.reporting.markup import figure, page, section, table, tag, words
-from framework.reporting.object_table import object_data, object_table, swatch
+from framework.reporting.object_table import object_data, object_table
 from framework.reporting.pictures import Photographer, Picture, webp_url
 from framework.reporting.recording import Recording, TruePath
 from framework.reporting.run_contents import RunContents
@@ -67,8 +68,17 @@ class RunReport:
         contents = self.contents
         parts = [
             self._head(),
-            tag("main", self._notices(), self._map(), self._objects(), truth_section(self.check, self.why_unchecked,
-                contents, self.pictures), self._trajectory(), self._growth(), self._times(), _provenance(contents)),
+            tag(
+                "main",
+                self._notices(),
+                self._map(),
+                self._objects(),
+                truth_section(self.check, self.why_unchecked, contents, self.pictures),
+                self._trajectory(),
+                self._growth(),
+                self._times(),
+                _provenance(contents),
+            ),
             tag("footer", "Made by InstanceMap from one run's record. Nothing in this page is loaded from elsewhere."),
         ]
         data: dict[str, Any] = {
@@ -132,13 +142,17 @@ class RunReport:
         up = self.scene.up if self.scene is not None else contents.up
         if up is None:
             up = np.array([0.0, 0.0, 1.0])
-        charts = [tag("figure", self._top_view(up), _caption(self._way_words(), TOP_VIEW_KEY))]
+        absent = {"truth"} if self.true_path is None else set()
+        absent |= set() if contents.lost_frames else {"lost"}
+        keys = tuple(key for key in TOP_VIEW_KEY if key[0] not in absent)
+        charts = [tag("figure", *self._top_views(up), _caption(self._way_words(), keys))]
         if self.true_path is not None:
             frames = [contents.tracked_frames[k] for k in self.true_path.chosen]
             charts.append(tag("figure", error_over_time(frames, self.true_path.errors), _caption(self._error_words())))
         return section("trajectory", "Trajectory", tag("div", *charts, class_="charts"))
 
-    def _top_view(self, up: Float64) -> str:
+    def _top_views(self, up: Float64) -> list[str]:
+        """Among the objects, and larger where it is small among them."""
         contents = self.contents
         colors = object_colors(contents.objects)
         likely = set(likely_ids(contents))
@@ -149,7 +163,8 @@ class RunReport:
         ]
         way = Way(contents.poses[:, :3, 3], "mine", lost_after(contents))
         true_ways = [self.true_path.positions] if self.true_path is not None else []
-        return top_view([way], true_ways, footprints, up)
+        whole, share = top_view([way], true_ways, footprints, up)
+        return [whole] if share > SMALL_WAY else [whole, top_view([way], true_ways, [], up)[0]]
 
     def _way_words(self) -> str:
         steps = np.linalg.norm(np.diff(self.contents.poses[:, :3, 3], axis=0), axis=1)
@@ -181,8 +196,13 @@ class RunReport:
             "when each of its likely objects was first detected. The slider below the map plays it."
         )
         picture = growth(frames, scene.sightings.growth, first, contents.tracked_frames[-1])
-        return section("growth", "Growth", tag("div", tag("figure", picture, _caption("", GROWTH_KEY)), class_="charts"),
-                       lead=lead)
+        chart = tag("figure", picture, _caption("", GROWTH_KEY))
+        strip = [
+            tag("figure", f'<img src="{one.url}" alt="" width="480" height="320">', _caption(_seen_words(one)))
+            for one in growth_pictures(scene)
+        ]
+        charts = tag("div", chart, tag("div", *strip, class_="strip"), class_="charts")
+        return section("growth", "Growth", charts, lead=lead)
 
     def _times(self) -> str:
         times = self.contents.times
@@ -199,18 +219,23 @@ class RunReport:
             ]
             for row in rows
         ]
-        heads = ["Stage", "5% to 95% of the frames, median", "Median, ms", "p95, ms"]
+        heads = ["Stage", "5% to 95%", "Median, ms", "p95, ms"]
         lead = "Reading and detection of the next frame run beside the other stages: a frame takes less than their sum."
         return section(
             "times",
             "Stage times",
-            tag("div", table(heads, body, numbers=(2, 3), class_="stage-times"), tag("figure", stage_areas(times)),
-                class_="charts"),
+            tag(
+                "div",
+                table(heads, body, numbers=(2, 3), class_="stage-times"),
+                tag("figure", stage_areas(times)),
+                class_="charts",
+            ),
             lead=lead,
         )
 
 
-TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("end", "end"), ("lost", "lost after here"))
+SMALL_WAY = 0.3  # of the width of the view from above: what is smaller is shown larger, too
+TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("end", "end"), ("lost", "then lost"))
 GROWTH_KEY = (("seen", "surface in sight, share of all"), ("objects", "objects found"))
 
 
@@ -224,8 +249,12 @@ def viewer(still: str, likely: int) -> str:
         "div",
         tag("div", *views, class_="choice", role="group", aria_label="What the colours say"),
         tag("label", '<input type="checkbox" id="path" checked>', "Camera path"),
-        tag("label", "Confidence ≥ ", tag("output", f"{LIKELY:.2f}", id="confidence-value"),
-            f'<input type="range" id="confidence" min="0" max="1" step="0.01" value="{LIKELY}">'),
+        tag(
+            "label",
+            "Confidence ≥ ",
+            tag("output", f"{LIKELY:.2f}", id="confidence-value"),
+            f'<input type="range" id="confidence" min="0" max="1" step="0.01" value="{LIKELY}">',
+        ),
         tag("span", class_="spring"),
         tag("button", "Reset view", type="button", id="reset"),
         tag("button", "Save GLB", type="button", id="save"),
@@ -298,8 +327,12 @@ def overview_url(path: Path) -> str:
     return webp_url(small, 80)
 
 
+def _seen_words(one: GrowthPicture) -> str:
+    return f"Frame {one.frame}: {100 * one.share:.0f}%"
+
+
 def _caption(text: str, keys: tuple[tuple[str, str], ...] = ()) -> str:
-    shown = [f'<span class="key {css}"></span>{words(name)} ' for css, name in keys]
+    shown = [f'<span class="pair"><span class="key {css}"></span>{words(name)}</span> ' for css, name in keys]
     return tag("figcaption", words(text), " ", tag("span", *shown, class_="keys") if shown else "")
 
 
@@ -317,8 +350,11 @@ def _time_bar(lowest: float, median: float, p95: float) -> str:
 def _provenance(contents: RunContents) -> str:
     record = contents.record
     rows = [("Code", record.commit)]
-    rows += [(key.removeprefix("environment."), str(value)) for key, value in record.metrics.items()
-             if key.startswith("environment.")]
+    rows += [
+        (key.removeprefix("environment."), str(value))
+        for key, value in record.metrics.items()
+        if key.startswith("environment.")
+    ]
     rows += [("seed", str(record.metrics.get("seed"))), ("config_hash", str(record.metrics.get("config_hash")))]
     listed = tag("dl", *(tag("dt", words(key)) + tag("dd", words(value)) for key, value in rows), class_="facts")
     config = yaml.safe_dump(dict(record.config), sort_keys=False, allow_unicode=True)

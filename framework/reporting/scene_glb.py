@@ -42,8 +42,11 @@ def scene_glb(mesh: LightMesh, first_seen: Float32, names: Mapping[int, str]) ->
         name = f"object {key}" if key else REMAINDER
         part.metadata = {"id": key, "class": names[key]} if key else {"id": 0}
         scene.add_geometry(part, node_name=name, geom_name=name)
-    content = trimesh.exchange.gltf.export_glb(scene, include_normals=False, tree_postprocessor=_as_standard_colors)
-    return bytes(content)
+    content = scene.export(  # type: ignore[no-untyped-call]
+        file_type="glb", include_normals=False, tree_postprocessor=_as_standard_colors
+    )
+    assert isinstance(content, bytes)
+    return content
 
 
 def light_enough(mesh: LightMesh, most_bytes: int = MOST_BYTES) -> LightMesh:

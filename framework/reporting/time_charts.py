@@ -67,9 +67,8 @@ def stage_areas(times: StageTimes) -> str:
         grid += [svg.path(np.array([[LEFT, y], [right, y]]), class_="grid")]
         grid += [svg.text(LEFT - 8, y + 4, svg.number(value), class_="tick", text_anchor="end")]
     label = svg.text(LEFT + 4, TOP + 8, "ms, all stages on top of each other", class_="tick")
-    return svg.diagram(
-        WIDTH, HEIGHT, "The stages' times over the frames", [*parts, *grid, frame_axis(first, last, LEFT, right, bottom), label]
-    )
+    parts += [*grid, frame_axis(first, last, LEFT, right, bottom), label]
+    return svg.diagram(WIDTH, HEIGHT, "The stages' times over the frames", parts)
 
 
 def growth(frames: Sequence[int], share: Float64, first_frames: Sequence[int], last_frame: int) -> str:

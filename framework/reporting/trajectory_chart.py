@@ -13,8 +13,9 @@ from framework.data import Float64
 from framework.reporting import svg
 
 WIDTH, HEIGHT = 560.0, 380.0  # of the viewBox
-AROUND = 0.18  # of the path's size, free around it
-SMALLEST_M = 0.6  # that the shorter side of the picture shows
+AROUND = 0.08  # of the size of what is shown, free around it
+SMALLEST_M = 0.1  # that the shorter side of the picture shows
+NAMED_PX = 46.0  # the width of a footprint that has its name written on it
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 ERROR_HEIGHT = 150.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 10.0, 34.0
@@ -43,11 +44,17 @@ def box_corners(center: Float64, extent: Float64, rotation: Float64) -> Float64:
     return np.asarray(center + (CORNERS * extent) @ rotation.T)
 
 
-def top_view(ways: Sequence[Way], true_ways: Sequence[Float64], objects: Sequence[Footprint], up: Float64) -> str:
-    """The ways from above, the true ones dashed, with what stands beside them."""
+def top_view(
+    ways: Sequence[Way], true_ways: Sequence[Float64], objects: Sequence[Footprint], up: Float64
+) -> tuple[str, float]:
+    """The ways from above, the true ones dashed, among objects; and how long the ways are, as a share of its width."""
     plane = _horizontal(ways[0].positions, up)
     shown = np.concatenate([way.positions for way in ways] + list(true_ways)) @ plane.T
     low, high = shown.min(axis=0), shown.max(axis=0)
+    way_size = float((high - low).max())
+    if objects:
+        corners = np.concatenate([one.corners_world for one in objects]) @ plane.T
+        low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
     middle, size = (low + high) / 2, (high - low) * (1 + 2 * AROUND)
     scale = min(WIDTH / max(size[0], SMALLEST_M * WIDTH / HEIGHT), HEIGHT / max(size[1], SMALLEST_M))
 
@@ -68,7 +75,7 @@ def top_view(ways: Sequence[Way], true_ways: Sequence[Float64], objects: Sequenc
     bar = np.array([[16.0, HEIGHT - 16.0], [16.0 + length * scale, HEIGHT - 16.0]])
     label = f"{svg.number(length)} m" if length >= 1 else f"{svg.number(100 * length)} cm"
     parts += [svg.path(bar, class_="scale"), svg.text(16, HEIGHT - 24, label, class_="tick")]
-    return svg.diagram(WIDTH, HEIGHT, "The camera's way from above", parts)
+    return svg.diagram(WIDTH, HEIGHT, "The camera's way from above", parts), way_size * scale / WIDTH
 
 
 def error_over_time(frames: Sequence[int], errors: Float64) -> str:
@@ -118,5 +125,8 @@ def _footprint(one: Footprint, corners: Float64) -> str:
     except QhullError:  # an object that is a line from above
         return ""
     title = svg.element("title", escape(one.name))
-    shape = svg.path(outline, closed=True, class_="footprint", fill=one.color, stroke=one.color)
-    return svg.element("g", title, shape)
+    parts = [title, svg.path(outline, closed=True, class_="footprint", fill=one.color, stroke=one.color)]
+    if np.ptp(outline[:, 0]) > NAMED_PX:
+        u, v = outline.mean(axis=0).tolist()
+        parts.append(svg.text(u, v + 4, one.name, class_="tick", text_anchor="middle"))
+    return svg.element("g", *parts)

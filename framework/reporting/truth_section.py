@@ -40,7 +40,8 @@ def truth_section(
     if not main and check is None:
         return ""
     figures = tag(
-        "dl", *(tag("div", tag("dt", words(name)), tag("dd", f"{value:.2f}"), class_="figure") for name, value in main),
+        "dl",
+        *(tag("div", tag("dt", words(name)), tag("dd", f"{value:.2f}"), class_="figure") for name, value in main),
         class_="figures small",
     )
     parts = [figures if main else "", _classes(metrics)]
@@ -92,7 +93,7 @@ def _card(one: MappedObject, judgement: Judgement, picture: Picture | None) -> s
     near = judgement.truth_class or "something unknown"
     lines = {
         Outcome.RIGHT: f"IoU {judgement.iou:.2f}",
-        Outcome.WRONG_CLASS: f"is a {near}, IoU {judgement.iou:.2f}",
+        Outcome.WRONG_CLASS: f"truth: {near}, IoU {judgement.iou:.2f}",
         Outcome.FALSE: f"nearest: {near}, IoU {judgement.iou:.2f}" if judgement.iou else "nothing is there",
         Outcome.IGNORED: f"on {near}",
     }

@@ -30,6 +30,7 @@ LAYERS = [
     ["records", "training"],
     ["tables"],
     ["figures"],
+    ["reporting"],
     ["api"],
     ["commands"],
     ["__main__"],

@@ -176,8 +176,9 @@ class Page {
       parts.push(copy, made("p", "source", object.source === "map" ? "rendered from the map" : `from ${object.source}`));
     }
     parts.push(made("h4", "", "What it may be"));
-    const bars = object.probabilities.flatMap(([name, share]) => [
-      made("span", "", name), meter(share), made("span", "number", share < 0.005 ? "<0.01" : share.toFixed(2)),
+    const likely = object.probabilities.filter(([, share], k) => k < 2 || share >= 0.005);
+    const bars = likely.flatMap(([name, share]) => [
+      made("span", "", name), meter(share), made("span", "", share < 0.005 ? "<0.01" : share.toFixed(2)),
     ]);
     parts.push(made("div", "bars", ...bars));
     const facts = [

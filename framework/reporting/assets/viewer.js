@@ -17,10 +17,10 @@ const VERTEX_SHADER = `
 
 const FRAGMENT_SHADER = `
   uniform float painted;
-  uniform float chosen;
+  uniform float faded;
   uniform float now;
   uniform vec3 paint;
-  uniform vec3 accent;
+  uniform vec3 ground;
   varying vec3 vColor;
   varying vec3 vNormal;
   varying float vFirst;
@@ -37,11 +37,14 @@ const FRAGMENT_SHADER = `
     else if (painted > 0.5) shown = pale;
     float lit = 0.74 + 0.30 * max(dot(normalize(vNormal), normalize(vec3(-0.45, 0.75, 0.6))), 0.0);
     shown *= lit;
-    if (chosen > 0.5) shown = mix(shown, accent, 0.38) + 0.06;
+    shown = mix(min(shown, vec3(1.0)), ground, faded);
     gl_FragColor = vec4(min(shown, vec3(1.0)), 1.0);
   }`;
 
 const FLIGHT_MS = 600;
+const FADED = 0.62; // of what is not chosen, while something is
+const PATH_WIDTH = 0.0022; // of the distance from which a map is looked at
+const PATH_SIDES = 6;
 const CLICK_PX = 5; // that a finger or a hand may move in a click
 
 class MapViewer {
@@ -72,7 +75,7 @@ class MapViewer {
   /** Reads a GLB, ArrayBuffer, and adds it as a map that `show` can show. */
   async add(content, data) {
     const { scene } = await new THREE.GLTFLoader().parseAsync(content, "");
-    const map = { group: new THREE.Group(), data, parts: new Map(), path: pathLine(data.path) };
+    const map = { group: new THREE.Group(), data, parts: new Map(), path: pathTube(data) };
     const colors = new Map(data.objects.map((one) => [one.id, one]));
     scene.traverse((node) => {
       if (!node.isMesh) return;
@@ -146,21 +149,21 @@ class MapViewer {
 
   paint() {
     if (!this.shown) return;
-    const dark = new THREE.Color(accentColor());
+    const ground = rgb(styleColor("--void"));
     for (const [id, part] of this.shown.parts) {
       const { object } = part.userData;
       const likely = object && object.confidence >= this.confidence;
       const { uniforms } = part.material;
       uniforms.painted.value = this.view === "color" ? 0 : likely ? 2 : 1;
       if (object) uniforms.paint.value.set(...rgb(this.view === "class" ? object.classColor : object.color));
-      uniforms.chosen.value = id !== 0 && id === this.chosen ? 1 : 0;
-      uniforms.accent.value.set(...rgb(`#${dark.getHexString()}`));
+      uniforms.faded.value = this.chosen === null || id === this.chosen ? 0 : FADED;
+      uniforms.ground.value.set(...ground);
       uniforms.now.value = this.now;
     }
     if (this.shown.path) {
       this.shown.path.visible = this.showPath;
-      const points = this.shown.data.path.length;
-      this.shown.path.geometry.setDrawRange(0, Math.max(1, Math.ceil(points * this.now)));
+      const steps = this.shown.data.path.length - 1;
+      this.shown.path.geometry.setDrawRange(0, 6 * PATH_SIDES * Math.ceil(steps * this.now));
     }
     this.draw();
   }
@@ -253,23 +256,29 @@ function material() {
     vertexColors: true,
     uniforms: {
       painted: { value: 0 },
-      chosen: { value: 0 },
+      faded: { value: 0 },
       now: { value: 1 },
       paint: { value: new THREE.Vector3() },
-      accent: { value: new THREE.Vector3() },
+      ground: { value: new THREE.Vector3() },
     },
   });
 }
 
-/** The camera's way, blue at its beginning, orange at its end. */
-function pathLine(points) {
-  if (points.length < 2) return null;
-  const geometry = new THREE.BufferGeometry();
-  geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(points.flat()), 3));
+/** The camera's way as a tube, blue at its beginning, orange at its end. */
+function pathTube({ path, eye, target }) {
+  if (path.length < 2) return null;
+  const curve = new THREE.CatmullRomCurve3(path.map((point) => new THREE.Vector3(...point)));
+  const steps = path.length - 1;
+  const width = PATH_WIDTH * new THREE.Vector3(...eye).distanceTo(new THREE.Vector3(...target));
+  const geometry = new THREE.TubeGeometry(curve, steps, width, PATH_SIDES);
   const start = [40, 110, 220], end = [235, 90, 40];
-  const shades = points.flatMap((_, k) => start.map((from, c) => (from + ((end[c] - from) * k) / (points.length - 1)) / 255));
+  const shades = [];
+  for (let k = 0; k <= steps; k += 1) {
+    const shade = start.map((from, c) => (from + ((end[c] - from) * k) / steps) / 255);
+    for (let side = 0; side <= PATH_SIDES; side += 1) shades.push(...shade);
+  }
   geometry.setAttribute("color", new THREE.BufferAttribute(new Float32Array(shades), 3));
-  return new THREE.Line(geometry, new THREE.LineBasicMaterial({ vertexColors: true }));
+  return new THREE.Mesh(geometry, new THREE.MeshBasicMaterial({ vertexColors: true }));
 }
 
 function rgb(hex) {
@@ -278,7 +287,6 @@ function rgb(hex) {
 }
 
 function styleColor(name) { return getComputedStyle(document.documentElement).getPropertyValue(name).trim(); }
-function accentColor() { return styleColor("--accent"); }
 
 /** A GLB out of the page: base64, gzip. */
 async function unpacked(element) {
