@@ -25,6 +25,8 @@ help: ## this list
 .PHONY: demo
 demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
 	@$(BIN)/python -m framework dataset=desk hydra.run.dir=$(DEMO)
+	@echo "its report, for the browser:"
+	@$(BIN)/python -m framework report $(DEMO)
 
 .PHONY: test
 test: $(INSTALLED_DEV) ## lint, check types, run the tests

@@ -97,7 +97,9 @@ def _row(
     )
 
 
-def object_data(one: MappedObject, contents: RunContents, picture: Picture | None) -> dict[str, Any]:
+def object_data(
+    one: MappedObject, contents: RunContents, picture: Picture | None, judgement: Judgement | None
+) -> dict[str, Any]:
     """What the panel shows of an object."""
     height = above_floor(one, contents)
     return {
@@ -112,6 +114,7 @@ def object_data(one: MappedObject, contents: RunContents, picture: Picture | Non
         "frames": f"{one.first_frame} to {one.last_frame}",
         "vertices": one.vertices,
         "source": picture.source if picture else "",
+        "truth": outcome_words(judgement) + (f", IoU {judgement.iou:.2f}" if judgement and judgement.iou else ""),
     }
 
 

@@ -81,10 +81,14 @@ class RunReport:
             ),
             tag("footer", "Made by InstanceMap from one run's record. Nothing in this page is loaded from elsewhere."),
         ]
+        judgements = self.check.judgements if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,
             "maps": [] if self.scene is None else [{"name": contents.name, **self.scene.data()}],
-            "objects": [object_data(one, contents, self.pictures.get(one.id)) for one in contents.objects],
+            "objects": [
+                object_data(one, contents, self.pictures.get(one.id), judgements.get(one.id))
+                for one in contents.objects
+            ],
         }
         maps = [] if self.scene is None else [self.scene.glb()]
         return page(f"{contents.name} · InstanceMap", "\n".join(parts), data, maps)
@@ -145,13 +149,13 @@ class RunReport:
         absent = {"truth"} if self.true_path is None else set()
         absent |= set() if contents.lost_frames else {"lost"}
         keys = tuple(key for key in TOP_VIEW_KEY if key[0] not in absent)
-        charts = [tag("figure", *self._top_views(up), _caption(self._way_words(), keys))]
+        charts = [*self._top_views(up, _caption(self._way_words(), keys))]
         if self.true_path is not None:
             frames = [contents.tracked_frames[k] for k in self.true_path.chosen]
             charts.append(tag("figure", error_over_time(frames, self.true_path.errors), _caption(self._error_words())))
         return section("trajectory", "Trajectory", tag("div", *charts, class_="charts"))
 
-    def _top_views(self, up: Float64) -> list[str]:
+    def _top_views(self, up: Float64, caption: str) -> list[str]:
         """Among the objects, and larger where it is small among them."""
         contents = self.contents
         colors = object_colors(contents.objects)
@@ -164,7 +168,11 @@ class RunReport:
         way = Way(contents.poses[:, :3, 3], "mine", lost_after(contents))
         true_ways = [self.true_path.positions] if self.true_path is not None else []
         whole, share = top_view([way], true_ways, footprints, up)
-        return [whole] if share > SMALL_WAY else [whole, top_view([way], true_ways, [], up)[0]]
+        views = [whole] if share > SMALL_WAY else [whole, top_view([way], true_ways, [], up)[0]]
+        return [
+            tag("figure", views[0], caption),
+            *(tag("figure", view, _caption("The same, larger.")) for view in views[1:]),
+        ]
 
     def _way_words(self) -> str:
         steps = np.linalg.norm(np.diff(self.contents.poses[:, :3, 3], axis=0), axis=1)

@@ -75,5 +75,6 @@ def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Flo
     inside = (z > 1e-3) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     visible = np.zeros(len(vertices), np.bool_)
     seen = depth[v[inside].astype(int), u[inside].astype(int)]
-    visible[inside] = z[inside] < seen + BEHIND + BEHIND_SHARE * seen
+    # beside the surface nothing is in front: a vertex on its border may be rounded to there
+    visible[inside] = (seen == 0) | (z[inside] < seen + BEHIND + BEHIND_SHARE * seen)
     return inside, visible

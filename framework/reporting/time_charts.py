@@ -66,7 +66,7 @@ def stage_areas(times: StageTimes) -> str:
         y = bottom - value / top * (bottom - TOP)
         grid += [svg.path(np.array([[LEFT, y], [right, y]]), class_="grid")]
         grid += [svg.text(LEFT - 8, y + 4, svg.number(value), class_="tick", text_anchor="end")]
-    label = svg.text(LEFT + 4, TOP + 8, "ms, all stages on top of each other", class_="tick")
+    label = svg.text(LEFT, 12, "ms, all stages on top of each other", class_="tick")
     parts += [*grid, frame_axis(first, last, LEFT, right, bottom), label]
     return svg.diagram(WIDTH, HEIGHT, "The stages' times over the frames", parts)
 

@@ -17,8 +17,8 @@ AROUND = 0.08  # of the size of what is shown, free around it
 SMALLEST_M = 0.1  # that the shorter side of the picture shows
 NAMED_PX = 46.0  # the width of a footprint that has its name written on it
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-ERROR_HEIGHT = 150.0
-LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 10.0, 34.0
+ERROR_HEIGHT = 170.0
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 34.0
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def error_over_time(frames: Sequence[int], errors: Float64) -> str:
         parts += [svg.text(LEFT - 8, y + 4, svg.number(value), class_="tick", text_anchor="end")]
     parts += [frame_axis(first, last, LEFT, right, bottom)]
     parts += [svg.path(np.stack([u, v], axis=1), class_="way mine")]
-    parts += [svg.text(LEFT + 4, TOP + 8, "mm from the true position", class_="tick")]
+    parts += [svg.text(LEFT, 12, "mm from the true position", class_="tick")]
     return svg.diagram(WIDTH, ERROR_HEIGHT, "The distance from the true position over the frames", parts)
 
 
