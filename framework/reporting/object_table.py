@@ -108,7 +108,7 @@ def object_data(
         "confidence": one.confidence,
         "probabilities": [[name, round(share, 4)] for name, share in one.class_probabilities],
         "size": f"{size_words(one, contents.up)} cm",
-        "place": f"{_position(one)} m",
+        "place": ", ".join(_position(one).split()) + " m",
         "height": None if height is None else f"{max(height, 0.0):.2f} m above the floor",
         "observations": one.observations,
         "frames": f"{one.first_frame} to {one.last_frame}",
