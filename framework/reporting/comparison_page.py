@@ -15,11 +15,12 @@ from framework.records.provenance import leaves
 from framework.records.run_record import LIKELY
 from framework.records.stored_runs import is_number
 from framework.registry import STAGES
+from framework.reporting.footage import Footage
 from framework.reporting.map_scene import MapScene, likely_ids
 from framework.reporting.markup import page, section, table, tag, words
-from framework.reporting.recording import Recording
 from framework.reporting.run_contents import RunContents
 from framework.reporting.run_page import lost_after, viewer
+from framework.reporting.sightings import NOT_CAMERA
 from framework.reporting.time_charts import stage_rows
 from framework.reporting.trajectory_chart import Way, top_view
 
@@ -72,7 +73,8 @@ class Comparison:
     def of(cls, runs: Sequence[RunContents], links: Sequence[str]) -> Comparison:
         """Decimates the maps, so that all of them together are as light as that of one run."""
         mapped = runs[:MOST_MAPS]
-        scenes = [MapScene.of(run, Recording(run, None, "not read"), 1 / len(mapped)) for run in mapped]
+        nothing = Footage(NOT_CAMERA, {}, {}, {}, {})
+        scenes = [MapScene.of(run, nothing, 1 / len(mapped)) for run in mapped]
         return cls(runs, short_names([run.record.directory for run in runs]), links, scenes)
 
     def html(self) -> str:

@@ -16,10 +16,10 @@ from framework.rendering.palette import instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
 from framework.reporting.decimation import LightMesh, decimated
-from framework.reporting.recording import Recording
+from framework.reporting.footage import Footage
 from framework.reporting.run_contents import MappedObject, RunContents
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
-from framework.reporting.sightings import NOT_CAMERA, Sightings, sightings, spread_out
+from framework.reporting.sightings import Sightings, sightings, spread_out
 
 VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, whose proportions the first view is chosen for
 PATH_POINTS = 400  # of the camera's way
@@ -32,12 +32,11 @@ class MapScene:
     contents: RunContents
     mesh: LightMesh
     surface: Surface  # the same, wound so that it shows its front to where the camera was
-    camera: Camera  # of the video, or one like a Kinect's
     sightings: Sightings
     up: Float64  # (3,)
 
     @classmethod
-    def of(cls, contents: RunContents, recording: Recording, share: float = 1.0) -> MapScene | None:
+    def of(cls, contents: RunContents, footage: Footage, share: float = 1.0) -> MapScene | None:
         """None where nothing was mapped. `share` of the triangles and bytes that a file may have is for this one."""
         if contents.mesh is None or not len(contents.poses):
             return None
@@ -47,9 +46,9 @@ class MapScene:
             return None
         surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.poses)
         mesh = LightMesh(surface.vertices, surface.triangles, mesh.colors, mesh.instance_ids)
-        camera = recording.camera or NOT_CAMERA
         up = contents.up if contents.up is not None else upward(contents.poses, surface)
-        return cls(contents, mesh, surface, camera, sightings(mesh, mesh.instance_ids, contents.poses, camera), up)
+        seen = sightings(mesh, mesh.instance_ids, contents.poses, footage.camera, footage.clarity)
+        return cls(contents, mesh, surface, seen, up)
 
     def glb(self) -> str:
         """The map as GLB, compressed by gzip, in base64: the same for the same record."""
@@ -60,9 +59,10 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """(V,) the objects of the vertices, 0 for what is unlikely."""
-        likely = np.isin(self.mesh.instance_ids, likely_ids(self.contents))
-        return np.where(likely, self.mesh.instance_ids, 0).astype(np.int32)
+        """(V,) 1 + the place among the likely objects of the one that a vertex is of, 0 = of none."""
+        likely = np.array([0, *likely_ids(self.contents)])
+        places = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
+        return np.where(likely[places] == self.mesh.instance_ids, places, 0).astype(np.int32)
 
     @cached_property
     def view(self) -> tuple[Camera, Float64]:

@@ -11,19 +11,18 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from framework.data import Bool, Camera, Float64, Int32, UInt8
+from framework.data import Bool, Float64, Int32, UInt8
 from framework.rendering.lit_view import LitView
 from framework.rendering.rasterizer import Rasterizer
 from framework.rendering.surface import Surface
 from framework.reporting.decimation import LightMesh
-from framework.reporting.recording import Recording
+from framework.reporting.footage import Footage
 
 WIDTH, HEIGHT = 264, 198  # px; shown half as large, or full in the panel
 MANY = 120  # objects from which on pictures are smaller, so that pages stay light
 QUALITY = 78  # of WebP
 MARGIN = 0.25  # of an object's size, around it
 SMALLEST = 0.12  # of the picture's width, that a cut has
-LARGEST = 640  # px, of the picture that cuts are made of
 OUTLINE = (255, 255, 255)  # around the object's colour, so that the line shows on all grounds
 
 
@@ -38,9 +37,9 @@ class Picture:
 class Photographer:
     """Takes pictures of the objects of one map."""
 
-    def __init__(self, mesh: LightMesh, surface: Surface, poses: Float64, recording: Recording, camera: Camera) -> None:
-        self._mesh, self._surface, self._poses, self._recording = mesh, surface, poses, recording
-        self._camera = camera.scaled(min(1.0, LARGEST / camera.width))
+    def __init__(self, mesh: LightMesh, surface: Surface, poses: Float64, footage: Footage) -> None:
+        self._mesh, self._surface, self._poses, self._footage = mesh, surface, poses, footage
+        self._camera = footage.camera
         self._rasterizer = Rasterizer(mesh.vertices, mesh.triangles)
 
     def pictures(self, labels: Int32, best: Mapping[int, int], colors: Mapping[int, UInt8]) -> dict[int, Picture]:
@@ -62,11 +61,9 @@ class Photographer:
 
     def _seen_from(self, k: int) -> tuple[UInt8, str]:
         """(H, W, 3) RGB and where it is from."""
-        frame = self._recording.frame(k)
-        if frame is None:
-            return LitView(self._surface, self._camera, self._poses[k]).in_colors(self._mesh.colors), "map"
-        size = self._camera.width, self._camera.height
-        return np.asarray(cv2.resize(frame.color, size, interpolation=cv2.INTER_AREA)), f"frame {frame.index}"
+        if k in self._footage.images:
+            return self._footage.images[k], f"frame {self._footage.frames[k]}"
+        return LitView(self._surface, self._camera, self._poses[k]).in_colors(self._mesh.colors), "map"
 
 
 def _cut(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -91,7 +92,7 @@ class TruePath:
     errors: Float64  # (n,) m, from there to the trajectory's positions
 
     @classmethod
-    def of(cls, poses: Float64, true_positions: dict[int, Float64]) -> TruePath | None:
+    def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
         """From true positions (3,) by number of the pose; None where there are too few to be moved."""
         chosen = sorted(true_positions)
         if len(chosen) < 3:

@@ -10,14 +10,22 @@ from typing import Any
 
 import numpy as np
 
-from framework.data import Float64, InstanceMesh, Int32
+from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
 from framework.files.json_file import read_json
 from framework.files.tum_trajectory import read_tum
 from framework.files.whole_files import is_there
 from framework.records.mesh_file import read_mesh
 from framework.records.stored_map import read_objects
-from framework.records.stored_runs import METRICS, PARTIAL_METRICS, TRAJECTORY, Record, read_partial, read_record
+from framework.records.stored_runs import (
+    METRICS,
+    PARTIAL_METRICS,
+    TRAJECTORY,
+    Record,
+    is_number,
+    read_partial,
+    read_record,
+)
 from framework.records.timings_file import StageTimes, read_timings
 
 LIKELY_CLASSES = 6  # of an object's class distribution, that a page shows
@@ -89,7 +97,8 @@ class RunContents:
     def up(self) -> Float64 | None:
         """(3,) against gravity, None where the map does not tell."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
-        return np.array(values, np.float64) if all(isinstance(value, float) for value in values) else None
+        up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
+        return up if abs(np.linalg.norm(up) - 1) < UNIT_TOLERANCE else None  # NaN is not
 
     @property
     def tracked_frames(self) -> tuple[int, ...]:

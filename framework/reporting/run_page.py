@@ -17,6 +17,7 @@ from framework.records.provenance import leaves
 from framework.records.run_record import LIKELY
 from framework.records.stored_runs import is_number
 from framework.registry import STAGES
+from framework.reporting.footage import Footage
 from framework.reporting.growth_pictures import GrowthPicture, growth_pictures
 from framework.reporting.map_scene import MapScene, hex_color, likely_ids, object_colors
 from framework.reporting.markup import figure, page, section, table, tag, words
@@ -24,6 +25,7 @@ from framework.reporting.object_table import object_data, object_table
 from framework.reporting.pictures import Photographer, Picture, webp_url
 from framework.reporting.recording import Recording, TruePath
 from framework.reporting.run_contents import RunContents
+from framework.reporting.sightings import NOT_CAMERA, spread_out
 from framework.reporting.time_charts import growth, stage_areas, stage_rows
 from framework.reporting.trajectory_chart import Footprint, Way, box_corners, error_over_time, top_view
 from framework.reporting.truth_check import TruthCheck
@@ -48,20 +50,19 @@ class RunReport:
     def of(cls, contents: RunContents) -> RunReport:
         """Raises DataError for a truth that cannot be read."""
         recording = Recording.of(contents)
-        scene = MapScene.of(contents, recording)
+        chosen = spread_out(len(contents.poses))
+        footage = Footage.of(recording, chosen, recording.camera or NOT_CAMERA)
+        scene = MapScene.of(contents, footage)
         photographer, pictures = None, {}
         if scene is not None:
-            photographer = Photographer(scene.mesh, scene.surface, contents.poses, recording, scene.camera)
+            photographer = Photographer(scene.mesh, scene.surface, contents.poses, footage)
             colors = object_colors(contents.objects)
             pictures = photographer.pictures(scene.mesh.instance_ids, scene.sightings.best, colors)
-        true_positions = {}
-        for k in scene.sightings.chosen if scene is not None else []:
-            frame = recording.frame(k)
-            if frame is not None and frame.T_world_camera is not None:
-                true_positions[k] = frame.T_world_camera[:3, 3]
         truth, why = recording.scene_truth()
-        check = TruthCheck.of(contents, truth, scene, photographer) if truth is not None else None
-        return cls(contents, scene, recording, pictures, TruePath.of(contents.poses, true_positions), check, why)
+        check = TruthCheck.of(contents, truth, scene, photographer, footage) if truth is not None else None
+        return cls(
+            contents, scene, recording, pictures, TruePath.of(contents.poses, footage.true_positions), check, why
+        )
 
     def html(self) -> str:
         """The page, the same for the same record and recording."""

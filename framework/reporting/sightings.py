@@ -39,31 +39,38 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
     return np.unique(np.rint(np.linspace(0, count - 1, min(count, most))).astype(int)).tolist() if count else []
 
 
-def sightings(mesh: LightMesh, labels: Int32, poses: Float64, camera: Camera) -> Sightings:
+def sightings(
+    mesh: LightMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
+) -> Sightings:
     """What the poses (P, 4, 4) saw of a mesh, by looking from some of them again.
 
     Args:
         labels: (V,) of the vertices, 0 = none.
         camera: that of the video.
+        clarity: how sharp the picture from a pose is, in [0, 1]; 1 where it is not in it.
     """
     chosen = spread_out(len(poses))
     small = camera.scaled(LOOK_WIDTH / camera.width)
     rasterizer = Rasterizer(mesh.vertices, mesh.triangles)
     first_seen = np.full(len(mesh.vertices), len(chosen), np.int32)
-    sizes = np.bincount(labels, minlength=1)
+    ids = np.union1d(labels, [0])
+    places = np.searchsorted(ids, labels).astype(np.int32)  # ids may be any numbers
+    sizes = np.bincount(places, minlength=len(ids))
     best_scores = np.zeros(len(sizes))
     best = np.full(len(sizes), -1)
     for step, k in enumerate(chosen):
         buffer = rasterizer.draw(small, poses[k])
         inside, visible = _seen(mesh.vertices, poses[k], small, buffer.depth)
         first_seen[visible & (first_seen == len(chosen))] = step
-        pixels = np.bincount(buffer.nearest(mesh.triangles, labels).ravel(), minlength=len(sizes))
-        whole = np.bincount(labels[inside], minlength=len(sizes)) / np.maximum(sizes, 1)
-        scores = pixels * whole**2  # one that is cut off by the picture's border tells less of an object
+        pixels = np.bincount(buffer.nearest(mesh.triangles, places).ravel(), minlength=len(sizes))
+        whole = np.bincount(places[inside], minlength=len(sizes)) / np.maximum(sizes, 1)
+        scores = (
+            clarity.get(k, 1.0) * pixels * whole**2
+        )  # one that is cut off by the picture's border tells less of an object
         better = scores > best_scores
         best[better], best_scores[better] = k, scores[better]
-    labelled = np.flatnonzero(best >= 0)
-    return Sightings(chosen, first_seen, {int(key): int(best[key]) for key in labelled if key > 0})
+    seen = {int(key): int(k) for key, k in zip(ids, best, strict=True) if key != 0 and k >= 0}
+    return Sightings(chosen, first_seen, seen)
 
 
 def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Float32) -> tuple[Bool, Bool]:

@@ -15,6 +15,7 @@ from framework.evaluation.instances import (
     judge,
     transfer_labels,
 )
+from framework.reporting.footage import Footage
 from framework.reporting.map_scene import MapScene
 from framework.reporting.pictures import Photographer, Picture
 from framework.reporting.run_contents import RunContents
@@ -41,7 +42,12 @@ class TruthCheck:
 
     @classmethod
     def of(
-        cls, contents: RunContents, truth: SceneTruth, scene: MapScene | None, photographer: Photographer | None
+        cls,
+        contents: RunContents,
+        truth: SceneTruth,
+        scene: MapScene | None,
+        photographer: Photographer | None,
+        footage: Footage,
     ) -> TruthCheck | None:
         """None where the record has no mesh, or the objects no classes."""
         if contents.mesh is None:
@@ -54,7 +60,7 @@ class TruthCheck:
             [one.class_name for one in objects],
         )
         judged, missed = judge(predictions, truth)
-        pictures = _pictures_of_true(truth, list(missed), scene, photographer)
+        pictures = _pictures_of_true(truth, list(missed), scene, photographer, footage)
         return cls(
             {one.id: one for one in judged},
             tuple(Missed(key, name, pictures.get(key)) for key, name in sorted(missed.items())),
@@ -62,13 +68,13 @@ class TruthCheck:
 
 
 def _pictures_of_true(
-    truth: SceneTruth, ids: list[int], scene: MapScene | None, photographer: Photographer | None
+    truth: SceneTruth, ids: list[int], scene: MapScene | None, photographer: Photographer | None, footage: Footage
 ) -> dict[int, Picture]:
     """Of true instances, with the part of each that was mapped outlined."""
     if scene is None or photographer is None or not ids:
         return {}
     true_ids = transfer_labels(truth.points_world, truth.instance_ids, scene.mesh.vertices, MAX_DISTANCE)
     labels = np.where(np.isin(true_ids, ids), true_ids, 0).astype(np.int32)
-    best = sightings(scene.mesh, labels, scene.contents.poses, scene.camera).best
+    best = sightings(scene.mesh, labels, scene.contents.poses, footage.camera, footage.clarity).best
     color: UInt8 = np.array(TRUE_COLOR, np.uint8)
     return photographer.pictures(labels, best, dict.fromkeys(best, color))

@@ -29,7 +29,7 @@ def at(x: float) -> np.ndarray:
 
 def test_each_place_is_known_when_it_comes_into_sight() -> None:
     mesh = wall()
-    found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA)
+    found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA, {})
     half = 2 * 100 / 150  # m, that the camera sees to either side
     x = mesh.vertices[:, 0]
     assert found.chosen == [0, 1, 2]
@@ -43,7 +43,7 @@ def test_each_place_is_known_when_it_comes_into_sight() -> None:
 def test_an_object_is_seen_best_where_none_of_it_is_cut_off() -> None:
     mesh = wall()
     poses = np.array([at(-3.2), at(-1.4), at(0.0), at(1.7)])
-    assert sightings(mesh, mesh.instance_ids, poses, CAMERA).best == {3: 1, 4: 3}
+    assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 1, 4: 3}
 
 
 def test_what_stands_behind_something_is_not_seen() -> None:
@@ -54,7 +54,7 @@ def test_what_stands_behind_something_is_not_seen() -> None:
         np.concatenate([mesh.colors, mesh.colors]),
         np.concatenate([mesh.instance_ids, np.where(mesh.instance_ids > 0, 9, 0).astype(np.int32)]),
     )
-    found = sightings(before, before.instance_ids, np.array([at(0.0)]), CAMERA)
+    found = sightings(before, before.instance_ids, np.array([at(0.0)]), CAMERA, {})
     assert (found.first_seen[: len(mesh.vertices)] == 1).all()
     assert 3 not in found.best
 
