@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from tqdm import tqdm
+
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
 from framework.files.whole_files import written_whole
@@ -53,7 +55,7 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
         _write(path, RunReport.of(runs[0]).html())
         return [path]
     pages = [directory / PAGE for directory in directories]
-    for page, run in zip(pages, runs, strict=True):
+    for page, run in zip(tqdm(pages, unit=" pages", disable=None, dynamic_ncols=True), runs, strict=True):
         _write(page, RunReport.of(run).html())
     path = out or Path(os.path.commonpath([place.parent for place in places])) / COMPARISON
     links = [quote(os.path.relpath(page.resolve(), path.resolve().parent)) for page in pages]

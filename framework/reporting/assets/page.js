@@ -42,6 +42,7 @@ class Page {
     this.chosen = null;
     this.confidence = report.likely;
     if (byId("canvas")) this.startViewer();
+    else document.body.dataset.ready = "true";
     document.querySelectorAll(".card[data-id]").forEach((card) => {
       card.addEventListener("click", () => this.choose(Number(card.dataset.id), { fly: true, scroll: true }));
     });
@@ -52,22 +53,25 @@ class Page {
 
   async startViewer() {
     try {
-      this.viewer = new MapViewer(byId("canvas"), (id) => this.choose(id));
+      const viewer = new MapViewer(byId("canvas"), (id) => this.choose(id));
+      this.glbs = [];
+      for (const [k, data] of report.maps.entries()) {
+        const content = await unpacked(byId(`map-${k}`));
+        this.glbs.push(content.slice(0));
+        await viewer.add(content, data);
+      }
+      this.viewer = viewer;
     } catch (error) {
       document.querySelector(".viewer").classList.add("no-webgl");
-      byId("panel").firstElementChild.textContent = "This browser shows no WebGL: here is a picture of the map.";
+      byId("panel").firstElementChild.textContent = `This browser cannot turn the map (${error.message}): here is a picture of it.`;
+      this.legend();
+      document.body.dataset.ready = "true";
       return;
     }
+    this.map = 0;
     this.buttons();
-    this.glbs = [];
-    for (const [k, data] of report.maps.entries()) {
-      const content = await unpacked(byId(`map-${k}`));
-      this.glbs.push(content.slice(0));
-      await this.viewer.add(content, data);
-    }
     this.viewer.resize();
     this.viewer.show(0);
-    this.map = 0;
     this.viewer.setConfidence(this.confidence);
     this.legend();
     this.setTime(1000);

@@ -203,3 +203,17 @@ def test_runs_are_switched_and_the_view_stays(pages: list[Path], opened: Any) ->
     page.get_by_role("link", name="first").click()
     page.wait_for_selector("body[data-ready]", timeout=30_000)
     assert page.url == pages[0].as_uri()
+
+
+def test_without_webgl_there_is_the_picture(pages: list[Path], browser: Any) -> None:
+    context = browser.new_context(offline=True)
+    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+    page = context.new_page()
+    page.goto(pages[0].as_uri())
+    page.wait_for_selector("body[data-ready]", timeout=30_000)
+    assert page.locator("#canvas").is_hidden()
+    assert page.locator(".still").is_visible()
+    assert page.evaluate("document.querySelector('.still').naturalWidth") > 1000
+    page.locator("#objects-table tbody tr").first.click()
+    assert "What it may be" in page.inner_text("#panel")
+    context.close()
