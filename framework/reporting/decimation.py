@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from framework.data import Bool, Float32, InstanceMesh, Int32, UInt8
+from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, UInt8
 
 OBJECTS_SHARE = 0.5  # of the triangles, that the objects may have
 QUADRIC_STEP = 2.5  # quadric decimation takes time by the square of this ratio: what has more is clustered first
 LEFT_TO_QUADRIC = 1.8  # triangles after clustering, by those that are wanted
+RELIEF = 0.03  # m, by which white stands out from black
+BRIGHTNESS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R BT.601
 COARSER = 1.3  # from one cell to the next one that is tried
 
 
@@ -67,16 +69,31 @@ def _decimated_part(mesh: InstanceMesh, instance_ids: Int32, chosen: Bool, most_
     )
     if len(part.triangles) <= most_triangles:
         return part
-    model = _open3d(part)
     if len(part.triangles) > QUADRIC_STEP * most_triangles:
-        cell = _cell(part.vertices, part.triangles, int(LEFT_TO_QUADRIC * most_triangles))
+        cell, model = _cell(part.vertices, part.triangles, int(LEFT_TO_QUADRIC * most_triangles)), _open3d(part)
         model = model.simplify_vertex_clustering(cell)
         while len(model.triangles) > QUADRIC_STEP * most_triangles:
             cell *= COARSER
             model = model.simplify_vertex_clustering(cell)
-    if len(model.triangles) > most_triangles:
-        model = model.simplify_quadric_decimation(max(most_triangles, 4))
-    return _relabeled(model, part.vertices, part.instance_ids)
+        part = _relabeled(model, part.vertices, part.instance_ids)
+    return _collapsed(part, most_triangles) if len(part.triangles) > most_triangles else part
+
+
+def _collapsed(mesh: LightMesh, most_triangles: int) -> LightMesh:
+    """Edges collapsed by quadrics, on a relief in which what is bright stands out: else flat pictures would be lost.
+
+    Vertices that are left go back to the nearest ones of the mesh, so place, colour and label are those of a vertex.
+    """
+    model = _open3d(mesh)
+    model.compute_vertex_normals()
+    brightness = mesh.colors @ BRIGHTNESS / 255
+    relief = mesh.vertices + RELIEF * brightness[:, None] * np.asarray(model.vertex_normals)
+    model.vertices = _vectors(relief)
+    model = model.simplify_quadric_decimation(max(most_triangles, 4))
+    model.remove_unreferenced_vertices()
+    _, nearest = cKDTree(relief, balanced_tree=False).query(np.asarray(model.vertices))
+    triangles = np.asarray(model.triangles).astype(np.int32).reshape(-1, 3)
+    return LightMesh(mesh.vertices[nearest], triangles, mesh.colors[nearest], mesh.instance_ids[nearest])
 
 
 def _cell(vertices: Float32, triangles: Int32, count: int) -> float:
@@ -89,11 +106,15 @@ def _cell(vertices: Float32, triangles: Int32, count: int) -> float:
 def _open3d(mesh: LightMesh) -> Any:
     import open3d as o3d  # here: it takes half a second to load
 
-    model = o3d.geometry.TriangleMesh(
-        o3d.utility.Vector3dVector(mesh.vertices.astype(np.float64)), o3d.utility.Vector3iVector(mesh.triangles)
-    )
-    model.vertex_colors = o3d.utility.Vector3dVector(mesh.colors / 255.0)
+    model = o3d.geometry.TriangleMesh(_vectors(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles))
+    model.vertex_colors = _vectors(mesh.colors / 255.0)
     return model
+
+
+def _vectors(rows: Float32 | Float64) -> Any:
+    import open3d as o3d
+
+    return o3d.utility.Vector3dVector(rows.astype(np.float64))
 
 
 def _relabeled(model: Any, vertices: Float32, instance_ids: Int32) -> LightMesh:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
@@ -81,7 +82,8 @@ def _seen(vertices: Float32, T_world_camera: Float64, camera: Camera, depth: Flo
     u, v = np.rint(camera.fx * x / ahead + camera.cx), np.rint(camera.fy * y / ahead + camera.cy)
     inside = (z > 1e-3) & (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
     visible = np.zeros(len(vertices), np.bool_)
-    seen = depth[v[inside].astype(int), u[inside].astype(int)]
-    # beside the surface nothing is in front: a vertex on its border may be rounded to there
-    visible[inside] = (seen == 0) | (z[inside] < seen + BEHIND + BEHIND_SHARE * seen)
+    # a vertex on the surface's border may be rounded to beside it
+    bordered = np.where(depth > 0, depth, cv2.dilate(depth, np.ones((3, 3), np.uint8)))
+    seen = bordered[v[inside].astype(int), u[inside].astype(int)]
+    visible[inside] = z[inside] < seen + BEHIND + BEHIND_SHARE * seen
     return inside, visible

@@ -44,7 +44,7 @@ class Page {
     if (byId("canvas")) this.startViewer();
     else document.body.dataset.ready = "true";
     document.querySelectorAll(".card[data-id]").forEach((card) => {
-      card.addEventListener("click", () => this.choose(Number(card.dataset.id), { fly: true, scroll: true }));
+      card.addEventListener("click", () => this.choose(Number(card.dataset.id), { fly: true }));
     });
     const search = byId("search");
     if (search) search.addEventListener("input", () => this.filter());
@@ -145,16 +145,22 @@ class Page {
   }
 
   /** Chooses an object, or none, everywhere. */
-  choose(id, { fly = false, scroll = false } = {}) {
+  choose(id, { fly = false } = {}) {
     if (!this.objects.has(id) && this.objects.size) id = null;
     this.chosen = id;
     if (this.viewer) {
       this.viewer.choose(id);
-      if (fly && id !== null) this.viewer.flyTo(id);
+      if (fly && id !== null) this.fly(id);
     }
     if (this.table) this.table.choose(id, !fly);
-    if (scroll && byId("map")) byId("map").scrollIntoView({ block: "start" });
     this.panel(id);
+  }
+
+  /** Comes near an object in the map, and scrolls to the map where little of it is in sight. */
+  fly(id) {
+    this.viewer.flyTo(id);
+    const { top, bottom, height } = byId("canvas").getBoundingClientRect();
+    if (Math.min(bottom, innerHeight) - Math.max(top, 0) < height / 3) byId("map").scrollIntoView({ block: "start" });
   }
 
   panel(id) {
