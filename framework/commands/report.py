@@ -13,8 +13,9 @@ from tqdm import tqdm
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
 from framework.files.whole_files import written_whole
+from framework.records.stored_runs import REPORT
 
-PAGE, COMPARISON = "report.html", "comparison.html"
+COMPARISON = "comparison.html"
 
 
 def main() -> None:
@@ -28,7 +29,7 @@ def main() -> None:
         "--out",
         metavar="FILE",
         type=Path,
-        help=f"where the page goes, that of the comparison where there are several runs; else {PAGE} in the run's "
+        help=f"where the page goes, that of the comparison where there are several runs; else {REPORT} in the run's "
         f"directory, or {COMPARISON} in the folder that all of them are in",
     )
     asked = arguments(parser)
@@ -51,10 +52,10 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
         raise DataError(f"{directories[0]}: each run is to be named once")
     runs = [RunContents.read(directory) for directory in directories]
     if len(runs) == 1:
-        path = out or directories[0] / PAGE
+        path = out or directories[0] / REPORT
         _write(path, RunReport.of(runs[0]).html())
         return [path]
-    pages = [directory / PAGE for directory in directories]
+    pages = [directory / REPORT for directory in directories]
     for page, run in zip(tqdm(pages, unit=" pages", disable=None, dynamic_ncols=True), runs, strict=True):
         _write(page, RunReport.of(run).html())
     path = out or Path(os.path.commonpath([place.parent for place in places])) / COMPARISON
@@ -67,4 +68,4 @@ def _write(path: Path, page: str) -> None:
     if not path.parent.is_dir():
         raise DataError(f"{path} could not be written: its folder does not exist")
     with written_whole(path) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+        temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be no text

@@ -35,7 +35,7 @@ from framework.records.metrics import (
     trajectory_metrics,
 )
 from framework.records.provenance import code_version, config_hash, environment
-from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES, TRAJECTORY
+from framework.records.stored_runs import CONFIG, MAP, MAPPED, METRICS, PARTIAL_METRICS, PLACES, REPORT, TRAJECTORY
 from framework.registry import STAGES
 from framework.rendering.overview import write_overview
 from framework.tracking.places_file import write_places
@@ -61,7 +61,7 @@ class RunRecord:
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
-        """Takes `directory` over: an earlier run's metrics are removed, so that they cannot pass for this one's."""
+        """Takes `directory` over: an earlier run's metrics and report are removed: they could pass for this one's."""
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         asked = {str(key): value for key, value in resolved.items()}
@@ -69,7 +69,7 @@ class RunRecord:
         provenance: Metrics = {**code_version(), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
-        for name in (METRICS, PARTIAL_METRICS):
+        for name in (METRICS, PARTIAL_METRICS, REPORT):
             (directory / name).unlink(missing_ok=True)
         _write_config(directory / CONFIG, asked)
         _reset_peak_memory()

@@ -27,6 +27,7 @@ PARTIAL_METRICS = "metrics.partial.json"  # in its place when the run ended earl
 LOG = "instancemap.log"
 MAP = "map.npz"
 TRAJECTORY = "trajectory.txt"
+REPORT = "report.html"  # what `report` writes: made of a record, and no part of it
 PLACES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
 MAPPED = (TRAJECTORY, "timings.csv", "instances.json", "mesh.ply", MAP, "overview.png")
 """What is written of a map, in this order: on a disk that is full the small ones still find a place."""

@@ -16,7 +16,7 @@ from framework.records.run_record import LIKELY
 from framework.records.stored_runs import is_number
 from framework.registry import STAGES
 from framework.reporting.footage import Footage
-from framework.reporting.map_scene import MapScene, likely_ids
+from framework.reporting.map_scene import MapScene
 from framework.reporting.markup import page, section, table, tag, words
 from framework.reporting.run_contents import RunContents
 from framework.reporting.run_page import lost_after, viewer
@@ -123,7 +123,7 @@ class Comparison:
             for k, (name, _) in enumerate(shown)
         ]
         choice = tag("div", tag("div", *buttons, class_="choice", role="group", aria_label="Run"), class_="tools")
-        return section("map", "Maps", choice, viewer("", len(likely_ids(shown[0][1].contents))))
+        return section("map", "Maps", choice, viewer(""))
 
     def _figures(self) -> str:
         rows = []

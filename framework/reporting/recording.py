@@ -68,14 +68,14 @@ class Recording:
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """The true instances that the run was compared with; None where there are none, and then why, "" = never were.
-
-        Raises DataError for a truth that cannot be read.
-        """
+        """The true instances that the run was compared with; None where there are none, then why, "" = never were."""
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:
             return None, self.why_not if expected else ""
-        truth = self.video.scene_truth()
+        try:
+            truth = self.video.scene_truth()
+        except (InstanceMapError, OSError) as error:
+            return None, str(error)
         if truth is None:
             return None, "the dataset has no true instances any more" if expected else ""
         if expected is not None and truth_sha256(truth) != expected:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,6 +12,8 @@ import yaml
 from PIL import Image
 
 from framework.data import Float64
+from framework.errors import FrameError
+from framework.files.image_files import read_color
 from framework.records.provenance import leaves
 from framework.records.run_record import LIKELY
 from framework.records.stored_runs import is_number
@@ -48,7 +49,7 @@ class RunReport:
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
-        """Raises DataError for a truth that cannot be read."""
+        """Looks at the recording again, where it can be read."""
         recording = Recording.of(contents)
         chosen = spread_out(len(contents.poses))
         footage = Footage.of(recording, chosen, recording.camera or NOT_CAMERA)
@@ -124,7 +125,7 @@ class RunReport:
             return section("map", "Map", tag("p", "Nothing was mapped.", class_="empty"))
         overview = overview_url(self.contents.record.directory / "overview.png")
         still = f'<img class="still" src="{overview}" alt="The map and its instances, rendered">' if overview else ""
-        return section("map", "Map", viewer(still, likely_count(self.contents)))
+        return section("map", "Map", viewer(still))
 
     def _objects(self) -> str:
         contents = self.contents
@@ -248,7 +249,7 @@ TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("
 GROWTH_KEY = (("seen", "surface in sight, share of all"), ("objects", "objects found"))
 
 
-def viewer(still: str, likely: int) -> str:
+def viewer(still: str) -> str:
     """The map's place in the page, with its buttons; `still` is shown where there is no WebGL."""
     views = [
         tag("button", name, type="button", data_view=view, aria_pressed="true" if view == "color" else "false")
@@ -277,7 +278,7 @@ def viewer(still: str, likely: int) -> str:
         class_="tools time",
     )
     hint = tag("p", "Drag to turn, scroll or pinch to come closer, click an object for its numbers.", class_="faint")
-    panel = tag("aside", hint, tag("div", id="legend"), id="panel", aria_live="polite", data_likely=likely)
+    panel = tag("aside", hint, tag("div", id="legend"), id="panel", aria_live="polite")
     stage = tag("div", '<canvas id="canvas" tabindex="0" aria-label="The map in 3D"></canvas>', still, class_="stage")
     return tag("div", bar, tag("div", stage, panel, class_="split"), time, class_="viewer")
 
@@ -328,9 +329,8 @@ def lost_after(contents: RunContents) -> list[int]:
 def overview_url(path: Path) -> str:
     """overview.png as a smaller picture, "" where there is none that can be read."""
     try:
-        with Image.open(io.BytesIO(path.read_bytes()), formats=["PNG"]) as image:
-            small = image.convert("RGB")
-    except (OSError, ValueError, Image.DecompressionBombError):
+        small = Image.fromarray(read_color(path))
+    except FrameError:
         return ""
     small.thumbnail((OVERVIEW_WIDTH, OVERVIEW_WIDTH))
     return webp_url(small, 80)
@@ -346,9 +346,7 @@ def _caption(text: str, keys: tuple[tuple[str, str], ...] = ()) -> str:
 
 
 def _time_bar(lowest: float, median: float, p95: float) -> str:
-    low, middle, high = (f"{100 * share:.1f}" for share in (lowest, median, p95))
-    wide = f"{100 * (p95 - lowest):.1f}"
-    assert high
+    low, middle, wide = (f"{100 * share:.1f}" for share in (lowest, median, p95 - lowest))
     return (
         '<svg class="spread" viewBox="0 0 100 10" preserveAspectRatio="none" aria-hidden="true">'
         f'<rect class="spread-all" x="{low}" y="3" width="{wide}" height="4"/>'

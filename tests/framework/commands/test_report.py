@@ -13,7 +13,9 @@ import pytest
 
 from framework import configs
 from framework.commands import report
+from framework.errors import DataError
 from tests.reported_run import rename_class, write_run
+from tests.scenes.corner_room import CornerRoom
 
 pytestmark = pytest.mark.usefixtures("fakes_registered")
 
@@ -97,6 +99,29 @@ def test_another_recording_in_its_place_is_not_taken_for_it(stored: Path, comman
     (stored / "trajectory.txt").write_text("\n".join(moved) + "\n")
     assert command(stored)[0] == 0
     assert "the recording is not the one that was mapped" in texts((stored / "report.html").read_text())
+
+
+def test_names_that_are_no_text_are_written_as_their_codes(stored: Path, command) -> None:
+    rename_class(stored, "cup \ud800")
+    assert command(stored)[0] == 0
+    assert "cup \\ud800" in texts((stored / "report.html").read_text())
+
+
+def test_another_run_into_the_folder_takes_the_report_with_it(stored: Path, command) -> None:
+    assert command(stored)[0] == 0
+    write_run(stored, frames=3)
+    assert not (stored / "report.html").exists()
+
+
+def test_a_truth_that_cannot_be_read_is_said(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreadable(_: CornerRoom) -> None:
+        raise DataError("instances.json is not valid JSON")
+
+    monkeypatch.setattr(CornerRoom, "scene_truth", unreadable)
+    assert command(stored)[0] == 0
+    said = texts((stored / "report.html").read_text())
+    assert "cannot be compared any more: instances.json is not valid JSON" in said
+    assert "AP50" in said
 
 
 def test_a_partial_run_says_that_it_is_one(stored: Path, command) -> None:
