@@ -17,7 +17,6 @@ const VERTEX_SHADER = `
 
 const FRAGMENT_SHADER = `
   uniform float painted;
-  uniform float chosen;
   uniform float faded;
   uniform float now;
   uniform vec3 paint;
@@ -38,7 +37,6 @@ const FRAGMENT_SHADER = `
     else if (painted > 0.5) shown = pale;
     float lit = 0.74 + 0.30 * max(dot(normalize(vNormal), normalize(vec3(-0.45, 0.75, 0.6))), 0.0);
     shown *= lit;
-    if (chosen > 0.5 && painted < 0.5) shown = mix(shown, paint, 0.25);
     shown = mix(min(shown, vec3(1.0)), ground, faded);
     gl_FragColor = vec4(min(shown, vec3(1.0)), 1.0);
   }`;
@@ -158,7 +156,6 @@ class MapViewer {
       const { uniforms } = part.material;
       uniforms.painted.value = this.view === "color" ? 0 : likely ? 2 : 1;
       if (object) uniforms.paint.value.set(...rgb(this.view === "class" ? object.classColor : object.color));
-      uniforms.chosen.value = id === this.chosen ? 1 : 0;
       uniforms.faded.value = this.chosen === null || id === this.chosen ? 0 : FADED;
       uniforms.ground.value.set(...ground);
       uniforms.now.value = this.now;
@@ -259,7 +256,6 @@ function material() {
     vertexColors: true,
     uniforms: {
       painted: { value: 0 },
-      chosen: { value: 0 },
       faded: { value: 0 },
       now: { value: 1 },
       paint: { value: new THREE.Vector3() },
