@@ -65,8 +65,8 @@ def sightings(
         first_seen[visible & (first_seen == len(chosen))] = step
         pixels = np.bincount(buffer.nearest(mesh.triangles, places).ravel(), minlength=len(sizes))
         whole = np.bincount(places[inside], minlength=len(sizes)) / np.maximum(sizes, 1)
-        # a picture whose border cuts an object off tells less of it
-        scores = clarity.get(k, 1.0) * pixels * whole**2
+        # a picture whose border cuts an object off tells less of it, and twice as large is not twice as good
+        scores = clarity.get(k, 1.0) * np.sqrt(pixels) * whole**2
         better = scores > best_scores
         best[better], best_scores[better] = k, scores[better]
     seen = {int(key): int(k) for key, k in zip(ids, best, strict=True) if key != 0 and k >= 0}

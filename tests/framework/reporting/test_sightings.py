@@ -42,8 +42,17 @@ def test_each_place_is_known_when_it_comes_into_sight() -> None:
 
 def test_an_object_is_seen_best_where_none_of_it_is_cut_off() -> None:
     mesh = wall()
-    poses = np.array([at(-3.2), at(-1.4), at(0.0), at(1.7)])
-    assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 1, 4: 3}
+    near = at(-1.0)
+    near[2, 3] = 1.0  # it sees more of the object's pixels, but 0.59 of the object
+    poses = np.array([at(-3.2), near, at(-1.4), at(0.0), at(1.7)])
+    assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 2, 4: 4}
+
+
+def test_a_blurred_picture_is_not_the_best_one() -> None:
+    mesh = wall()
+    poses = np.array([at(-1.4), at(-1.5), at(1.7)])
+    both = [sightings(mesh, mesh.instance_ids, poses, CAMERA, {k: 0.4}).best[3] for k in (0, 1)]
+    assert both == [1, 0]
 
 
 def test_what_stands_behind_something_is_not_seen() -> None:
