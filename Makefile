@@ -25,6 +25,7 @@ help: ## this list
 .PHONY: demo
 demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
 	@$(BIN)/python -m framework dataset=desk hydra.run.dir=$(DEMO)
+	@page="$$($(BIN)/python -m framework report $(DEMO))"; echo "report: $$page"
 
 .PHONY: test
 test: $(INSTALLED_DEV) ## lint, check types, run the tests

@@ -114,6 +114,26 @@ class Score:
         return self.matched_iou / (self.true_positives + 0.5 * self.false_positives + 0.5 * missed)
 
 
+class Outcome(Enum):
+    """What became of a prediction."""
+
+    RIGHT = "right"  # matched with a true instance of its class
+    WRONG_CLASS = "wrong class"  # it overlaps a true instance of another class enough
+    FALSE = "false"  # it overlaps none enough, or one that a more confident prediction has found already
+    IGNORED = "not judged"  # it lies where the truth is not known, or nobody looked for its class
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """One prediction against the truth."""
+
+    id: int
+    outcome: Outcome
+    truth_id: int  # the true instance that it overlaps most, 0 = none; of a match the one that it is matched with
+    truth_class: str | None  # None = not known
+    iou: float  # with that one
+
+
 @dataclass(frozen=True)
 class InstanceEvaluation:
     """What `evaluate` found. Empty where the truth holds no instance that counts."""
@@ -200,6 +220,26 @@ def evaluate(
     return InstanceEvaluation(by_class, agnostic, overall, best_ious, best_ids)
 
 
+def judge(
+    predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
+) -> tuple[list[Judgement], dict[int, str]]:
+    """What became of each prediction, best first, and the class of each true instance that counts and was missed.
+
+    By the matching of `InstanceEvaluation.overall`: the counts are those of its score at that IoU.
+    """
+    overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
+    everything = np.ones(len(overlaps.predicted_ids), np.bool_)
+    same_class = overlaps.evaluated & (overlaps.predicted_classes[:, None] == overlaps.truth_classes[None, :])
+    matches = overlaps.matches(threshold, everything, same_class)
+    judged = [overlaps.judgement(k, match, threshold) for k, match in matches]
+    found = {one.truth_id for one in judged if one.outcome is Outcome.RIGHT}
+    counted = zip(overlaps.truth_ids.tolist(), overlaps.truth_classes, overlaps.evaluated, strict=True)
+    return judged, {key: name for key, name, counts in counted if counts and key not in found}
+
+
+IGNORED, NO_MATCH = -2, -1  # in place of a true instance's column
+
+
 @dataclass(frozen=True)
 class _Overlaps:
     """K predictions, best first, against T true instances."""
@@ -245,30 +285,52 @@ class _Overlaps:
 
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
         """Matches the chosen predictions (K,) in order of confidence with true instances that are `allowed` (K, T)."""
-        ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
-        unknown = self.ignorable | (ignored_iou >= threshold)
-        free = np.ones(len(self.truth_ids), np.bool_)
-        hits: list[bool] = []  # of the predictions that count, best first
-        ignored, matched_iou = 0, 0.0
-        for k in np.flatnonzero(predicted):
-            candidates = np.where(allowed[k] & free, self.iou[k], 0.0)
-            best = int(candidates.argmax()) if len(candidates) else -1
-            if best >= 0 and candidates[best] >= threshold:
-                free[best] = False
-                matched_iou += float(candidates[best])
-                hits.append(True)
-            elif unknown[k]:
-                ignored += 1
-            else:
-                hits.append(False)
+        matches = self.matches(threshold, predicted, allowed)
+        hits = [match >= 0 for _, match in matches if match != IGNORED]  # of the predictions that count, best first
         count = int((truths & self.evaluated).sum())
         return Score(
             ap=average_precision(np.array(hits, np.bool_), count),
             true_positives=sum(hits),
             false_positives=len(hits) - sum(hits),
-            ignored=ignored,
+            ignored=len(matches) - len(hits),
             truths=count,
-            matched_iou=matched_iou,
+            matched_iou=sum(float(self.iou[k, match]) for k, match in matches if match >= 0),
+        )
+
+    def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
+        """Each of the chosen predictions (K,), best first, with the column of its match, NO_MATCH or IGNORED."""
+        ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
+        unknown = self.ignorable | (ignored_iou >= threshold)
+        free = np.ones(len(self.truth_ids), np.bool_)
+        found: list[tuple[int, int]] = []
+        for k in np.flatnonzero(predicted).tolist():
+            candidates = np.where(allowed[k] & free, self.iou[k], 0.0)
+            best = int(candidates.argmax()) if len(candidates) else -1
+            if best >= 0 and candidates[best] >= threshold:
+                free[best] = False
+                found.append((k, best))
+            else:
+                found.append((k, IGNORED if unknown[k] else NO_MATCH))
+        return found
+
+    def judgement(self, k: int, match: int, threshold: float) -> Judgement:
+        """Of prediction k with what `matches` says of it."""
+        t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
+        iou = float(self.iou[k, t]) if t >= 0 else 0.0
+        if match >= 0:
+            outcome = Outcome.RIGHT
+        elif match == IGNORED:
+            outcome = Outcome.IGNORED
+        else:
+            other = iou >= threshold and self.truth_classes[t] != self.predicted_classes[k]
+            outcome = Outcome.WRONG_CLASS if other else Outcome.FALSE
+        near = iou > 0
+        return Judgement(
+            id=int(self.predicted_ids[k]),
+            outcome=outcome,
+            truth_id=int(self.truth_ids[t]) if near else 0,
+            truth_class=self.truth_classes[t] if near else None,
+            iou=iou,
         )
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:

@@ -85,10 +85,10 @@ def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annot
     figures = instances.evaluate(predictions, truth).metrics()
     to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
     of_map = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
-    return {**figures, **of_map, "annotation_release": annotation or None, TRUTH: _sha256(truth)}
+    return {**figures, **of_map, "annotation_release": annotation or None, TRUTH: truth_sha256(truth)}
 
 
-def _sha256(truth: SceneTruth) -> str:
+def truth_sha256(truth: SceneTruth) -> str:
     """Of all that predictions are compared with."""
     digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
     for array in (truth.points_world, truth.instance_ids):

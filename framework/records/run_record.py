@@ -44,6 +44,7 @@ from framework.records.stored_runs import (
     METRICS,
     PARTIAL_METRICS,
     PLACES,
+    REPORT,
     TRAJECTORY,
 )
 from framework.registry import STAGES
@@ -71,7 +72,7 @@ class RunRecord:
 
     @classmethod
     def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
-        """Takes `directory` over: an earlier run's metrics are removed, so that they cannot pass for this one's."""
+        """Takes `directory` over: an earlier run's metrics and report are removed: they could pass for this one's."""
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         asked = {str(key): value for key, value in resolved.items()}
@@ -79,7 +80,7 @@ class RunRecord:
         provenance: Metrics = {**code_version(), **environment()}
         directory.mkdir(parents=True, exist_ok=True)
         remove_left_over(directory)
-        for name in (METRICS, PARTIAL_METRICS):
+        for name in (METRICS, PARTIAL_METRICS, REPORT):
             (directory / name).unlink(missing_ok=True)
         _write_config(directory / CONFIG, asked)
         _reset_peak_memory()

@@ -29,6 +29,7 @@ MAP = "map.npz"
 MESH = "mesh.ply"
 INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
+REPORT = "report.html"  # what `report` writes: made of a record, and no part of it
 PLACES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 """What is written of a map, in this order: on a disk that is full the small ones still find a place."""
@@ -100,6 +101,18 @@ def read_record(directory: Path) -> Record:
     except OSError as error:  # the run has just begun again
         raise DataError(f"{directory / METRICS} cannot be read: {error.strerror}") from error
     return Record(directory, metrics, config, written)
+
+
+def read_partial(directory: Path) -> tuple[Record, str]:
+    """What there is of a run that ended early, and why it did.
+
+    Raises DataError, naming the file, when one cannot be read or the two are not of the same run.
+    """
+    path = directory / PARTIAL_METRICS
+    metrics, config = _read_flat(path), read_yaml(directory / CONFIG)
+    if metrics.get("config_hash") != config_hash(config):
+        raise DataError(f"{path} is not of the config beside it: config_hash differs; run it again")
+    return Record(directory, metrics, config, path.stat().st_mtime), str(metrics.get("partial"))
 
 
 def find_records(root: Path) -> tuple[list[Record], list[Incomplete]]:

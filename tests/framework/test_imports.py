@@ -31,6 +31,7 @@ LAYERS = [
     ["tables"],
     ["figures"],
     ["exporting"],
+    ["reporting"],
     ["api"],
     ["commands"],
     ["__main__"],

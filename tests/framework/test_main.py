@@ -162,6 +162,7 @@ FAULTY = {
     "figures": ["nowhere"],
     "import": ["old", "new"],
     "check": ["out=check.jpg"],
+    "report": ["nowhere"],
     "diff": ["old", "old"],
     "export": ["nowhere", "--to", "glb"],
     "evaluate": ["old"],

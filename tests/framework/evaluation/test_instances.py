@@ -10,7 +10,7 @@ import pytest
 
 from framework.data import SceneTruth
 from framework.errors import DataError
-from framework.evaluation.instances import PredictedInstances, Transfer, average_precision, evaluate
+from framework.evaluation.instances import Outcome, PredictedInstances, Transfer, average_precision, evaluate, judge
 
 SPACING = 0.2  # m between the points of a scene: more than twice the transfer distance, so points never mix
 
@@ -343,3 +343,27 @@ def test_the_transfer_distance_itself_is_near_enough(transfer):
     at, below = 5 / 64, float(np.nextafter(5 / 64, 0))
     assert evaluate(moved, truth, transfer=transfer, max_distance=at).best_ious == {1: 1.0}
     assert evaluate(moved, truth, transfer=transfer, max_distance=below).best_ious == {1: 0.0}
+
+
+def test_each_prediction_is_judged_as_it_is_counted():
+    """Right, taken for another class, a second one on the same object, on nothing, and where nobody knows."""
+    names = {1: "chair", 2: "bed", 3: "chair", 4: None, 5: "book"}
+    truth = scene([(1, 120), (2, 100), (3, 100), (4, 100), (5, 100), (0, 100)], names)
+    runs = [(11, 80), (12, 40), (13, 100), (0, 100), (14, 100), (0, 100), (15, 100)]
+    claims = {11: ("chair", 0.9), 12: ("chair", 0.8), 13: ("couch", 0.7), 14: ("chair", 0.6), 15: ("bed", 0.5)}
+    predictions = prediction(truth, runs, claims)
+    judged, missed = judge(predictions, truth)
+    assert [(one.id, one.outcome, one.truth_id, one.truth_class) for one in judged] == [
+        (11, Outcome.RIGHT, 1, "chair"),
+        (12, Outcome.FALSE, 1, "chair"),
+        (13, Outcome.WRONG_CLASS, 2, "bed"),
+        (14, Outcome.IGNORED, 4, None),
+        (15, Outcome.FALSE, 0, None),
+    ]
+    assert [one.iou for one in judged] == pytest.approx([80 / 120, 40 / 120, 1.0, 1.0, 0.0])
+    assert missed == {2: "bed", 3: "chair", 5: "book"}
+    overall = evaluate(predictions, truth).overall
+    assert overall is not None
+    counts = [sum(one.outcome is outcome for one in judged) for outcome in (Outcome.RIGHT, Outcome.IGNORED)]
+    assert counts == [overall.true_positives, overall.ignored]
+    assert overall.truths - overall.true_positives == len(missed)

@@ -1,0 +1,73 @@
+"use strict";
+
+// A table whose columns sort it, whose rows can be chosen, and which shows only what is looked for.
+
+class ObjectTable {
+  constructor(table, onChoose) {
+    this.body = table.tBodies[0];
+    this.rows = [...this.body.rows];
+    this.heads = [...table.tHead.rows[0].cells];
+    this.heads.forEach((head, column) => {
+      const button = head.querySelector("button");
+      if (button) button.addEventListener("click", () => this.sort(column));
+    });
+    this.body.addEventListener("click", (event) => {
+      const row = event.target.closest("tr");
+      if (row) onChoose(Number(row.dataset.id));
+    });
+    this.body.addEventListener("keydown", (event) => {
+      const row = event.target.closest("tr");
+      if (event.key === "Enter" || event.key === " ") onChoose(Number(row.dataset.id));
+      else if (event.key === "ArrowDown") this.focusFrom(row, 1);
+      else if (event.key === "ArrowUp") this.focusFrom(row, -1);
+      else return;
+      event.preventDefault();
+    });
+  }
+
+  /** Numbers begin with the largest, words with A; again turns that around. */
+  sort(column) {
+    const head = this.heads[column];
+    const numeric = head.classList.contains("number");
+    const before = head.getAttribute("aria-sort");
+    const first = numeric ? "descending" : "ascending";
+    const order = before === first ? (numeric ? "ascending" : "descending") : first;
+    this.heads.forEach((one) => one.removeAttribute("aria-sort"));
+    head.setAttribute("aria-sort", order);
+    const value = (row) => row.cells[column].dataset.value;
+    const sign = order === "ascending" ? 1 : -1;
+    this.rows.sort((a, b) => sign * (numeric ? value(a) - value(b) : value(a).localeCompare(value(b), "en", { numeric: true })));
+    this.body.append(...this.rows);
+  }
+
+  /** Hides rows without these words; pales those that are less confident. Returns how many are shown. */
+  filter(words, confidence) {
+    let shown = 0;
+    for (const row of this.rows) {
+      const found = row.dataset.words.includes(words) || row.dataset.id === words;
+      row.hidden = !found;
+      row.classList.toggle("unlikely", Number(row.dataset.confidence) < confidence);
+      shown += found;
+    }
+    return shown;
+  }
+
+  choose(id, scroll) {
+    for (const row of this.rows) {
+      const chosen = Number(row.dataset.id) === id;
+      row.setAttribute("aria-selected", chosen);
+      if (chosen && scroll) row.scrollIntoView({ block: "nearest" });
+    }
+  }
+
+  focusFrom(row, step) {
+    const shown = this.rows.filter((one) => !one.hidden);
+    const next = shown[shown.indexOf(row) + step];
+    if (next) next.focus();
+  }
+
+  picture(id) {
+    const row = this.rows.find((one) => Number(one.dataset.id) === id);
+    return row && row.querySelector("img");
+  }
+}

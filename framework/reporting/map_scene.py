@@ -1,0 +1,129 @@
+"""A run's map as it is shown: light, with colours for its objects and a place to look at it from."""
+
+from __future__ import annotations
+
+import base64
+import gzip
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from framework.data import Camera, Float64, Int32, UInt8
+from framework.records.run_record import LIKELY
+from framework.rendering.palette import instance_colors
+from framework.rendering.surface import Surface
+from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
+from framework.reporting.decimation import LightMesh, decimated
+from framework.reporting.footage import Footage
+from framework.reporting.run_contents import MappedObject, RunContents
+from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
+from framework.reporting.sightings import Sightings, sightings, spread_out
+
+VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, whose proportions the first view is chosen for
+PATH_POINTS = 400  # of the camera's way
+
+
+@dataclass(frozen=True)
+class MapScene:
+    """What the viewer shows of one run."""
+
+    contents: RunContents
+    mesh: LightMesh
+    surface: Surface  # the same, wound so that it shows its front to where the camera was
+    sightings: Sightings
+    up: Float64  # (3,)
+
+    @classmethod
+    def of(cls, contents: RunContents, footage: Footage, share: float = 1.0) -> MapScene | None:
+        """None where nothing was mapped. `share` of the triangles and bytes that a file may have is for this one."""
+        if contents.mesh is None or not len(contents.poses):
+            return None
+        mesh = decimated(contents.mesh, contents.instance_ids(contents.mesh), max(1, int(share * MOST_TRIANGLES)))
+        mesh = light_enough(mesh, int(share * MOST_BYTES))
+        if not len(mesh.triangles):
+            return None
+        surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.poses)
+        mesh = LightMesh(surface.vertices, surface.triangles, mesh.colors, mesh.instance_ids)
+        up = contents.up if contents.up is not None else upward(contents.poses, surface)
+        seen = sightings(mesh, mesh.instance_ids, contents.poses, footage.camera, footage.clarity)
+        return cls(contents, mesh, surface, seen, up)
+
+    def glb(self) -> str:
+        """The map as GLB, compressed by gzip, in base64: the same for the same record."""
+        steps = max(1, len(self.sightings.chosen))
+        names = {one.id: one.class_name for one in self.contents.objects}
+        content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names)
+        return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
+
+    @property
+    def likely_labels(self) -> Int32:
+        """(V,) 1 + the place among the likely objects of the one that a vertex is of, 0 = of none."""
+        likely = np.array([0, *likely_ids(self.contents)])
+        places = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
+        return np.where(likely[places] == self.mesh.instance_ids, places, 0).astype(np.int32)
+
+    @cached_property
+    def view(self) -> tuple[Camera, Float64]:
+        """From where the map is looked at first: a camera and its T_world_camera."""
+        return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
+
+    def data(self) -> dict[str, Any]:
+        """What the viewer's script needs beside the GLB."""
+        poses = self.contents.poses
+        _, T_world_camera = self.view
+        eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
+        distance = float(np.median((self.mesh.vertices - eye) @ forward))
+        numbers = self.contents.tracked_frames or tuple(range(len(poses)))
+        colors, class_colors = object_colors(self.contents.objects), colors_of_classes(self.contents.objects)
+        return {
+            "up": _rounded(self.up),
+            "eye": _rounded(eye),
+            "target": _rounded(eye + max(distance, 0.1) * forward),
+            "fov": float(np.rad2deg(FIELD_OF_VIEW_RAD)),
+            "path": [_rounded(poses[k][:3, 3]) for k in spread_out(len(poses), PATH_POINTS)],
+            "frames": [numbers[k] for k in self.sightings.chosen],
+            "objects": [
+                {
+                    "id": one.id,
+                    "class": one.class_name,
+                    "confidence": one.confidence,
+                    "color": hex_color(colors[one.id]),
+                    "classColor": class_colors[one.class_name],
+                }
+                for one in self.contents.objects
+            ],
+        }
+
+
+def likely_ids(contents: RunContents) -> list[int]:
+    """The objects that are in a run's overview.png."""
+    return [one.id for one in contents.objects if one.confidence >= LIKELY]
+
+
+def object_colors(objects: tuple[MappedObject, ...]) -> dict[int, UInt8]:
+    """RGB (3,) by id: those of overview.png, then others for what is too unlikely to be there."""
+    ordered = sorted(objects, key=lambda one: (one.confidence < LIKELY, one.id))
+    places = {one.id: one.centroid for one in ordered if one.centroid is not None}
+    chosen = instance_colors(np.array(list(places.values()), np.float64).reshape(-1, 3))
+    colors = dict(zip(places, chosen, strict=True))
+    return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}
+
+
+def colors_of_classes(objects: tuple[MappedObject, ...]) -> dict[str, str]:
+    """#rrggbb by class; those of the likeliest objects are least like each other."""
+    most: dict[str, float] = {}
+    for one in objects:
+        most[one.class_name] = max(one.confidence, most.get(one.class_name, 0.0))
+    names = sorted(most, key=lambda name: (-most[name], name))
+    return dict(zip(names, map(hex_color, instance_colors(np.zeros((len(names), 3)))), strict=True))
+
+
+def hex_color(color: UInt8) -> str:
+    """#rrggbb."""
+    return "#" + bytes(color.tolist()).hex()
+
+
+def _rounded(point: Float64) -> list[float]:
+    return [round(float(value), 4) for value in point]

@@ -1,0 +1,93 @@
+"""Meshes made light."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from framework.data import InstanceMesh, Int32
+from framework.reporting.decimation import LightMesh, clustered, decimated
+
+
+def wavy_plane(n: int = 120) -> InstanceMesh:
+    """1 m by 1 m, red on one half, blue on the other; a square in the middle is an object."""
+    x, y = np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij")
+    vertices = np.stack([x, y, 0.02 * np.sin(12 * x) * np.cos(9 * y)], axis=-1).reshape(-1, 3).astype(np.float32)
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    triangles = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
+    colors = np.where(vertices[:, :1] < 0.5, (200, 10, 10), (10, 10, 200)).astype(np.uint8)
+    inside = (np.abs(vertices[:, :2] - 0.5) < 0.2).all(axis=1)
+    ids = np.where(inside, 7, 0).astype(np.int32)
+    classes = np.full(len(ids), -1, np.int32)
+    return InstanceMesh(vertices, triangles.astype(np.int32), colors, ids, classes, ())
+
+
+def areas(vertices: np.ndarray, triangles: Int32) -> np.ndarray:
+    a, b, c = vertices[triangles].transpose(1, 0, 2)
+    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
+
+
+@pytest.mark.parametrize("most", [8000, 300])  # collapsed; clustered and then collapsed
+def test_surface_colours_and_labels_are_kept(most: int) -> None:
+    mesh = wavy_plane()
+    light = decimated(mesh, mesh.instance_ids, most)
+    assert 0.6 * most < len(light.triangles) <= most
+    area = areas(mesh.vertices, mesh.triangles).sum()
+    assert areas(light.vertices, light.triangles).sum() == pytest.approx(area, rel=0.08)
+    x, y, z = light.vertices.T
+    assert np.abs(z - 0.02 * np.sin(12 * x) * np.cos(9 * y)).max() < 0.012
+    left, right = light.vertices[:, 0] < 0.4, light.vertices[:, 0] > 0.6
+    assert (light.colors[left, 0] > 150).all()
+    assert (light.colors[right, 2] > 150).all()
+    middle = light.vertices[light.instance_ids == 7]
+    assert (np.abs(middle[:, :2] - 0.5) < 0.25).all()
+    corners = (light.instance_ids[light.triangles] == 7).all(axis=1)
+    assert areas(light.vertices, light.triangles[corners]).sum() == pytest.approx(0.16, rel=0.12)
+
+
+def test_objects_stay_finer_than_what_is_around_them() -> None:
+    mesh = wavy_plane()
+    light = decimated(mesh, mesh.instance_ids, 3000)
+    of_object = (light.instance_ids[light.triangles] == 7).all(axis=1)
+    sizes = areas(light.vertices, light.triangles)
+    assert np.median(sizes[of_object]) < 0.5 * np.median(sizes[~of_object])
+
+
+def test_what_is_small_enough_stays_as_it_is() -> None:
+    mesh = wavy_plane(20)
+    light = decimated(mesh, mesh.instance_ids, 1000)
+    assert len(light.triangles) == len(mesh.triangles)
+    assert areas(light.vertices, light.triangles).sum() == areas(mesh.vertices, mesh.triangles).sum()
+
+
+def test_triangles_that_share_no_vertex_become_few_enough_all_the_same() -> None:
+    mesh = wavy_plane()
+    corners = mesh.triangles.ravel()
+    triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
+    soup = LightMesh(mesh.vertices[corners], triangles, mesh.colors[corners], mesh.instance_ids[corners])
+    light = clustered(soup, 100_000, 24, 12)
+    assert 10_000 < 24 * len(light.vertices) + 12 * len(light.triangles) <= 100_000
+    assert set(light.instance_ids.tolist()) == {0, 7}
+    assert clustered(soup, 10**9, 24, 12) is soup
+
+
+def test_a_flat_picture_stays_one() -> None:
+    """A chequerboard on a plane: for the surface alone two triangles would do, and 0.85 of the area would be right."""
+    mesh = wavy_plane(101)
+    x, y, _ = mesh.vertices.T
+    white = (np.floor(5 * x) + np.floor(5 * y)) % 2 == 0
+    flat = replace(
+        mesh,
+        vertices=mesh.vertices * np.float32([1, 1, 0]),
+        colors=np.where(white[:, None], 240, 20).astype(np.uint8).repeat(3, axis=1),
+    )
+    light = decimated(flat, np.zeros(len(x), np.int32), 5000)
+    corners = light.vertices[light.triangles]
+    centers, sizes = corners.mean(axis=1), areas(light.vertices, light.triangles)
+    shown = light.colors[light.triangles][..., 0].mean(axis=1) > 128
+    u, v = 5 * centers[:, :2].T
+    true = (np.floor(u) + np.floor(v)) % 2 == 0
+    assert sizes[shown == true].sum() > 0.93
+    assert (light.vertices[:, 2] == 0).all(), "the relief is gone"

@@ -1,0 +1,219 @@
+"""The page as a browser shows it: without network, clicked on, by keys, and what the canvas shows."""
+
+from __future__ import annotations
+
+import io
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from framework import configs
+from framework.commands.report import write_reports
+from tests.reported_run import FAKES, rename_class, write_run
+
+CHROMIUM = "/usr/bin/chromium"
+FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+HOSTILE = "<img src=x onerror=alert(1)>"
+PLACE_OF = """id => {
+    const { shown, camera, canvas } = window.report.viewer;
+    const { geometry } = shown.parts.get(id);
+    geometry.computeBoundingBox();
+    const { left, top, width, height } = canvas.getBoundingClientRect();
+    const at = geometry.boundingBox.getCenter(new THREE.Vector3()).project(camera);
+    return [left + width * (at.x + 1) / 2, top + height * (1 - at.y) / 2];
+}"""
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright, of the extra dev, is not installed")
+    if not Path(CHROMIUM).exists():
+        pytest.skip(f"{CHROMIUM} is not there")
+    with playwright.sync_playwright() as driver:
+        found = driver.chromium.launch(executable_path=CHROMIUM, args=FLAGS)
+        yield found
+        found.close()
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    """Those of two runs, and that which compares them; an object of the second has a hostile name."""
+    folder = tmp_path_factory.mktemp("runs")
+    first = write_run(folder / "first")
+    second = Path(shutil.copytree(first, folder / "second"))
+    rename_class(second, HOSTILE)
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(configs, "_added", [FAKES])
+        return write_reports([first, second])
+
+
+@pytest.fixture
+def opened(browser: Any) -> Iterator[Any]:
+    """Opens a page, without network. At the end nothing was asked for, and nothing went wrong."""
+    contexts, faults = [], []
+
+    def open_page(path: Path, **options: Any) -> Any:
+        context = browser.new_context(offline=True, **({"viewport": {"width": 1280, "height": 900}} | options))
+        contexts.append(context)
+        page = context.new_page()
+        page.on("console", lambda message: faults.append(message.text))
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("dialog", lambda dialog: faults.append(f"a dialog: {dialog.message}"))
+        page.on("request", lambda asked: None if asked.url == path.as_uri() else requests.append(asked.url))
+        requests: list[str] = []
+        page.goto(path.as_uri())
+        page.wait_for_selector("body[data-ready]", timeout=30_000)
+        faults.extend(url for url in requests if not url.startswith(("data:", "blob:")))
+        return page
+
+    yield open_page
+    for context in contexts:
+        context.close()
+    assert not faults
+
+
+def canvas(page: Any) -> np.ndarray:
+    """What the map's place shows, (H, W, 3)."""
+    page.wait_for_timeout(150)  # for the next frame
+    picture = page.locator("#canvas").screenshot()
+    return np.asarray(Image.open(io.BytesIO(picture)).convert("RGB")).astype(int)
+
+
+def colored(image: np.ndarray) -> float:
+    """The share of the pixels that have a colour."""
+    return float((np.ptp(image, axis=2) > 60).mean())
+
+
+def test_a_click_on_an_object_shows_its_numbers(pages: list[Path], opened: Any, tmp_path: Path) -> None:
+    page = opened(pages[0])
+    before = canvas(page)
+    assert len(np.unique(before.reshape(-1, 3), axis=0)) > 200, "the canvas is blank"
+    assert page.locator("#panel .details").count() == 0
+    first = page.evaluate("report.objects[0]")
+    page.mouse.click(*page.evaluate(PLACE_OF, first["id"]))
+    panel = page.inner_text("#panel")
+    for said in (
+        first["class"],
+        first["size"],
+        first["place"],
+        f"{first['confidence']:.2f}",
+        "What it may be",
+        "Truth",
+    ):
+        assert said in panel
+    assert page.locator("#panel img").count() == 1
+    row = page.locator(f"tr[data-id='{first['id']}']")
+    assert row.get_attribute("aria-selected") == "true"
+    assert np.abs(canvas(page) - before).max() > 30, "nothing is highlighted"
+    page.screenshot(path=tmp_path / "chosen.png", full_page=True)
+    assert (tmp_path / "chosen.png").stat().st_size > 50_000
+    page.get_by_label("Choose nothing").click()
+    assert page.locator("#panel .details").count() == 0
+
+
+def test_the_views_colour_the_map_otherwise(pages: list[Path], opened: Any) -> None:
+    page = opened(pages[0])
+    own = canvas(page)
+    page.get_by_role("button", name="Instances").click()
+    instances = canvas(page)
+    assert page.get_by_role("button", name="Instances").get_attribute("aria-pressed") == "true"
+    assert np.abs(instances - own).max() > 60
+    page.locator("#confidence").fill("1")
+    assert page.inner_text("#confidence-value") == "1.00"
+    assert colored(canvas(page)) < 0.5 * colored(instances), "nothing is as likely as that"
+    page.get_by_role("button", name="Classes").click()
+    assert page.locator("#legend button").count() == 0
+    page.locator("#confidence").fill("0")
+    assert page.locator("#legend button").count() > 0
+
+
+def test_the_map_grows_with_the_slider(pages: list[Path], opened: Any) -> None:
+    page = opened(pages[0])
+    page.locator("#path").uncheck()
+    void = np.array(Image.new("RGB", (1, 1), "#e5e8ec"))[0, 0]
+    shown = []
+    for time in ("0", "500", "1000"):
+        page.locator("#time").fill(time)
+        shown.append(float((np.abs(canvas(page) - void).max(axis=2) > 12).mean()))
+    assert 0.02 < shown[0] <= shown[1] < shown[2]
+    assert page.inner_text("#time-value") == "frame 5"
+
+
+def test_rows_are_sorted_searched_and_chosen_by_keys(pages: list[Path], opened: Any) -> None:
+    page = opened(pages[0])
+    rows = page.locator("#objects-table tbody tr:not([hidden])")
+    ids = [row.get_attribute("data-id") for row in rows.all()]
+    assert len(ids) > 1
+    page.get_by_role("button", name="Object", exact=True).click()
+    by_name = rows.evaluate_all("rows => rows.map(row => row.cells[1].dataset.value)")
+    assert by_name == sorted(by_name)
+    page.get_by_role("button", name="Size, cm").click()
+    sizes = rows.evaluate_all("rows => rows.map(row => Number(row.cells[3].dataset.value))")
+    assert sizes == sorted(sizes, reverse=True)
+    page.get_by_role("button", name="Size, cm").click()
+    assert page.locator("th[aria-sort='ascending']").inner_text().startswith("Size")
+    assert rows.evaluate_all("rows => rows.map(row => Number(row.cells[3].dataset.value))") == sorted(sizes)
+    before = page.evaluate("window.report.viewer.camera.position.toArray()")
+    rows.nth(0).focus()
+    page.keyboard.press("ArrowDown")
+    page.keyboard.press("Enter")
+    chosen = rows.nth(1).get_attribute("data-id")
+    assert rows.nth(1).get_attribute("aria-selected") == "true"
+    assert page.locator("#panel h3").inner_text().endswith(str(chosen))
+    while page.evaluate("Boolean(window.report.viewer.flight)"):  # wait_for_function is eval, which the policy forbids
+        page.wait_for_timeout(50)
+    after = page.evaluate("window.report.viewer.camera.position.toArray()")
+    assert np.linalg.norm(np.subtract(after, before)) > 0.05, "it does not fly there"
+    page.locator("#search").fill(str(chosen))
+    assert rows.count() >= 1
+    page.locator("#search").fill("no such thing")
+    assert rows.count() == 0
+    assert page.inner_text("#count").startswith("0 of")
+
+
+def test_it_fits_a_phone_and_the_dark(pages: list[Path], opened: Any) -> None:
+    page = opened(pages[0], viewport={"width": 390, "height": 844}, color_scheme="dark")
+    assert page.evaluate("document.documentElement.scrollWidth") == 390
+    assert max(page.evaluate("getComputedStyle(document.body).backgroundColor.match(/\\d+/g).map(Number)")) < 60
+    assert np.median(canvas(page)) < 120
+
+
+def test_a_hostile_name_is_text(pages: list[Path], opened: Any) -> None:
+    page = opened(pages[1])
+    page.locator("#objects-table tbody tr").filter(has_text="<img").click()
+    assert HOSTILE in page.inner_text("#panel h3")
+    assert page.locator("img[src='x']").count() == 0
+
+
+def test_runs_are_switched_and_the_view_stays(pages: list[Path], opened: Any) -> None:
+    page = opened(pages[2])
+    page.locator("#canvas").focus()
+    page.keyboard.press("ArrowLeft")
+    before = page.evaluate("window.report.viewer.camera.position.toArray()")
+    page.get_by_role("button", name="second", exact=True).click()
+    assert page.evaluate("window.report.viewer.shown === window.report.viewer.maps[1]")
+    assert page.evaluate("window.report.viewer.camera.position.toArray()") == pytest.approx(before, abs=1e-3)
+    assert HOSTILE in page.inner_text("#legend") or page.locator("#legend button").count() == 0
+    assert len(np.unique(canvas(page).reshape(-1, 3), axis=0)) > 200
+    page.get_by_role("link", name="first").click()
+    page.wait_for_selector("body[data-ready]", timeout=30_000)
+    assert page.url == pages[0].as_uri()
+
+
+def test_without_webgl_there_is_the_picture(pages: list[Path], browser: Any) -> None:
+    context = browser.new_context(offline=True)
+    context.add_init_script("HTMLCanvasElement.prototype.getContext = () => null;")
+    page = context.new_page()
+    page.goto(pages[0].as_uri())
+    page.wait_for_selector("body[data-ready]", timeout=30_000)
+    assert page.locator("#canvas").is_hidden()
+    assert page.locator(".still").is_visible()
+    assert page.evaluate("document.querySelector('.still').naturalWidth") > 1000
+    page.locator("#objects-table tbody tr").first.click()
+    assert "What it may be" in page.inner_text("#panel")
+    context.close()
