@@ -24,7 +24,7 @@ from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
 from framework.registry import STAGES, composition, find_class, parameter_fields, plugin_fields
 
-_COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
+COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 
@@ -74,7 +74,7 @@ def _option(loader: Any, stage: str, name: str) -> Option:
         for name in plugin_fields(plugin_class)
     }
     texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
-    comments = {match["key"]: match["comment"] for text in texts for match in _COMMENTED_KEY.finditer(text)}
+    comments = {match["key"]: match["comment"] for text in texts for match in COMMENTED_KEY.finditer(text)}
     parameters = tuple(
         Parameter(
             name=field.name,
