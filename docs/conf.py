@@ -19,7 +19,7 @@ extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
     "sphinx.ext.napoleon",
-    "extensions.field_comments",
+    "extensions.docstrings",
     "extensions.mathml",
     "extensions.options",
     "extensions.project_files",
@@ -29,15 +29,19 @@ exclude_patterns = ["extensions", "_build"]
 html_theme = "furo"
 html_title = f"InstanceMap {release}"
 html_static_path = ["static"]
-html_css_files = ["tables.css"]
+html_css_files = ["pages.css"]
 html_math_renderer = "mathml"
 
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
+default_role = "literal"  # a name between single backticks in a docstring
+toc_object_entries_show_parents = "hide"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
-napoleon_google_docstring = True
+autodoc_type_aliases = {
+    name: name for name in ("Array", "Bool", "Float32", "Float64", "FrameReader", "Int32", "Int64", "UInt16", "UInt8")
+}
 
 nitpicky = True
 nitpick_ignore_regex = [("py:.*", r"(?!(framework|plugins|instancemap)\.).*")]  # other libraries: nothing is fetched

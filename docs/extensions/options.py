@@ -68,7 +68,9 @@ class Files(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         group = self.arguments[0]
-        return [definitions((f"{group}={path.stem}", _head(path.read_text())) for path in sorted((CONF / group).iterdir()))]
+        return [
+            definitions((f"{group}={path.stem}", _head(path.read_text())) for path in sorted((CONF / group).iterdir()))
+        ]
 
 
 class Commands(SphinxDirective):
@@ -119,18 +121,18 @@ def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
 
 
 def table(rows: Iterable[Row]) -> nodes.table:
-    """Parameter, type, default, meaning: a row each."""
-    widths = (26, 14, 16, 44)
-    group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in widths), cols=len(widths))
-    head = nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Parameter", "Type", "Default", "Meaning")))
+    """A row for each parameter: its name, its type and default below, and beside that what it means."""
+    group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (45, 55)), cols=2)
+    head = nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Parameter", "Meaning")))
     group += nodes.thead("", head)
     group += nodes.tbody("", *map(_row, rows))
     return nodes.table("", group, classes=["parameters"])
 
 
 def _row(row: Row) -> nodes.row:
-    words = [nodes.paragraph("", "", nodes.literal("", word)) if word else nodes.paragraph() for word in row[:3]]
-    return nodes.row("", *(nodes.entry("", word) for word in words), nodes.entry("", paragraph(row.meaning)))
+    kind = [nodes.Text(f"{row.type}{' = ' if row.type else '= '}"), nodes.literal("", row.default or '""')]
+    lines = nodes.line_block("", nodes.line("", "", nodes.literal("", row.name)), nodes.line("", "", *kind))
+    return nodes.row("", nodes.entry("", lines), nodes.entry("", paragraph(row.meaning)))
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

@@ -1,6 +1,6 @@
 """Fields of dataclasses in the API reference, with the comments beside them: shapes, units, bounds.
 
-The code states them as plain comments, which autodoc does not read.
+The code states them as plain comments, which autodoc does not read. Arrays have the names that the code gives them.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ import ast
 import dataclasses
 import inspect
 import io
+import re
 import textwrap
 import tokenize
 from typing import Any
@@ -34,7 +35,7 @@ def comments(source: str) -> dict[str, str]:
 
 
 def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:
-    """Appends an Attributes section to a dataclass's docstring."""
+    """Appends a dataclass's fields to its docstring."""
     if what != "class" or not dataclasses.is_dataclass(of):
         return
     said: dict[str, str] = {}
@@ -42,10 +43,22 @@ def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: 
         if dataclasses.is_dataclass(base):
             said |= comments(textwrap.dedent(inspect.getsource(base)))
     fields = [field for field in dataclasses.fields(of) if not field.name.startswith("_")]
-    if fields:
-        lines += ["", "Attributes:", *(f"    {field.name}: {escape(said[field.name])}" for field in fields), ""]
+    lines.append("")
+    for field in fields:
+        lines.append(f":var {field.name}: {escape(said[field.name])}")
+        lines.append(f":vartype {field.name}: {field.type}")
+    lines.append("")
+
+
+def name_arrays(
+    app: Sphinx, what: str, name: str, of: Any, options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Sphinx knows the names of `autodoc_type_aliases`, but writes them so where an array may be None."""
+    plain = [text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returned)]
+    return plain[0], plain[1]
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    app.connect("autodoc-process-docstring", add_fields, priority=400)  # before napoleon
+    app.connect("autodoc-process-docstring", add_fields)
+    app.connect("autodoc-process-signature", name_arrays)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
