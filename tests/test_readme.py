@@ -1,7 +1,8 @@
-"""What the README shows works."""
+"""What the README and the pages of docs/ show works."""
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import json
 import os
@@ -9,13 +10,17 @@ import re
 import shlex
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
+from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
 from omegaconf import OmegaConf
 
+from framework import __main__ as main
 from framework import configs
 from framework.api import Map, load_map
 from framework.data import Camera, Frame
@@ -26,11 +31,9 @@ from framework.pipeline import Pipeline
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
 from tests import option_files
+from tests.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
-CHECKOUT = Path(__file__).resolve().parent.parent
-README = (CHECKOUT / "README.md").read_text()
-LINES = [line for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
 COMMANDS = {  # by the main config that they compose
     line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
     for line in LINES
@@ -38,12 +41,6 @@ COMMANDS = {  # by the main config that they compose
     and ("=" in words[3] or words[3] == "-m" or (CONF / f"{words[3].replace('-', '_')}.yaml").exists())
 }
 BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
-
-
-def block(language: str, containing: str) -> str:
-    """The one code block of the README with these words in it."""
-    [found] = [code for code in re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL) if containing in code]
-    return str(found)
 
 
 def test_the_loop_maps_a_sequence() -> None:
@@ -57,7 +54,7 @@ def test_the_loop_maps_a_sequence() -> None:
 def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"frames": CornerRoom()}
-    exec(block("python", "mapper = Mapper"), names)
+    exec(block("python", "for frame in frames:"), names)
     scene = names["scene"]
     assert isinstance(scene, Map)
     assert len(scene.mesh().vertices) > 1000
@@ -73,7 +70,7 @@ def test_what_the_tour_names_is_there() -> None:
 
 @pytest.fixture
 def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The README's detector, saved where it says."""
+    """The detector of the tutorial, saved where it says."""
     (tmp_path / "my_plugins").mkdir()
     (tmp_path / "my_plugins" / "color_blobs.py").write_text(block("python", "class ColorBlobs"))
     (tmp_path / "my_conf" / "detector").mkdir(parents=True)
@@ -103,16 +100,16 @@ def test_the_detector_finds_what_it_says(my_plugins: Path, monkeypatch: pytest.M
 
 
 def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
-    """The README's command, with the other stages faked for speed."""
+    """The tutorial's command, with the other stages faked for speed."""
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
     for stage, name in FAKES.items():
         group = my_plugins / "my_conf" / stage
         group.mkdir(exist_ok=True)
         (group / "fake.yaml").write_text(f"_target_: tests.scenes.corner_room.{name}\n")
-    command = "-m framework --config-dir my_conf detector=color_blobs detector.hue=120 hydra.run.dir=run"
+    assert OWN_PLUGIN in LINES
     done = subprocess.run(
-        [sys.executable, *command.split(), *chosen],
+        [sys.executable, *OWN_PLUGIN.split()[1:], *chosen, "hydra.run.dir=run"],
         cwd=my_plugins,
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{CHECKOUT}:{my_plugins}", "HOME": str(my_plugins)},
         capture_output=True,
@@ -123,6 +120,7 @@ def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
     assert (my_plugins / "run" / "metrics.json").exists()
 
 
+OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=120"
 FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", "fuser": "GridFuser"}
 
 
@@ -163,15 +161,28 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework evaluate outputs/table3_map": [],
     "python -m framework plugins": [],
     "python -m framework plugins detector": [],
+    "python -m framework check dataset=rgbd_folder dataset.root=my_room": [],
+    "python -m framework dataset=rgbd_folder dataset.root=my_room hydra.run.dir=outputs/my_room": [
+        "dataset.stop=6",
+        "fuser.voxel_size=0.04",
+    ],
 }
-LEFT_BEHIND = ["detections.json", "refinement.png", *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own"))]
+LEFT_BEHIND = [
+    "detections.json",
+    "refinement.png",
+    "check.png",
+    *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own")),
+]
 RUN = """
 import json, sys
 from framework.__main__ import main
 for line in json.load(open("commands.json")):
     print(">>>", line, flush=True)
-    sys.argv = ["instancemap", *line]
-    main()
+    if isinstance(line, str):
+        exec(line, {})
+    else:
+        sys.argv = ["instancemap", *line]
+        main()
 """
 
 
@@ -182,7 +193,8 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", folder / "DIR")
     (folder / "FILE").write_text((folder / "DIR" / "poses.txt").read_text())
-    lines = [shlex.split(command)[3:] + small for command, small in RUNNABLE.items()]
+    recording, result = OWN_DATA
+    lines = [recording, *(shlex.split(command)[3:] + small for command, small in RUNNABLE.items()), result]
     (folder / "commands.json").write_text(json.dumps(lines))
     done = subprocess.run(
         [sys.executable, "-c", RUN],
@@ -212,6 +224,61 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
     assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
+
+
+PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
+
+
+class ParsedError(Exception):
+    """Raised in place of what a command does."""
+
+
+@pytest.mark.parametrize("command", [line for line in PARSED if line not in COMMANDS and line not in RUNNABLE])
+def test_every_other_command_takes_its_arguments(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = argparse.ArgumentParser.parse_intermixed_args
+
+    def parse_and_stop(parser: argparse.ArgumentParser, words: list[str]) -> None:
+        parse(parser, words)
+        raise ParsedError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_intermixed_args", parse_and_stop)
+    monkeypatch.setattr(sys, "argv", ["instancemap", *shlex.split(command)[4:]])
+    with pytest.raises(ParsedError):
+        importlib.import_module(main.module_of(command.split()[3])).main()
+
+
+def test_nothing_is_shown_that_no_test_runs() -> None:
+    """Every line of a console, and every script."""
+    make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
+    looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
+    installed = re.compile(r"pip install \.|docker (build|run) .*")
+    assert not [line for line in LINES if line not in looked_at and not installed.fullmatch(line)]
+    scripts = {*OWN_DATA, *blocks("python", "docs/python.md"), *(block("python", words) for words in EXECUTED)}
+    assert not set(blocks("python")) - scripts
+
+
+def test_what_is_installed_by_name_is_there() -> None:
+    extras = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = {extra for text in PAGES.values() for extra in re.findall(r"instancemap\[([\w,-]+)\]", text)}
+    assert len(named) > 8
+    assert not named - set(extras)
+
+
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
+EXECUTED = [
+    "for frame in sequence",
+    "for frame in frames:",
+    "class ColorBlobs",
+    "class AcmeSearchPath",
+]  # by tests here
+
+
+def test_a_package_registers_its_options() -> None:
+    names: dict[str, Any] = {}
+    exec(block("python", "class AcmeSearchPath"), names)
+    path = ConfigSearchPathImpl()
+    names["AcmeSearchPath"]().manipulate_search_path(path)
+    assert [(element.provider, element.path) for element in path.get_path()] == [("acme", "pkg://acme.conf")]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
