@@ -35,6 +35,7 @@ html_math_renderer = "mathml"
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 myst_heading_anchors = 3
 
+smartquotes = False  # "" is an empty word, here
 default_role = "literal"  # a name between single backticks in a docstring
 toc_object_entries_show_parents = "hide"
 autodoc_member_order = "bysource"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import functools
+import html
 import re
 import subprocess
 import sys
@@ -15,6 +15,7 @@ import yaml
 import instancemap
 from framework import __version__
 from framework.commands.plugins import registered
+from framework.files.search_paths import CONF
 from framework.registry import STAGES
 from tests.doc_pages import CHECKOUT, DOCS, PAGES
 
@@ -26,7 +27,6 @@ LINKING = {
         for path in sorted(CHECKOUT.glob(folder))
     },
 }
-OPTIONS = functools.cache(registered)  # of a stage
 CODE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]+`", re.DOTALL | re.MULTILINE)
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
 
@@ -48,17 +48,8 @@ def test_what_a_page_links_to_is_there(name: str) -> None:
             assert anchor in anchors(target.read_text()), f"{path} has no heading #{anchor}"
 
 
-def test_plugins_and_parameters_that_pages_name_are_there() -> None:
-    """`fuser=NAME` and `fuser.parameter` between backticks, also in commands."""
-    text = "\n".join(PAGES.values())
-    for stage in STAGES:
-        options = {option.name for option in OPTIONS(stage)}
-        parameters = {parameter.name for option in OPTIONS(stage) for parameter in option.parameters}
-        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - {"color_blobs", "nearby"}
-        assert len(chosen) > 2
-        assert not chosen - options, stage
-        given = set(re.findall(rf"(?<![\w./:]){stage}\.([a-z]\w*)\b(?![.(])", text)) - {"hue", "py"}
-        assert not given - parameters, stage
+def option_names(stage: str) -> list[str]:
+    return [path.stem for path in (CONF / stage).glob("*.yaml")]
 
 
 @pytest.fixture(scope="module")
@@ -85,10 +76,26 @@ def test_the_api_reference_has_every_public_name(built: Path) -> None:
 def test_the_configuration_reference_has_every_parameter(built: Path) -> None:
     for stage in STAGES:
         page = (built / "configuration" / f"{stage}.html").read_text()
-        for option in OPTIONS(stage):
-            assert f'id="{stage}-{option.name.replace("_", "-")}"' in page
-            assert all(f"{stage}.{parameter.name}</span>" in page for parameter in option.parameters)
+        assert not [name for name in option_names(stage) if f'id="{stage}-{name.replace("_", "-")}"' not in page]
+    page = html.unescape((built / "configuration" / "refiner.html").read_text())
+    for option in registered("refiner"):
+        assert option.parameters or option.name == "identity"
+        for parameter in option.parameters:
+            assert f"refiner.{parameter.name}</span>" in page
+            assert parameter.comment in page
     assert "every random number of a run derives from it" in (built / "configuration.html").read_text()
+
+
+def test_plugins_and_parameters_that_pages_name_are_there(built: Path) -> None:
+    """`fuser=NAME` and `fuser.parameter`, in prose and commands: the configuration reference has them."""
+    text = "\n".join(PAGES.values())
+    for stage in STAGES:
+        reference = (built / "configuration" / f"{stage}.html").read_text()
+        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - {"color_blobs", "nearby"}
+        assert len(chosen) > 2
+        assert not [name for name in chosen if f'id="{stage}-{name.replace("_", "-")}"' not in reference]
+        given = set(re.findall(rf"(?<![\w./:]){stage}\.([a-z]\w*)\b(?![.(])", text)) - {"hue", "scene"}
+        assert not [name for name in given if f"{stage}.{name}</span>" not in reference]
 
 
 def test_pages_need_no_network(built: Path) -> None:

@@ -70,7 +70,9 @@ def _option(loader: Any, stage: str, name: str) -> Option:
     except (ConfigError, HydraException) as error:
         return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
     nested = {
-        name: ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        name: ", ".join(
+            dict.fromkeys(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        )
         for name in plugin_fields(plugin_class)
     }
     texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
