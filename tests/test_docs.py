@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 import subprocess
 import sys
+import tomllib
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -126,3 +128,24 @@ def test_the_citation_has_what_its_schema_requires() -> None:
     [paper] = citation["references"]
     for said in (__version__, str(paper["year"]), paper["journal"], str(paper["number"]), paper["url"]):
         assert said in page
+
+
+def test_the_image_is_made_of_what_is_there() -> None:
+    """Nobody here can build it: what it copies is there and reaches docker, and it installs what the Makefile does."""
+    dockerfile = (CHECKOUT / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
+    steps = re.findall(r"^([A-Z]+) (.*)", dockerfile, re.MULTILINE)
+    copied = {source for step, words in steps if step == "COPY" for source in words.split()[:-1]}
+    assert copied >= {"framework", "plugins", "conf", "pyproject.toml"}
+    assert not [source for source in copied if not (CHECKOUT / source).exists()]
+    sent = set(re.findall(r"^!(.*)", (CHECKOUT / ".dockerignore").read_text(), re.MULTILINE))
+    assert copied == sent
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert {project["readme"], project["license-files"][0]} <= copied  # pip reads them
+    [(_, entrypoint)] = [step for step in steps if step[0] == "ENTRYPOINT"]
+    assert set(json.loads(entrypoint)) <= set(project["scripts"])
+    makefile = (CHECKOUT / "Makefile").read_text()
+    libraries = set(re.findall(r"missing (lib[\w.-]+)", makefile))
+    assert len(libraries) > 3
+    assert libraries <= set(dockerfile.split())
+    assert re.findall(r"torch==[\d.]+", makefile) == re.findall(r"torch==[\d.]+", dockerfile)
+    assert [step for step, _ in steps].index("USER") < [step for step, _ in steps].index("ENTRYPOINT")  # not as root
