@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
 import os
@@ -10,17 +9,13 @@ import re
 import shlex
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
-from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
 from omegaconf import OmegaConf
 
-from framework import __main__ as main
 from framework import configs
 from framework.api import Map, load_map
 from framework.data import Camera, Frame
@@ -31,7 +26,7 @@ from framework.pipeline import Pipeline
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
 from tests import option_files
-from tests.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
+from tests.doc_pages import CHECKOUT, LINES, block, blocks
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 COMMANDS = {  # by the main config that they compose
@@ -136,6 +131,7 @@ def test_every_command_composes(command: str) -> None:
             )
 
 
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
 OWN = [
     "dataset=rgbd_folder",
@@ -148,6 +144,11 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=simulated"],
     "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
     "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
+    "python -m framework check dataset=rgbd_folder dataset.root=my_room": [],
+    "python -m framework dataset=rgbd_folder dataset.root=my_room hydra.run.dir=outputs/my_room": [
+        "dataset.stop=6",
+        "fuser.voxel_size=0.04",
+    ],
     "python -m framework detection_cache=read_write refiner=kmeans": [*OWN, "hydra.run.dir=cached"],
     "python -m framework detect dataset=synthetic detector=simulated out=detections.json": SMALL,
     "python -m framework show-refinement dataset=synthetic detector=simulated frame=24 out=refinement.png": [
@@ -161,16 +162,10 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework evaluate outputs/table3_map": [],
     "python -m framework plugins": [],
     "python -m framework plugins detector": [],
-    "python -m framework check dataset=rgbd_folder dataset.root=my_room": [],
-    "python -m framework dataset=rgbd_folder dataset.root=my_room hydra.run.dir=outputs/my_room": [
-        "dataset.stop=6",
-        "fuser.voxel_size=0.04",
-    ],
 }
 LEFT_BEHIND = [
     "detections.json",
     "refinement.png",
-    "check.png",
     *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own")),
 ]
 RUN = """
@@ -213,6 +208,7 @@ def test_commands_that_take_seconds_run(ran: Path) -> None:
     assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
     assert list(ran.glob("instancemap/detections/*/*.detections"))
+    assert (ran / "check.png").exists()
 
 
 def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
@@ -224,65 +220,6 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
     assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
-
-
-PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
-
-
-class ParsedError(Exception):
-    """Raised in place of what a command does."""
-
-
-@pytest.mark.parametrize("command", [line for line in PARSED if line not in COMMANDS and line not in RUNNABLE])
-def test_every_other_command_takes_its_arguments(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    parse = argparse.ArgumentParser.parse_intermixed_args
-
-    def parse_and_stop(parser: argparse.ArgumentParser, words: list[str]) -> None:
-        parse(parser, words)
-        raise ParsedError
-
-    monkeypatch.setattr(argparse.ArgumentParser, "parse_intermixed_args", parse_and_stop)
-    monkeypatch.setattr(sys, "argv", ["instancemap", *shlex.split(command)[4:]])
-    with pytest.raises(ParsedError):
-        importlib.import_module(main.module_of(command.split()[3])).main()
-
-
-def test_nothing_is_shown_that_no_test_runs() -> None:
-    """Every line of a console, and every script."""
-    make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
-    looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
-    shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()
-    looked_at |= {
-        "pip install .",
-        *(line for line in LINES if line.startswith("docker ") and f"#   {line}\n" in shown_in),
-    }
-    assert not [line for line in LINES if line not in looked_at]
-    scripts = {*OWN_DATA, *blocks("python", "docs/python.md"), *(block("python", words) for words in EXECUTED)}
-    assert not set(blocks("python")) - scripts
-
-
-def test_what_is_installed_by_name_is_there() -> None:
-    extras = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
-    named = {extra for text in PAGES.values() for extra in re.findall(r"instancemap\[([\w,-]+)\]", text)}
-    assert len(named) > 8
-    assert not named - set(extras)
-
-
-OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
-EXECUTED = [
-    "for frame in sequence",
-    "for frame in frames:",
-    "class ColorBlobs",
-    "class AcmeSearchPath",
-]  # by tests here
-
-
-def test_a_package_registers_its_options() -> None:
-    names: dict[str, Any] = {}
-    exec(block("python", "class AcmeSearchPath"), names)
-    path = ConfigSearchPathImpl()
-    names["AcmeSearchPath"]().manipulate_search_path(path)
-    assert [(element.provider, element.path) for element in path.get_path()] == [("acme", "pkg://acme.conf")]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
