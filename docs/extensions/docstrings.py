@@ -36,7 +36,7 @@ def comments(source: str) -> dict[str, str]:
 
 def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:
     """Appends a dataclass's fields to its docstring."""
-    if what != "class" or not dataclasses.is_dataclass(of):
+    if not isinstance(of, type) or not dataclasses.is_dataclass(of):
         return
     said: dict[str, str] = {}
     for base in reversed(of.__mro__):  # a field stands where it was last declared

@@ -27,7 +27,7 @@ def visit_block(writer: HTML5Translator, node: nodes.math_block) -> None:
 
 def _translated(node: nodes.math | nodes.math_block, as_block: bool = False) -> str:
     try:
-        return tex2mathml(node.astext(), as_block=as_block)
+        return str(tex2mathml(node.astext(), as_block=as_block))
     except MathError as error:
         log.warning("the formula %s: %s", node.astext(), error, location=node, type="mathml")
         return ""
