@@ -35,6 +35,11 @@ test: $(INSTALLED_DEV) ## lint, check types, run the tests
 	$(BIN)/python -m framework compile --all
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --quiet
 
+.PHONY: docs
+docs: $(INSTALLED_DEV) ## build the pages of docs/ into outputs/docs
+	@$(BIN)/python -m sphinx -W --keep-going -n -q -d outputs/docs/.doctrees docs outputs/docs
+	@echo "outputs/docs/index.html"
+
 .PHONY: install
 install: $(INSTALLED_DEV) ## only set up, for developers
 	@$(BIN)/python -m framework compile --all
@@ -47,7 +52,7 @@ format: $(INSTALLED_DEV) ## format the code and mend what the linter can
 .PHONY: clean
 clean: ## remove the environment and all caches; outputs stay
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis
-	find framework plugins tests -name __pycache__ -type d -prune -exec rm -rf {} +
+	find framework plugins tests docs -name __pycache__ -type d -prune -exec rm -rf {} +
 
 # The first time pip shows its downloads, which are large; later, after a change of pyproject.toml, only what is wrong.
 # PIP_USE_PEP517 spares the older pips a warning about one of Hydra's libraries.

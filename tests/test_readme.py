@@ -1,4 +1,4 @@
-"""What the README shows works."""
+"""What the README and the pages of docs/ show works."""
 
 from __future__ import annotations
 
@@ -26,11 +26,9 @@ from framework.pipeline import Pipeline
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
 from tests import option_files
+from tests.doc_pages import CHECKOUT, LINES, block, blocks
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
-CHECKOUT = Path(__file__).resolve().parent.parent
-README = (CHECKOUT / "README.md").read_text()
-LINES = [line for block in re.findall(r"```console\n(.*?)```", README, re.DOTALL) for line in block.splitlines()]
 COMMANDS = {  # by the main config that they compose
     line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
     for line in LINES
@@ -38,12 +36,6 @@ COMMANDS = {  # by the main config that they compose
     and ("=" in words[3] or words[3] == "-m" or (CONF / f"{words[3].replace('-', '_')}.yaml").exists())
 }
 BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
-
-
-def block(language: str, containing: str) -> str:
-    """The one code block of the README with these words in it."""
-    [found] = [code for code in re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL) if containing in code]
-    return str(found)
 
 
 def test_the_loop_maps_a_sequence() -> None:
@@ -57,7 +49,7 @@ def test_the_loop_maps_a_sequence() -> None:
 def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     names: dict[str, object] = {"frames": CornerRoom()}
-    exec(block("python", "mapper = Mapper"), names)
+    exec(block("python", "for frame in frames:"), names)
     scene = names["scene"]
     assert isinstance(scene, Map)
     assert len(scene.mesh().vertices) > 1000
@@ -73,7 +65,7 @@ def test_what_the_tour_names_is_there() -> None:
 
 @pytest.fixture
 def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The README's detector, saved where it says."""
+    """The detector of the tutorial, saved where it says."""
     (tmp_path / "my_plugins").mkdir()
     (tmp_path / "my_plugins" / "color_blobs.py").write_text(block("python", "class ColorBlobs"))
     (tmp_path / "my_conf" / "detector").mkdir(parents=True)
@@ -103,16 +95,16 @@ def test_the_detector_finds_what_it_says(my_plugins: Path, monkeypatch: pytest.M
 
 
 def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
-    """The README's command, with the other stages faked for speed."""
+    """The tutorial's command, with the other stages faked for speed."""
     chosen = [f"{stage}=fake" for stage in FAKES]
     (my_plugins / "my_conf").joinpath("dataset").mkdir()
     for stage, name in FAKES.items():
         group = my_plugins / "my_conf" / stage
         group.mkdir(exist_ok=True)
         (group / "fake.yaml").write_text(f"_target_: tests.scenes.corner_room.{name}\n")
-    command = "-m framework --config-dir my_conf detector=color_blobs detector.hue=120 hydra.run.dir=run"
+    assert OWN_PLUGIN in LINES
     done = subprocess.run(
-        [sys.executable, *command.split(), *chosen],
+        [sys.executable, *OWN_PLUGIN.split()[1:], *chosen, "hydra.run.dir=run"],
         cwd=my_plugins,
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{CHECKOUT}:{my_plugins}", "HOME": str(my_plugins)},
         capture_output=True,
@@ -123,6 +115,7 @@ def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
     assert (my_plugins / "run" / "metrics.json").exists()
 
 
+OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=120"
 FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", "fuser": "GridFuser"}
 
 
@@ -138,6 +131,7 @@ def test_every_command_composes(command: str) -> None:
             )
 
 
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
 SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
 OWN = [
     "dataset=rgbd_folder",
@@ -150,6 +144,11 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=outputs/demo"],
     "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
     "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
+    "python -m framework check dataset=rgbd_folder dataset.root=my_room": [],
+    "python -m framework dataset=rgbd_folder dataset.root=my_room hydra.run.dir=outputs/my_room": [
+        "dataset.stop=6",
+        "fuser.voxel_size=0.04",
+    ],
     "python -m framework detection_cache=read_write refiner=kmeans": [*OWN, "hydra.run.dir=cached"],
     "python -m framework detect dataset=synthetic detector=simulated out=detections.json": SMALL,
     "python -m framework show-refinement dataset=synthetic detector=simulated frame=24 out=refinement.png": [
@@ -177,8 +176,11 @@ import json, sys
 from framework.__main__ import main
 for line in json.load(open("commands.json")):
     print(">>>", line, flush=True)
-    sys.argv = ["instancemap", *line]
-    main()
+    if isinstance(line, str):
+        exec(line, {})
+    else:
+        sys.argv = ["instancemap", *line]
+        main()
 """
 
 
@@ -189,7 +191,8 @@ def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", folder / "DIR")
     (folder / "FILE").write_text((folder / "DIR" / "poses.txt").read_text())
-    lines = [shlex.split(command)[3:] + small for command, small in RUNNABLE.items()]
+    recording, result = OWN_DATA
+    lines = [recording, *(shlex.split(command)[3:] + small for command, small in RUNNABLE.items()), result]
     (folder / "commands.json").write_text(json.dumps(lines))
     done = subprocess.run(
         [sys.executable, "-c", RUN],
@@ -208,6 +211,7 @@ def test_commands_that_take_seconds_run(ran: Path) -> None:
     assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
     assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
     assert list(ran.glob("instancemap/detections/*/*.detections"))
+    assert (ran / "check.png").exists()
 
 
 def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:

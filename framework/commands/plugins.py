@@ -24,7 +24,7 @@ from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
 from framework.registry import STAGES, composition, find_class, parameter_fields, plugin_fields
 
-_COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
+COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
 
 
@@ -70,11 +70,13 @@ def _option(loader: Any, stage: str, name: str) -> Option:
     except (ConfigError, HydraException) as error:
         return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
     nested = {
-        name: ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        name: ", ".join(
+            dict.fromkeys(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        )
         for name in plugin_fields(plugin_class)
     }
     texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
-    comments = {match["key"]: match["comment"] for text in texts for match in _COMMENTED_KEY.finditer(text)}
+    comments = {match["key"]: match["comment"] for text in texts for match in COMMENTED_KEY.finditer(text)}
     parameters = tuple(
         Parameter(
             name=field.name,

@@ -1,0 +1,48 @@
+"""How sphinx builds these pages: `make docs`, or `sphinx-build docs DIR`."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+DOCS = Path(__file__).resolve().parent
+sys.path[:0] = [str(DOCS), str(DOCS.parent)]  # its extensions; the package of this checkout
+
+from framework import __version__  # noqa: E402
+
+project = "InstanceMap"
+author = "The InstanceMap authors"
+release = version = __version__
+copyright = f"{author}, Apache-2.0"
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.napoleon",
+    "extensions.docstrings",
+    "extensions.mathml",
+    "extensions.options",
+    "extensions.project_files",
+]
+exclude_patterns = ["extensions", "_build"]
+
+html_theme = "furo"
+html_title = f"InstanceMap {release}"
+html_static_path = ["static"]
+html_css_files = ["pages.css"]
+html_math_renderer = "mathml"
+
+myst_enable_extensions = ["colon_fence", "dollarmath"]
+myst_heading_anchors = 3
+
+smartquotes = False  # "" is an empty word, here
+default_role = "literal"  # a name between single backticks in a docstring
+toc_object_entries_show_parents = "hide"
+autodoc_member_order = "bysource"
+autodoc_typehints_format = "short"
+autodoc_type_aliases = {
+    name: name for name in ("Array", "Bool", "Float32", "Float64", "FrameReader", "Int32", "Int64", "UInt16", "UInt8")
+}
+
+nitpicky = True
+nitpick_ignore_regex = [("py:.*", r"(?!(framework|plugins|instancemap)\.).*")]  # other libraries: nothing is fetched

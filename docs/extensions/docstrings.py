@@ -1,0 +1,64 @@
+"""Fields of dataclasses in the API reference, with the comments beside them: shapes, units, bounds.
+
+The code states them as plain comments, which autodoc does not read. Arrays have the names that the code gives them.
+"""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import inspect
+import io
+import re
+import textwrap
+import tokenize
+from typing import Any
+
+from sphinx.application import Sphinx
+from sphinx.util.rst import escape
+
+
+def comments(source: str) -> dict[str, str]:
+    """The comment on the lines of each annotated name in a class's source."""
+    said = {
+        token.start[0]: token.string.lstrip("#: ").strip()
+        for token in tokenize.generate_tokens(io.StringIO(source).readline)
+        if token.type == tokenize.COMMENT
+    }
+    [found] = ast.parse(source).body
+    assert isinstance(found, ast.ClassDef)
+    return {
+        line.target.id: " ".join(said[k] for k in range(line.lineno, (line.end_lineno or line.lineno) + 1) if k in said)
+        for line in found.body
+        if isinstance(line, ast.AnnAssign) and isinstance(line.target, ast.Name)
+    }
+
+
+def add_fields(app: Sphinx, what: str, name: str, of: Any, options: Any, lines: list[str]) -> None:
+    """Appends a dataclass's fields to its docstring."""
+    if not isinstance(of, type) or not dataclasses.is_dataclass(of):
+        return
+    said: dict[str, str] = {}
+    for base in reversed(of.__mro__):  # a field stands where it was last declared
+        if dataclasses.is_dataclass(base):
+            said |= comments(textwrap.dedent(inspect.getsource(base)))
+    fields = [field for field in dataclasses.fields(of) if not field.name.startswith("_")]
+    lines.append("")
+    for field in fields:
+        lines.append(f":var {field.name}: {escape(said[field.name])}")
+        lines.append(f":vartype {field.name}: {field.type}")
+    lines.append("")
+
+
+def name_arrays(
+    app: Sphinx, what: str, name: str, of: Any, options: Any, signature: str | None, returned: str | None
+) -> tuple[str | None, str | None]:
+    """Sphinx knows the names of `autodoc_type_aliases`, but writes them so where an array may be None."""
+    plain = [text and re.sub(r"TypeAliasForwardRef\('(\w+)'\)", r"\1", text) for text in (signature, returned)]
+    return plain[0], plain[1]
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("autodoc-process-docstring", add_fields)
+    app.connect("autodoc-process-signature", name_arrays)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,143 @@
+"""The configuration reference, made of what is registered: `{options} detector`, `{settings} config`, `{commands}`.
+
+Nothing of it is written down here: names, types, defaults and comments are those that `python -m framework plugins`
+prints, which come from the dataclasses and the YAML files.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
+
+import yaml
+from docutils import nodes
+from sphinx.application import Sphinx
+from sphinx.util.docutils import SphinxDirective
+
+from framework.__main__ import COMMANDS
+from framework.commands.plugins import COMMENTED_KEY, Option, registered
+from framework.files.search_paths import CONF
+
+
+class Row(NamedTuple):
+    """A line of a table of parameters."""
+
+    name: str
+    type: str
+    default: str
+    meaning: str
+
+
+class Options(SphinxDirective):
+    """All options of a stage: a section each, with its documentation and a table of its parameters."""
+
+    required_arguments = 1  # the stage
+
+    def run(self) -> list[nodes.Node]:
+        stage = self.arguments[0]
+        return [self.option(option) for option in registered(stage)]
+
+    def option(self, option: Option) -> nodes.section:
+        section = nodes.section(ids=[f"{option.stage}-{option.name}".replace("_", "-")], names=[option.name])
+        section += nodes.title("", "", nodes.literal("", f"{option.stage}={option.name}"))
+        section += paragraph(option.documentation)
+        section += nodes.paragraph("", "", nodes.literal("", option.target), classes=["target"])
+        rows = [Row(f"{option.stage}.{it.name}", it.type, it.default, it.comment) for it in option.parameters]
+        section += table(rows) if rows else paragraph("No parameters.")
+        return section
+
+
+class Settings(SphinxDirective):
+    """The settings at the top of a main config, such as `seed`, with the comments of its YAML."""
+
+    required_arguments = 1  # the config's name
+
+    def run(self) -> list[nodes.Node]:
+        text = (CONF / f"{self.arguments[0]}.yaml").read_text()
+        given = yaml.safe_load(text)
+        comments = {match["key"]: match["comment"] for match in COMMENTED_KEY.finditer(text)}
+        keys = [key for key in given if key not in ("defaults", "hydra")]
+        return [table(Row(key, _type(given[key]), yaml_value(given[key]), comments.get(key, "")) for key in keys)]
+
+
+class Files(SphinxDirective):
+    """The choices of a config group that registers no plugins, each with the first line of its YAML."""
+
+    required_arguments = 1  # the group
+
+    def run(self) -> list[nodes.Node]:
+        group = self.arguments[0]
+        return [
+            definitions((f"{group}={path.stem}", _head(path.read_text())) for path in sorted((CONF / group).iterdir()))
+        ]
+
+
+class Commands(SphinxDirective):
+    """The commands of `python -m framework`, each with what it does."""
+
+    def run(self) -> list[nodes.Node]:
+        return [definitions(COMMANDS.items())]
+
+
+def _head(text: str) -> str:
+    """The comment at the top of a YAML; `# @package` is Hydra's."""
+    lines = [line for line in text.splitlines() if not line.startswith("# @")]
+    head = []
+    for line in lines:
+        if not line.startswith("#"):
+            break
+        head.append(line.removeprefix("#").strip())
+    return " ".join(head)
+
+
+def _type(value: object) -> str:
+    return "" if value is None else type(value).__name__
+
+
+def yaml_value(value: object) -> str:
+    """As it is written on the command line."""
+    return str(yaml.safe_dump(value, default_flow_style=True)).partition("\n")[0]
+
+
+def paragraph(text: str) -> nodes.paragraph:
+    return nodes.paragraph("", "", *inline(text))
+
+
+def inline(text: str) -> Iterator[nodes.Node]:
+    """Text in which `words` and ``words`` between backticks are code."""
+    for k, part in enumerate(re.split(r"`+", text)):
+        if part:
+            yield nodes.literal("", part) if k % 2 else nodes.Text(part)
+
+
+def definitions(items: Iterable[tuple[str, str]]) -> nodes.definition_list:
+    found = nodes.definition_list()
+    for term, meaning in items:
+        found += nodes.definition_list_item(
+            "", nodes.term("", "", nodes.literal("", term)), nodes.definition("", paragraph(meaning))
+        )
+    return found
+
+
+def table(rows: Iterable[Row]) -> nodes.table:
+    """A row for each parameter: its name, its type and default below, and beside that what it means."""
+    group = nodes.tgroup("", *(nodes.colspec(colwidth=width) for width in (45, 55)), cols=2)
+    head = nodes.row("", *(nodes.entry("", paragraph(word)) for word in ("Parameter", "Meaning")))
+    group += nodes.thead("", head)
+    group += nodes.tbody("", *map(_row, rows))
+    return nodes.table("", group, classes=["parameters"])
+
+
+def _row(row: Row) -> nodes.row:
+    kind = [nodes.Text(f"{row.type}{' = ' if row.type else '= '}"), nodes.literal("", row.default or '""')]
+    lines = nodes.line_block("", nodes.line("", "", nodes.literal("", row.name)), nodes.line("", "", *kind))
+    return nodes.row("", nodes.entry("", lines), nodes.entry("", paragraph(row.meaning)))
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.add_directive("options", Options)
+    app.add_directive("settings", Settings)
+    app.add_directive("files", Files)
+    app.add_directive("commands", Commands)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -1,0 +1,46 @@
+"""Links out of these pages: relative, as on any code host, and right in the built pages, too.
+
+Some files of the project are pages here as well; in `docs/` each has a page of one line that links to it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+from sphinx.application import Sphinx
+
+DOCS = Path(__file__).resolve().parents[1]
+PROJECT = DOCS.parent
+PAGES = {
+    "CHANGELOG.md": "changelog.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "data/desk/README.md": "desk.md",
+    "plugins/detectors/mask_rcnn_rooms.md": "guides/mask_rcnn_rooms.md",
+    "plugins/detectors/maskrcnn2go.md": "guides/maskrcnn2go.md",
+}
+"""The pages that show files of the project."""
+
+_LINK = re.compile(r"(?<=\]\()(?!\w+:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?(?=\))")
+
+
+def show(app: Sphinx, name: str, source: list[str]) -> None:
+    """The text of a page, or of the file that it shows, with its links as seen from the page."""
+    page = DOCS / f"{name}.md"
+    shown = {DOCS / place: PROJECT / path for path, place in PAGES.items()}.get(page, page)
+    text = source[0] if shown == page else shown.read_text()
+
+    def relinked(link: re.Match[str]) -> str:
+        target = Path(os.path.normpath(shown.parent / link["path"]))
+        if target.is_relative_to(PROJECT):
+            target = DOCS / PAGES.get(str(target.relative_to(PROJECT)), target)
+        return os.path.relpath(target, page.parent) + (link["anchor"] or "")
+
+    source[0] = _LINK.sub(relinked, text)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    app.connect("source-read", show)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
