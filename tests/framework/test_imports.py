@@ -32,6 +32,7 @@ LAYERS = [
     ["figures"],
     ["api"],
     ["commands"],
+    ["contracts"],
     ["__main__"],
 ]
 """All of framework/, from the ground up: nothing imports from a layer above its own."""
