@@ -22,6 +22,7 @@ COMMANDS = {
     "show-refinement": "draws one frame's masks before and after refinement",
     "compile": "compiles the map's kernels, once for a machine: the first run then begins at once",
     "plugins": "lists what is registered for each stage, with its parameters",
+    "new-plugin": "writes a repository with a plugin of your own: package, option, tests, CI",
     "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
     "train-detector": "trains Mask R-CNN on rendered rooms",
     "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
