@@ -31,6 +31,7 @@ LAYERS = [
     ["tables"],
     ["figures"],
     ["api"],
+    ["doctor"],
     ["commands"],
     ["contracts"],
     ["__main__"],
