@@ -163,8 +163,15 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework evaluate outputs/table3_map": [],
     "python -m framework plugins": [],
     "python -m framework plugins detector": [],
+    "python -m framework doctor": [],
+    "python -m framework new-plugin refiner my_refiner": [],
 }
-LEFT_BEHIND = ["detections.json", "refinement.png", *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own"))]
+LEFT_BEHIND = [
+    "detections.json",
+    "refinement.png",
+    "instancemap-my-refiner/pyproject.toml",
+    *(f"{run}/metrics.json" for run in ("simulated", "coarse", "own")),
+]
 RUN = """
 import json, sys
 from framework.__main__ import main
@@ -212,6 +219,13 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
     assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_every_row_of_an_experiment_is_named(name: str) -> None:
+    rows = configs.composed(f"experiment={name}", "row=any").rows
+    assert rows
+    assert not [row for row in rows if f"`{row}`" not in README]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)

@@ -19,8 +19,8 @@ LEGEND = "ok: there; --: not there, and optional; !!: a run with the default sta
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Says what is there of what InstanceMap can use, and gives the line that gets what is not."
-        " What it prints can be pasted into an issue: the user's name and home are left out. The status is 1 where a run"
-        " with the default stages cannot work.",
+        " What it prints can be pasted into an issue: the user's name and home are left out. The status is 1 where a"
+        " run with the default stages cannot work.",
     )
     parser.add_argument("--json", action="store_true", help="as JSON, for programs")
     asked = parser.parse_args([word for word in sys.argv[1:] if not word.startswith("debug=")])

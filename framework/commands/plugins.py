@@ -141,10 +141,11 @@ def main() -> None:
     parser.add_argument("stage", nargs="?", choices=STAGES, help="only this stage")
     parser.add_argument("name", nargs="?", help="only this option")
     asked = arguments(parser)
-    gc.disable()  # going through all that torch and Open3D leave in memory takes a fifth of the time
     with one_line_errors():
         stages = [asked.stage] if asked.stage else list(STAGES)
+        gc.disable()  # going through all that torch and Open3D leave in memory takes a fifth of the time
         options = registered(*stages, only=asked.name)
+        gc.enable()
         if asked.name and not options:
             raise ConfigError(f"there is no {asked.stage}={asked.name}")
         for stage in stages:
