@@ -71,7 +71,6 @@ def main() -> None:
         print(f"written: {made}; the method is in {names['package']}/{asked.name}.py")
         print(f"  cd {made} && pip install -e '.[test]' && pytest")
         print(f"  {names['sweep']}")
-        print("  instancemap tables first_sweep")
 
 
 def write_repository(stage: str, name: str, folder: Path) -> Path:

@@ -9,12 +9,15 @@ import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
 
 from framework.commands.new_plugin import LONGEST_NAME, check_name, files_of, write_repository
+from framework.doctor.requirements import NOT_OF_USERS
 from framework.errors import ConfigError
 from framework.registry import STAGES
 from tests import option_files
@@ -101,7 +104,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
         write_repository(stage, f"my_{stage}", folder)
     line = [sys.executable, "-m", "framework", "new-plugin", "refiner", "my_refiner", "--in", str(folder)]
     said = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
-    assert len(said.splitlines()) == 4
+    assert len(said.splitlines()) == 3
     for source in (CHECKOUT, *folder.glob("instancemap-my-*")):
         build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder / "wheels")]
         subprocess.run(build, cwd=source, check=True, capture_output=True, timeout=120)
@@ -149,13 +152,25 @@ def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: P
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
-    run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), "hydra.sweep.dir=first_sweep")
+    said = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), "hydra.sweep.dir=first_sweep")
     records = [json.loads(path.read_text()) for path in (place / "first_sweep").glob("*/metrics.json")]
     assert [record["frames"] for record in records] == [3, 3]
     assert all(record["instances.count"] > 0 for record in records)
-    assert "my_refiner" in run(place, "instancemap", "tables", "first_sweep")
+    assert run(place, "instancemap", "tables", "first_sweep").strip() in said
     with (place / "first_sweep" / "table.csv").open() as table:
         rows = list(csv.DictReader(table))
     assert [row["row"] for row in rows] == ["refiner=gmm_em", "refiner=my_refiner"]
+    assert "refiner=my_refiner" in said
     listed = run(place, "instancemap", "plugins", "refiner", "my_refiner")
     assert "my_refiner  [from instancemap-my-refiner]" in listed
+
+
+def test_an_installed_package_examines_itself_and_writes_plugins(place: Path) -> None:
+    sections = json.loads(run(place, "instancemap", "doctor", "--json"))
+    found = {of["title"]: {one["name"]: one for one in of["findings"]} for of in sections}
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert list(found["Libraries"]) == [Requirement(line).name for line in project["dependencies"]]
+    assert set(found["Extras, optional"]) == project["optional-dependencies"].keys() - NOT_OF_USERS
+    assert found["InstanceMap"]["commit"]["detail"] == "no checkout"
+    assert "written: instancemap-other" in run(place, "instancemap", "new-plugin", "tracker", "other")
+    assert (place / "instancemap-other" / "instancemap_other" / "other.py").exists()
