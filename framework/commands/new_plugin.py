@@ -38,7 +38,7 @@ PLACES = {  # of each template in the new repository; the first ones are those o
 LONGEST_NAME = 30  # characters; lines of the templates stay within 120
 FOLDERS = ("conf", "tests")  # of the repository and the package, that a module would stand in the way of
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
-FIRST = "hydra.sweep.dir=first_sweep"
+FIRST = "hydra.sweep.dir=outputs/first_sweep"
 SWEEPS = {  # by stage: how a new plugin is compared with ours
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
