@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
+REINSTALL = "pip install --force-reinstall instancemap"
+
 
 class State(Enum):
     """Whether a thing is there. The values are the marks in front of it."""
@@ -42,7 +44,9 @@ def section(title: str, *looks: Callable[[], Iterable[Finding]]) -> Section:
         try:
             findings += look()
         except Exception as error:  # whatever is broken: to say so is what this is for
-            findings.append(Finding(look.__name__.strip("_").replace("_", " "), State.OPTIONAL, reason(error)))
+            broken = isinstance(error, ImportError)  # what is looked with is needed by every run
+            state, remedy = (State.BROKEN, REINSTALL) if broken else (State.OPTIONAL, "")
+            findings.append(Finding(look.__name__.strip("_").replace("_", " "), state, reason(error), remedy))
     return Section(title, tuple(findings))
 
 

@@ -103,9 +103,18 @@ def test_what_cannot_be_looked_at_does_not_stop_the_rest() -> None:
     def _broken_look() -> list[Finding]:
         raise OSError(5, "Input/output error")
 
+    def without_library() -> list[Finding]:
+        raise ImportError("no yaml")
+
     fine = Finding("fine", State.THERE, "")
-    found = section("x", _broken_look, lambda: [fine]).findings
-    assert found == (Finding("broken look", State.OPTIONAL, "OSError: [Errno 5] Input/output error"), fine)
+    found = section("x", _broken_look, without_library, lambda: [fine]).findings
+    assert found[0] == Finding("broken look", State.OPTIONAL, "OSError: [Errno 5] Input/output error")
+    assert (found[1].name, found[1].state, found[1].detail) == (
+        "without library",
+        State.BROKEN,
+        "ImportError: no yaml",
+    )
+    assert found[2] == fine
 
 
 def test_names_of_people_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
