@@ -23,7 +23,9 @@ COMMANDS = {
     "detect": "writes a video's detections as a COCO result file",
     "show-refinement": "draws one frame's masks before and after refinement",
     "compile": "compiles the map's kernels, once for a machine: the first run then begins at once",
+    "doctor": "says what is there of what can be used, and what gets the rest: first of all in an issue",
     "plugins": "lists what is registered for each stage, with its parameters",
+    "new-plugin": "writes a repository with a plugin of your own: package, option, tests, CI",
     "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
     "train-detector": "trains Mask R-CNN on rendered rooms",
     "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
@@ -40,6 +42,7 @@ PRINTING = (
     "export",
     "evaluate",
     "plugins",
+    "doctor",
 )  # what others may be reading: `| head` ends them without a word
 
 HELP = """\

@@ -58,6 +58,8 @@ class FileConfigSource(file_config_source.FileConfigSource):
             check_yaml(path, read_text(path, LARGEST_FILE))
             found = super().load_config(config_path)
         config: Any = found.config
+        if not isinstance(config, DictConfig):
+            raise DataError(f"{path}: expected keys and values, found a list")
         if "defaults" in config and not isinstance(config.get("defaults"), ListConfig):
             raise DataError(f"{path}: defaults must be a list")  # Hydra has no word for some of what else it may be
         return found

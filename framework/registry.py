@@ -15,9 +15,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
+from hydra._internal.config_repository import CachingConfigRepository
+from hydra._internal.defaults_list import create_defaults_list
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -133,26 +135,29 @@ def _options_loader() -> Iterator[Any]:
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
     """The classes that the stage's options name, first of those options whose names `sought` has in it."""
     inheriting = []
+    files: Any = CachingConfigRepository(loader.repository)
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
-        own = loader.repository.load_config(f"{stage}/{name}").config
+        own = files.load_config(f"{stage}/{name}").config
         if "_target_" in own:
             yield str(own["_target_"])
         else:
             inheriting.append(name)
     for name in inheriting:  # from another option, which was asked, or from what is none
         with suppress(HydraException):  # of an option that cannot be used
-            for path, package in composition(loader, stage, name).items():
+            for path, package in composition(files, stage, name).items():
                 if package == stage:
-                    yield str(loader.repository.load_config(path).config.get("_target_"))
+                    yield str(files.load_config(path).config.get("_target_"))
 
 
-def composition(loader: Any, stage: str, name: str) -> dict[str, str]:
+def composition(files: Any, stage: str, name: str) -> dict[str, str]:
     """The configs that an option of a stage is made of, in order, and where each belongs: packages by path.
 
     They are looked for where a run would choose the option: one that overrides the choice of another stage, as a
-    dataset may, composes nowhere else. Raises HydraException for an option that cannot be used.
+    dataset may, composes nowhere else. `files` is a loader's repository, which Hydra would read anew for every option,
+    and its own configs with it. Raises HydraException for an option that cannot be used.
     """
-    entries = loader.compute_defaults_list("config", [f"{stage}={name}"], RunMode.RUN).defaults
+    chosen = OverridesParser.create().parse_overrides([f"{stage}={name}"])
+    entries: Any = create_defaults_list(files, "config", chosen, prepend_hydra=False, skip_missing=False).defaults
     return {entry.config_path: entry.package for entry in entries if entry.package.partition(".")[0] == stage}
 
 
@@ -197,6 +202,31 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
     """
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
+    schema, plugins = _taken(where, plugin_class, node)
+    missing = [name for name in fields if name not in stages and OmegaConf.is_missing(schema, name)]
+    missing += [name for name in stages if name not in plugins]
+    if missing:
+        stage = where.split()[0]
+        needed = " ".join(f"{stage}.{name}=..." for name in missing)
+        hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
+        raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
+    return {name: plugins[name] if name in stages else schema[name] for name in fields}
+
+
+def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
+    """Raises ConfigError where an option, by itself, gives a parameter that there is not, or a value of a wrong type.
+
+    What depends on other configs, and what only a user has, is left out.
+    """
+    plugins = plugin_fields(plugin_class)
+    settled = [key for key in map(str, node) if key not in plugins and not OmegaConf.is_interpolation(node, key)]
+    _taken(where, plugin_class, OmegaConf.masked_copy(node, settled))
+
+
+def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
+    """A plugin's parameters and, where it holds others, those: what `node` gives, defaults for the rest."""
+    stages = plugin_fields(plugin_class)
+    fields = parameter_fields(plugin_class)
     try:
         schema = _schema(plugin_class.__name__, {name: of for name, of in fields.items() if name not in stages})
     except OmegaConfBaseException as error:
@@ -217,14 +247,7 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
             schema[key] = node[key]
         except OmegaConfBaseException as error:
             raise ConfigError(f"{where}: {key}: {_first_line(error)}") from error
-    missing = [name for name in names if name not in stages and OmegaConf.is_missing(schema, name)]
-    missing += [name for name in stages if name not in plugins]
-    if missing:
-        stage = where.split()[0]
-        needed = " ".join(f"{stage}.{name}=..." for name in missing)
-        hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
-        raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
-    return {name: plugins[name] if name in stages else schema[name] for name in names}
+    return schema, plugins
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:

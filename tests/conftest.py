@@ -14,8 +14,11 @@ import numpy as np
 import pytest
 
 import tests.cores  # noqa: F401  # isort: skip; before numba is loaded, which reads what it sets
-from framework import configs
-from tests.scenes.corner_room import CornerRoom
+
+pytest.register_assert_rewrite("framework.contracts")  # before they are loaded
+
+from framework import configs  # noqa: E402
+from tests.scenes.corner_room import CornerRoom  # noqa: E402
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
 CHECKOUT = Path(__file__).resolve().parent.parent

@@ -11,7 +11,7 @@ from framework.commands.plugins import registered
 from framework.files.search_paths import CONF
 from framework.registry import STAGES, build, find_class
 
-OPTION = {(stage, option.name): option for stage in STAGES for option in registered(stage)}
+OPTION = {(option.stage, option.name): option for option in registered(*STAGES)}
 OPTIONS = [*OPTION]
 
 

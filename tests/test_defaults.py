@@ -120,3 +120,5 @@ def test_the_wheel_has_networks_and_configs_where_an_installed_run_looks(tmp_pat
     assert any(name.endswith("licenses/framework/reporting/assets/three.LICENSE") for name in names)
     assert not [name for name in names if "viewer_source" in name]
     assert not STAGES.keys() - {name.split("/")[2] for name in names if name.startswith("framework/conf/")}
+    assert not {f"framework/templates/{stage}/plugin.py.template" for stage in STAGES} - names
+    assert not [name for name in names if name.startswith(("examples", "tests"))]

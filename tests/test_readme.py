@@ -164,10 +164,13 @@ RUNNABLE = {  # what to append, by a command that then takes seconds
     "python -m framework export outputs/demo --to floorplan graph --robot-height 0.5": [],
     "python -m framework plugins": [],
     "python -m framework plugins detector": [],
+    "python -m framework doctor": [],
+    "python -m framework new-plugin refiner my_refiner": [],
 }
 LEFT_BEHIND = [
     "detections.json",
     "refinement.png",
+    "instancemap-my-refiner/pyproject.toml",
     *(f"{run}/metrics.json" for run in ("outputs/demo", "coarse", "own")),
     *(f"outputs/demo/export/{name}" for name in ("scene.glb", "scene.usdc", "map.yaml", "scene_graph.json")),
 ]
@@ -223,6 +226,13 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
     assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_every_row_of_an_experiment_is_named(name: str) -> None:
+    rows = configs.composed(f"experiment={name}", "row=any").rows
+    assert rows
+    assert not [row for row in rows if f"`{row}`" not in README]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)

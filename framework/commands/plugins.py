@@ -1,12 +1,14 @@
 """`python -m framework plugins [STAGE [NAME]]`: what is registered for each stage, with documentation and parameters.
 
-The options come from Hydra's own search path, so those of installed third-party packages are listed like any other.
+The options come from Hydra's own search path, so those of installed third-party packages are listed like any other, and
+with --config-dir those of a folder, too.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import gc
 import importlib.resources
 import inspect
 import re
@@ -15,14 +17,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hydra._internal.config_repository import CachingConfigRepository
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
-from framework.errors import ConfigError
-from framework.registry import STAGES, composition, find_class, parameter_fields, plugin_fields
+from framework.errors import ConfigError, DataError
+from framework.registry import STAGES, check_option, composition, find_class, parameter_fields, plugin_fields
 
 COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -50,32 +54,44 @@ class Option:
     parameters: tuple[Parameter, ...]
 
 
-def registered(stage: str, only: str | None = None) -> list[Option]:
-    """The options of a config group, by name, or the one that is asked for."""
+def registered(*stages: str, only: str | None = None) -> list[Option]:
+    """The options of these config groups, by stage and name, or those with the name that is asked for."""
     with config_directory():
-        loader = GlobalHydra.instance().config_loader()
-        return [_option(loader, stage, name) for name in loader.get_group_options(stage) if only in (None, name)]
+        loader: Any = GlobalHydra.instance().config_loader()
+        files = CachingConfigRepository(loader.repository)  # of all options: they share most of what they are made of
+        return [
+            _option(files, stage, name)
+            for stage in stages
+            for name in loader.get_group_options(stage)
+            if only in (None, name)
+        ]
 
 
-def _option(loader: Any, stage: str, name: str) -> Option:
-    own = loader.repository.load_config(f"{stage}/{name}")
-    target = str(own.config.get("_target_"))
+def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
+    source = next(source for source in files.get_sources() if source.is_config(f"{stage}/{name}"))
+    target = ""
     try:
-        inherited = composition(loader, stage, name)  # and the option's own file
-        files = {path: loader.repository.load_config(path) for path, package in inherited.items() if package == stage}
-        given = OmegaConf.to_container(OmegaConf.merge(*(file.config for file in files.values())), resolve=False)
-        assert isinstance(given, dict)
-        target = str(given.get("_target_"))
+        own: Any = files.load_config(f"{stage}/{name}")
+        target = str(own.config.get("_target_"))
+        made_of = composition(files, stage, name)  # the option's own file, and those that it includes
+        texts, configs = [], []
+        for path in (path for path, package in made_of.items() if package == stage):
+            part: Any = files.load_config(path)
+            texts.append(_text(part.path, f"{path}.yaml"))
+            configs.append(part.config)
+        node: Any = OmegaConf.merge(*configs)
+        target = str(node.get("_target_"))
         plugin_class = find_class(STAGES[stage], target)
-    except (ConfigError, HydraException) as error:
-        return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
+        check_option(f"{stage} {target}", plugin_class, node)
+    except (ConfigError, DataError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
+        return Option(stage, name, target, source.provider, f"cannot be used: {one_line(error)}", ())
+    given: Any = OmegaConf.to_container(node, resolve=False)
     nested = {
-        name: ", ".join(
-            dict.fromkeys(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        field: ", ".join(
+            dict.fromkeys(package.rpartition(".")[2] for package in made_of.values() if f"{stage}.{field}." in package)
         )
-        for name in plugin_fields(plugin_class)
+        for field in plugin_fields(plugin_class)
     }
-    texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
     comments = {match["key"]: match["comment"] for text in texts for match in COMMENTED_KEY.finditer(text)}
     parameters = tuple(
         Parameter(
@@ -88,9 +104,9 @@ def _option(loader: Any, stage: str, name: str) -> Option:
     )
     documentation = (inspect.getdoc(plugin_class) or "").partition("\n\n")[0].replace("\n", " ")
     change = _HEAD.match(_text(own.path, f"{stage}/{name}.yaml"))
-    if change and len(files) > 1:
+    if change and len(texts) > 1:
         documentation += f" Here: {change['comment']}."
-    return Option(stage, name, target, own.provider, documentation, parameters)
+    return Option(stage, name, target, source.provider, documentation, parameters)
 
 
 def _default(field: dataclasses.Field[Any]) -> object:
@@ -128,9 +144,13 @@ def main() -> None:
     parser.add_argument("name", nargs="?", help="only this option")
     asked = arguments(parser)
     with one_line_errors():
-        for stage in [asked.stage] if asked.stage else STAGES:
-            options = registered(stage, asked.name)
-            if asked.name and not options:
-                raise ConfigError(f"there is no {stage}={asked.name}")
+        stages = [asked.stage] if asked.stage else list(STAGES)
+        gc.disable()  # going through all that torch and Open3D leave in memory takes a fifth of the time
+        options = registered(*stages, only=asked.name)
+        gc.enable()
+        if asked.name and not options:
+            raise ConfigError(f"there is no {asked.stage}={asked.name}")
+        for stage in stages:
             print(f"{stage} ({STAGES[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
-            print("\n\n".join(map(describe, options)) or "  (none)", end="\n\n")
+            described = [describe(option) for option in options if option.stage == stage]
+            print("\n\n".join(described) or "  (none)", end="\n\n")

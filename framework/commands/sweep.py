@@ -63,7 +63,7 @@ class PlaceCallback(Callback):
             self.take(lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.resume is True))
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
-        self.take(lambda: sweep_of(config))
+        self.take(lambda: sweep_of(config, with_table=self.of_run))
 
     def take(self, place: Callable[[], AbstractContextManager[None]]) -> None:
         try:
@@ -88,8 +88,8 @@ def run_in(directory: Path, wait: bool) -> Iterator[None]:
         yield
 
 
-def sweep_of(config: DictConfig) -> AbstractContextManager[None]:
-    """The place of a sweep, once it is known that it has runs. Raises InstanceMapError.
+def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[None]:
+    """The place of a sweep, once it is known that it has runs, with a table of them or not. Raises InstanceMapError.
 
     Has joblib start no more workers than there are runs: the signals of a terminal reach all of them, and one that
     never had a run would die of them, and all others with it.
@@ -103,7 +103,7 @@ def sweep_of(config: DictConfig) -> AbstractContextManager[None]:
         with flag_override(own, "readonly", False):
             own.launcher.n_jobs = workers
     directory = place_of("hydra.sweep.dir", own.sweep.dir)
-    return sweep_in(directory, "table" in config, config.get("figure") is not None, workers > 1)
+    return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
 
 
 def by_joblib(own: DictConfig | HydraConf) -> bool:
@@ -157,6 +157,7 @@ def _report(directory: Path, with_table: bool, with_figure: bool) -> None:
         from framework.tables.experiment_tables import write_tables
 
         print(write_tables(directory))
+        print(f"{os.path.relpath(directory / 'table.md')}, and beside it table.tex, table.csv")
     if with_figure:
         from framework.figures.experiment_figure import write_figure
 

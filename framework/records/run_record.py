@@ -161,9 +161,10 @@ class RunRecord:
         unlikely = int(figures.get("instances.count") or 0) - len(labels)
         rest = f"; {unlikely} of a confidence below {LIKELY} are in the files alone" if unlikely else ""
         log.info("found: %s%s", counted, rest)
-        for name in ("overview.png", "mesh.ply", "instances.json"):
-            if (self.directory / name).exists():
-                log.info("%s", self.directory / name)
+        written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
+        if written:  # one line: a job of a sweep has a long name
+            beside = f", and beside it {', '.join(written[1:])}" if written[1:] else ""
+            log.info("%s%s", _from_here(self.directory / written[0]), beside)
         if fault is not None:
             log.warning("partial run, %s: its figures are in %s", reason(fault), PARTIAL_METRICS)
 
@@ -189,6 +190,12 @@ class _Attempts:
 def _write_config(path: Path, config: Mapping[str, Any]) -> None:
     with written_whole(path) as temporary:
         OmegaConf.save(OmegaConf.create(dict(config)), temporary)
+
+
+def _from_here(path: Path) -> Path:
+    """The path as one would give it in the working folder."""
+    here, place = Path.cwd(), path.absolute()
+    return place.relative_to(here) if place.is_relative_to(here) else place
 
 
 def _found(scene: SceneMap) -> tuple[InstanceMesh, Mapping[int, Instance]]:

@@ -33,7 +33,9 @@ LAYERS = [
     ["exporting"],
     ["reporting"],
     ["api"],
+    ["doctor"],
     ["commands"],
+    ["contracts"],
     ["__main__"],
 ]
 """All of framework/, from the ground up: nothing imports from a layer above its own."""

@@ -1,8 +1,4 @@
-"""A small room whose every pixel is known exactly, and the simplest plugins that can map it: what the tests run on.
-
-The corner of a room (two walls and a floor, textured) with a chair and a couch, both spheres. World: x right, y down,
-z forward, like the first camera.
-"""
+"""The contracts' room as videos, with the faults that tests need, and the simplest plugins that can map it."""
 
 from __future__ import annotations
 
@@ -14,12 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.contracts.corner_room import CAMERA, CLASSES, frame_at, look, pose_at, spheres_in
 from framework.data import (
     Box,
     Camera,
     Detections,
     Frame,
-    FrameTruth,
     Instance,
     InstanceMesh,
     PointClusters,
@@ -29,7 +25,7 @@ from framework.data import (
 )
 from framework.errors import DataError, FrameError, MapFullError
 from framework.files.whole_files import written_whole
-from framework.geometry import back_project, exp_se3, transform
+from framework.geometry import back_project, transform
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -40,44 +36,6 @@ from framework.interfaces import (
     RGBDSequence,
     SceneMap,
 )
-
-CLASSES = ("chair", "couch")
-CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
-PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))  # n . p + d = 0, n into the room
-SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centre, radius: instances 1 and 2
-
-
-def look(camera: Camera, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Depth (H, W) float32, normals (H, W, 3), colour (H, W, 3) uint8 and instance ids (H, W) int32, all exact."""
-    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
-    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
-    d = rays @ T_world_camera[:3, :3].T
-    o = T_world_camera[:3, 3]
-    depth = np.full(u.shape, np.inf)
-    normals = np.zeros((*u.shape, 3))
-    ids = np.zeros(u.shape, np.int32)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        for n, offset in PLANES:
-            t = -(o @ np.array(n) + offset) / (d @ np.array(n))
-            nearer = (t > 1e-3) & (t < depth)
-            depth[nearer], normals[nearer] = t[nearer], n
-        for k, (center, radius) in enumerate(SPHERES, start=1):
-            b, a = d @ (o - center), (d**2).sum(-1)
-            t = (-b - np.sqrt(b**2 - a * (((o - center) ** 2).sum() - radius**2))) / a
-            nearer = (t > 1e-3) & (t < depth)
-            depth[nearer], ids[nearer] = t[nearer], k
-            normals[nearer] = ((o + t[..., None] * d - center) / radius)[nearer]
-    seen = np.isfinite(depth)
-    depth = np.where(seen, depth, 0)
-    p = o + depth[..., None] * d
-    waves = np.stack([np.sin(9 * p + 1.3 * k).sum(-1) + np.sin(23 * p[..., k] + k) for k in range(3)], axis=-1)
-    color = np.where(seen[..., None], 128 + 28 * waves + 20 * (ids[..., None] - 1), 0)
-    return depth.astype(np.float32), normals, np.clip(color, 0, 255).astype(np.uint8), ids
-
-
-def pose_at(k: int) -> np.ndarray:
-    """T_world_camera of frame k: about a centimetre and a third of a degree further than the one before."""
-    return exp_se3(np.array([0.010, -0.003, 0.006, 0.002, -0.005, 0.001]) * k)
 
 
 @dataclass
@@ -106,10 +64,8 @@ class CornerRoom(RGBDSequence):
         time.sleep(self.slow_s)
         if index == self.unreadable:
             raise FrameError(f"frame {index}: depth/{index:06d}.png is truncated")
-        depth, _, color, ids = look(CAMERA, pose_at(index))
-        truth = FrameTruth(ids, dict(enumerate(CLASSES, start=1))) if self.truth else None
-        posed = self.truth and index not in self.unposed
-        return Frame(index, index / 30, color, depth, CAMERA, pose_at(index) if posed else None, truth)
+        frame = frame_at(index, self.truth)
+        return replace(frame, T_world_camera=None) if index in self.unposed else frame
 
     def scene_truth(self) -> SceneTruth | None:
         if not self.truth:
@@ -170,14 +126,7 @@ class SphereDetector(Detector):
     def detect(self, frame: Frame) -> Detections:
         if frame.index == self.broken_at:
             raise FrameError(f"frame {frame.index}: the detector cannot use it")
-        if frame.truth is None:
-            raise DataError(f"frame {frame.index} has no true instances: choose a detector that needs none")
-        masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
-        boxes = [
-            [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
-        ]
-        sure = np.array([[0.9, 0.1], [0.2, 0.8]], np.float32)
-        return Detections(masks, np.array(boxes, np.float32), sure.max(1), sure, CLASSES)
+        return spheres_in(frame)
 
 
 @dataclass

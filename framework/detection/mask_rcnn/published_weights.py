@@ -35,6 +35,7 @@ class PublishedNetwork:
     algorithm: str  # of hashlib
     digest: str  # hex, the first digits or all
     licence: str
+    megabytes: int = 0  # as far as it is known before the download; 0 = not known
 
     @property
     def file(self) -> Path:
@@ -49,6 +50,7 @@ PUBLISHED = {
         "sha256",
         "bf2d0c1e",
         "BSD-3-Clause",
+        178,
     ),
     "resnet50_fpn_coco_detectron2": PublishedNetwork(
         f"{DETECTRON2}mask_rcnn_R_50_FPN_3x/137849600/model_final_f10217.pkl", "md5", "f10217", "CC BY-SA 3.0"

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from framework import configs
 from framework.commands.plugins import Option, Parameter, describe, registered
 from framework.registry import STAGES
 
@@ -178,8 +179,44 @@ def test_an_option_reads_like_its_yaml() -> None:
     ]
 
 
-@pytest.mark.parametrize("stage", STAGES)
-def test_every_registered_option_can_be_described(stage: str) -> None:
-    for option in registered(stage):
+FAULTY_OPTIONS = {
+    "no_yaml": ("a: [1,\n", "no_yaml.yaml cannot be read: "),
+    "list": ("- 1\n", "list.yaml: expected keys and values, found a list"),
+    "no_text": ("\udcff", "no_text.yaml could not be read as text: "),
+    "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "has no NoDetection; did you mean 'NoDetections'?"),
+    "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
+    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "there is no parameter 'score'"),
+    "no_number": (
+        "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
+        "min_pixels: Value 'many' of type 'str' could not be converted to Integer",
+    ),
+    "no_option": ("defaults: [nobody, _self_]\n", "there is no detector=nobody"),
+}
+
+
+def test_options_of_a_folder_are_listed_and_each_faulty_one_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = tmp_path / "detector"
+    group.mkdir()
+    for name, (text, _) in FAULTY_OPTIONS.items():
+        (group / f"{name}.yaml").write_bytes(text.encode(errors="surrogateescape"))
+    (group / "own.yaml").write_text("_target_: plugins.detectors.none.NoDetections\n")
+    monkeypatch.setattr(configs, "_added", [tmp_path])
+    found = {option.name: option for option in registered("detector")}
+    for name, (_, said) in FAULTY_OPTIONS.items():
+        assert found[name].documentation.startswith("cannot be used: ")
+        assert said in found[name].documentation
+        assert "\n" not in found[name].documentation
+    assert found["own"].provider == "command-line"
+    assert found["own"].documentation == found["none"].documentation
+    assert len(found["maskrcnn2go"].parameters) > 3
+
+
+def test_every_registered_option_can_be_described() -> None:
+    options = registered(*STAGES)
+    assert {option.stage for option in options} == set(STAGES)
+    for option in options:
         assert option.name in describe(option)
         assert option.provider == "main"
+        assert not option.documentation.startswith("cannot be used")

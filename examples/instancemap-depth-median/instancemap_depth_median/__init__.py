@@ -1,0 +1,1 @@
+"""A refiner for InstanceMap: refiner=depth_median."""

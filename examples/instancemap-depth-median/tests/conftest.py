@@ -1,0 +1,5 @@
+"""Has pytest show the values in an assertion of a contract that fails."""
+
+import pytest
+
+pytest.register_assert_rewrite("framework.contracts")

@@ -1,0 +1,40 @@
+"""What every refiner keeps, and what is special about this one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from framework.contracts.corner_room import bleeding_clusters, exact_clusters, frame_at
+from framework.contracts.option import OptionContract
+from framework.contracts.refiner import RefinerContract
+from framework.errors import ConfigError
+
+from instancemap_depth_median.depth_median import DepthMedian
+
+
+class TestDepthMedian(OptionContract, RefinerContract):
+    option = "depth_median"
+
+
+def test_what_a_mask_takes_in_of_the_wall_behind_is_dropped() -> None:
+    frame = frame_at(1)
+    refined = DepthMedian().refine(bleeding_clusters(frame), frame)
+    ids = frame.truth.instance_ids[refined.pixels[:, 1], refined.pixels[:, 0]]
+    bleeding = bleeding_clusters(frame)
+    before = frame.truth.instance_ids[bleeding.pixels[:, 1], bleeding.pixels[:, 0]]
+    assert (ids == 0).sum() < 0.5 * (before == 0).sum()
+    assert (ids > 0).sum() > 0.99 * (before > 0).sum()
+
+
+def test_what_is_far_behind_the_most_is_dropped_and_the_rest_stays() -> None:
+    frame = frame_at(1)
+    clusters = exact_clusters(frame)
+    farthest = frame.depth[clusters.pixels[:, 1], clusters.pixels[:, 0]].argmax()
+    frame.depth[tuple(clusters.pixels[farthest, ::-1])] += 1
+    refined = DepthMedian(reach=0.5).refine(clusters, frame)
+    np.testing.assert_array_equal(refined.pixels, np.delete(clusters.pixels, farthest, axis=0))
+
+
+def test_parameters_are_checked() -> None:
+    with pytest.raises(ConfigError, match=r"DepthMedian.reach must be in \[0, inf\], found -1"):
+        DepthMedian(reach=-1)
