@@ -26,7 +26,7 @@ from framework.pipeline import Pipeline
 from framework.records.mesh_file import read_mesh
 from framework.registry import STAGES, build
 from tests import option_files
-from tests.doc_pages import CHECKOUT, LINES, block, blocks
+from tests.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 COMMANDS = {  # by the main config that they compose
@@ -232,7 +232,7 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
 def test_every_row_of_an_experiment_is_named(name: str) -> None:
     rows = configs.composed(f"experiment={name}", "row=any").rows
     assert rows
-    assert not [row for row in rows if f"`{row}`" not in README]
+    assert not [row for row in rows if not any(f"`{row}`" in page for page in PAGES.values())]
 
 
 @pytest.mark.parametrize("command", BENCHMARKS)
