@@ -17,6 +17,7 @@ COMMANDS = {
     "import": "turns a recording of a phone or a sensor into a folder that can be mapped",
     "check": "looks whether a recording will map, and says what to set where it will not",
     "diff": "lists what appeared, vanished or moved between two visits of a place",
+    "query": "ranks a stored run's objects by words: a red chair",
     "evaluate": "evaluates stored runs anew, without running them again",
     "detect": "writes a video's detections as a COCO result file",
     "show-refinement": "draws one frame's masks before and after refinement",
@@ -34,6 +35,7 @@ PRINTING = (
     "ranks",
     "figures",
     "diff",
+    "query",
     "evaluate",
     "plugins",
 )  # what others may be reading: `| head` ends them without a word

@@ -184,6 +184,11 @@ class SceneMap(ABC):
         return 0
 
     @property
+    def embedding_space(self) -> str:
+        """What the `embedding` of its objects is of, as in Detections; "" where none has one."""
+        return ""
+
+    @property
     def instance_count(self) -> int:
         """The number of objects found so far; asked often, for the progress bar: override it where it can be cheap."""
         return len(self.instances())

@@ -163,6 +163,7 @@ FAULTY = {
     "import": ["old", "new"],
     "check": ["out=check.jpg"],
     "diff": ["old", "old"],
+    "query": ["old", "a red chair"],
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],
