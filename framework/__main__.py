@@ -25,6 +25,7 @@ COMMANDS = {
     "plugins": "lists what is registered for each stage, with its parameters",
     "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
     "train-detector": "trains Mask R-CNN on rendered rooms",
+    "train-words": "trains the network that knows rendered rooms in words",
     "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
     "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
 }

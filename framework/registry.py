@@ -211,7 +211,8 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
         if key not in names:
             raise ConfigError(f"{where}: there is no parameter {str(key)!r}{_did_you_mean(str(key), names, 'it has')}")
         if key in stages:
-            plugins[str(key)] = _plugins(f"{where}: {key}", stages[str(key)], node[key])
+            given = _plugin if holds_one(plugin_class, str(key)) else _plugins
+            plugins[str(key)] = given(f"{where}: {key}", stages[str(key)], node[key])
             continue
         try:
             schema[key] = node[key]
@@ -228,13 +229,20 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """The fields that hold other plugins by name, Mapping[str, interface], and their interfaces."""
+    """The fields that hold another plugin, or several by name (Mapping[str, interface]), and their interfaces."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)
+        if hint in STAGES.values():
+            found[name] = hint
         if get_origin(hint) is Mapping and len(of) == 2 and of[1] in STAGES.values():
             found[name] = of[1]
     return found
+
+
+def holds_one(plugin_class: type, name: str) -> bool:
+    """Whether a field that holds plugins holds one, and not several by name."""
+    return get_type_hints(plugin_class)[name] in STAGES.values()
 
 
 def _schema(name: str, fields: Mapping[str, tuple[dataclasses.Field[Any], Any]]) -> DictConfig:
@@ -245,6 +253,14 @@ def _schema(name: str, fields: Mapping[str, tuple[dataclasses.Field[Any], Any]])
     ]
     schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(name, kept))
     return schema
+
+
+def _plugin(where: str, interface: type[Plugin], node: Any) -> Plugin:
+    """The plugin that a config in another one's describes."""
+    try:
+        return build(interface, node)
+    except InstanceMapError as error:
+        raise type(error)(f"{where}: {error}") from error
 
 
 def _plugins(where: str, interface: type[Plugin], node: Any) -> dict[str, Plugin]:

@@ -160,6 +160,13 @@ def _transformers_segmentation(folder: Path) -> list[str]:
     return [f"detector.model={write_network(folder, 'mask2former')}", "detector.score_threshold=0.02"]
 
 
+def _with_embeddings(folder: Path) -> list[str]:
+    pytest.importorskip("transformers")
+    from tests.tiny_image_text import write_image_text
+
+    return [f"detector.model={write_image_text(folder)}", "detector.min_pixels=20"]
+
+
 def _rf_detr_seg(folder: Path) -> list[str]:
     pytest.importorskip("transformers")
     from tests.tiny_transformers import write_network
@@ -190,5 +197,6 @@ WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("detector", "precomputed"): _precomputed,
     ("detector", "rf_detr_seg"): _rf_detr_seg,
     ("detector", "transformers_segmentation"): _transformers_segmentation,
+    ("detector", "with_embeddings"): _with_embeddings,
     ("tracker", "trajectory_file"): _trajectory_file,
 }

@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
-from framework.registry import STAGES, composition, find_class, parameter_fields, plugin_fields
+from framework.registry import STAGES, composition, find_class, holds_one, parameter_fields, plugin_fields
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -70,8 +70,11 @@ def _option(loader: Any, stage: str, name: str) -> Option:
     except (ConfigError, HydraException) as error:
         return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
     nested = {
-        name: ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
+        name: path.rpartition("/")[2]
+        if holds_one(plugin_class, name)
+        else ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
         for name in plugin_fields(plugin_class)
+        for path in [next((path for path, package in inherited.items() if package == f"{stage}.{name}"), "")]
     }
     texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
     comments = {match["key"]: match["comment"] for text in texts for match in _COMMENTED_KEY.finditer(text)}

@@ -171,6 +171,7 @@ FAULTY = {
     "plugins": ["detector", "nothing"],
     "synthesize": ["new", "--scenes=999"],
     "train-detector": ["device=tpu"],
+    "train-words": ["schedule.epochs=0"],
     "convert-weights": ["nothing.pth", "out.safetensors"],
     "convert-oni": ["nothing.oni", "out"],
 }
