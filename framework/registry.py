@@ -18,7 +18,7 @@ from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from hydra.types import RunMode
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configs import config_directory
@@ -201,7 +201,7 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
         schema = _schema(plugin_class.__name__, {name: of for name, of in fields.items() if name not in stages})
     except OmegaConfBaseException as error:
         raise ConfigError(
-            f"{where}: parameters must be bool, int, float, str, Path or Enum: {_first_line(error)}"
+            f"{where}: parameters must be bool, int, float, str, Path, Enum or list[str]: {_first_line(error)}"
         ) from error
     names = list(fields)
     plugins: dict[str, Any] = {}
@@ -225,7 +225,12 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
         hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
         raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
-    return {name: plugins[name] if name in stages else schema[name] for name in names}
+    return {name: plugins[name] if name in stages else _plain(schema[name]) for name in names}
+
+
+def _plain(value: Any) -> Any:
+    """A list as Python has it."""
+    return list(value) if isinstance(value, ListConfig) else value
 
 
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:

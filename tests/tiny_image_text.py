@@ -33,7 +33,6 @@ TEXT = {
 def write_image_text(folder: Path, kind: str = "siglip") -> Path:
     """A model of this `model_type`, as save_pretrained writes it, with its tokenizer and preprocessing."""
     import transformers
-    from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
 
     torch.manual_seed(5)
     config_class, model_class = {
@@ -46,6 +45,19 @@ def write_image_text(folder: Path, kind: str = "siglip") -> Path:
         for weights in model.parameters():  # as they are made, all pictures would look alike to them
             weights.add_(torch.randn_like(weights) * 0.3)
     model.save_pretrained(folder)
+    write_tokenizer(folder)
+    size = {"height": SIDE, "width": SIDE} if kind == "siglip" else {"shortest_edge": SIDE}
+    content = {"size": size, "resample": 3, "rescale_factor": 1 / 255}
+    content |= {"image_mean": [0.5] * 3, "image_std": [0.5] * 3} if kind == "siglip" else {}
+    (folder / "preprocessor_config.json").write_text(json.dumps(content))
+    return folder
+
+
+def write_tokenizer(folder: Path) -> None:
+    """One of WORDS."""
+    import transformers
+    from tokenizers import Tokenizer, models, normalizers, pre_tokenizers, processors
+
     tokenizer = Tokenizer(models.WordLevel({word: k for k, word in enumerate(WORDS)}, unk_token="[UNK]"))
     tokenizer.normalizer = normalizers.Lowercase()
     tokenizer.pre_tokenizer = pre_tokenizers.Whitespace()
@@ -54,8 +66,3 @@ def write_image_text(folder: Path, kind: str = "siglip") -> Path:
         tokenizer_object=tokenizer, pad_token="[PAD]", unk_token="[UNK]", eos_token="[EOS]"
     )
     fast.save_pretrained(folder)
-    size = {"height": SIDE, "width": SIDE} if kind == "siglip" else {"shortest_edge": SIDE}
-    content = {"size": size, "resample": 3, "rescale_factor": 1 / 255}
-    content |= {"image_mean": [0.5] * 3, "image_std": [0.5] * 3} if kind == "siglip" else {}
-    (folder / "preprocessor_config.json").write_text(json.dumps(content))
-    return folder

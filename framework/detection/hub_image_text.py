@@ -14,7 +14,8 @@ from torch import Tensor
 from framework.data import Float32, UInt8
 from framework.detection.hub_model import CONFIG, PREPROCESSING, find_model
 from framework.detection.image_text import ImageTextModel, unit_rows
-from framework.errors import ConfigError, DataError, in_one_line
+from framework.detection.transformers_parts import imported_transformers, read_part
+from framework.errors import ConfigError, DataError
 from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
@@ -52,16 +53,10 @@ class HubImageText(ImageTextModel):
     sees_mask = False
 
     def __init__(self, model: str, revision: str, device: torch.device, half: bool) -> None:
-        try:
-            import transformers
-        except ImportError as error:
-            raise ConfigError(
-                "the package transformers is not installed: pip install instancemap[transformers]"
-            ) from error
-        self._transformers = transformers
+        transformers = imported_transformers()
         self._folder = find_model(model, revision, TOKENIZER)
         self._device = device
-        config = self._read("its config.json", transformers.AutoConfig)
+        config = read_part("detector.model", self._folder, "its config.json", transformers.AutoConfig)
         if config.model_type not in FAMILIES:
             raise ConfigError(
                 f"detector.model must be a CLIP or a SigLIP of a fixed size, found {model}, a {config.model_type}"
@@ -71,8 +66,8 @@ class HubImageText(ImageTextModel):
         if not 16 <= self.side <= LONGEST_SIDE:
             raise DataError(f"detector.model: {self._folder} takes pictures of {self.side} px; expected 16 to 1024")
         self._mean, self._std, self._factor = _normalization(self._folder / PREPROCESSING, self._family)
-        self._tokenizer = self._read("its tokenizer", transformers.AutoTokenizer)
-        network = self._read("its weights", transformers.AutoModel)
+        self._tokenizer = read_part("detector.model", self._folder, "its tokenizer", transformers.AutoTokenizer)
+        network = read_part("detector.model", self._folder, "its weights", transformers.AutoModel)
         self._dtype = torch.float16 if half and device.type == "cuda" else torch.float32
         self._network = network.to(device, self._dtype).eval()
         self.space = _space(self._folder, model)
@@ -100,14 +95,6 @@ class HubImageText(ImageTextModel):
     def _unit(self, features: Any) -> Float32:
         vectors: Tensor = features if isinstance(features, Tensor) else features.pooler_output
         return unit_rows(vectors.float().cpu().numpy(), self.space)
-
-    def _read(self, what: str, auto_class: Any) -> Any:
-        try:
-            return auto_class.from_pretrained(str(self._folder), local_files_only=True)
-        except Exception as error:  # whatever transformers, tokenizers and safetensors raise on foreign files
-            raise DataError(
-                f"detector.model: {what} could not be read from {self._folder}: {in_one_line(error)}"
-            ) from error
 
 
 def _normalization(path: Path, family: Family) -> tuple[tuple[float, ...], tuple[float, ...], float]:
