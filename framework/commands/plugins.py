@@ -11,6 +11,7 @@ import importlib.resources
 import inspect
 import re
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -69,13 +70,7 @@ def _option(loader: Any, stage: str, name: str) -> Option:
         plugin_class = find_class(STAGES[stage], target)
     except (ConfigError, HydraException) as error:
         return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
-    nested = {
-        name: path.rpartition("/")[2]
-        if holds_one(plugin_class, name)
-        else ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{stage}.{name}." in package)
-        for name in plugin_fields(plugin_class)
-        for path in [next((path for path, package in inherited.items() if package == f"{stage}.{name}"), "")]
-    }
+    nested = {name: _nested(inherited, f"{stage}.{name}", plugin_class) for name in plugin_fields(plugin_class)}
     texts = [_text(file.path, f"{path}.yaml") for path, file in files.items()]
     comments = {match["key"]: match["comment"] for text in texts for match in _COMMENTED_KEY.finditer(text)}
     parameters = tuple(
@@ -92,6 +87,14 @@ def _option(loader: Any, stage: str, name: str) -> Option:
     if change and len(files) > 1:
         documentation += f" Here: {change['comment']}."
     return Option(stage, name, target, own.provider, documentation, parameters)
+
+
+def _nested(inherited: Mapping[str, str], place: str, plugin_class: type) -> str:
+    """The options that a field at `place` (detector.of) holds: one, or several by name."""
+    if holds_one(plugin_class, place.rpartition(".")[2]):
+        own = [path for path, package in inherited.items() if package == place]
+        return own[-1].rpartition("/")[2] if own else ""  # after those that it inherits from
+    return ", ".join(package.rpartition(".")[2] for package in inherited.values() if f"{place}." in package)
 
 
 def _default(field: dataclasses.Field[Any]) -> object:
