@@ -19,6 +19,7 @@ COMMANDS = {
     "check": "looks whether a recording will map, and says what to set where it will not",
     "diff": "lists what appeared, vanished or moved between two visits of a place",
     "export": "writes a run as GLB, USD, PLY, OBJ, floor plan, ROS map or scene graph",
+    "query": "ranks a stored run's objects by words: a red chair",
     "evaluate": "evaluates stored runs anew, without running them again",
     "detect": "writes a video's detections as a COCO result file",
     "show-refinement": "draws one frame's masks before and after refinement",
@@ -28,6 +29,7 @@ COMMANDS = {
     "new-plugin": "writes a repository with a plugin of your own: package, option, tests, CI",
     "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
     "train-detector": "trains Mask R-CNN on rendered rooms",
+    "train-words": "trains the network that knows rendered rooms in words",
     "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
     "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
 }
@@ -40,6 +42,7 @@ PRINTING = (
     "report",
     "diff",
     "export",
+    "query",
     "evaluate",
     "plugins",
     "doctor",

@@ -44,6 +44,8 @@ MOST_PIXELS = 2**25  # of an image: 8K video
 WIDEST = 10.0  # m sideways for each m of depth, that a camera sees: 168 degrees; no lens without distortion has more
 LONGEST_FOCAL_LENGTH = 1e6  # px
 UNIT_TOLERANCE = 1e-3  # largest | |v| - 1 | of a unit vector
+LONGEST_EMBEDDING = 65_536  # numbers in one; published networks have some 500 to 4,000
+LONGEST_SPACE = 300  # characters of the name of a space of embeddings
 PROBABILITY_TOLERANCE = 1e-3  # a row of probabilities sums to 1 within this: softmax in half precision
 
 
@@ -213,6 +215,8 @@ class Detections:
     class_probabilities: Float32  # (N, C), each row a distribution over `classes`
     classes: tuple[str, ...]  # names of the C columns
     exact: bool = False  # the masks are the objects' true outlines: refiners have nothing to clean
+    embeddings: Float32 | None = None  # (N, D) unit rows, 0 = not computed for this one; None = for none of them
+    embedding_space: str = ""  # what they are of, "MODEL@REVISION": only those of one space compare; "" = none
 
     def __post_init__(self) -> None:
         n, c = len(self.scores), len(self.classes)
@@ -221,6 +225,7 @@ class Detections:
         check_array("Detections.scores", self.scores, (n,), np.float32)
         _check_scores("Detections.scores", self.scores)
         _check_distributions("Detections.class_probabilities", self.class_probabilities, (n, c))
+        _check_embeddings("Detections.embeddings", self.embeddings, self.embedding_space, n)
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -252,6 +257,8 @@ class PointClusters:
     classes: tuple[str, ...]  # names of the C columns
     exact: bool = False  # as in Detections
     structure: Bool | None = None  # (H, W) pixels on floors and walls, which are of no object; None = none is known
+    embeddings: Float32 | None = None  # (N, D), as in Detections
+    embedding_space: str = ""  # as in Detections
 
     def __post_init__(self) -> None:
         p, n, c = len(self.points_world), len(self.scores), len(self.classes)
@@ -261,6 +268,7 @@ class PointClusters:
         check_array("PointClusters.scores", self.scores, (n,), np.float32)
         _check_scores("PointClusters.scores", self.scores)
         _check_distributions("PointClusters.class_probabilities", self.class_probabilities, (n, c))
+        _check_embeddings("PointClusters.embeddings", self.embeddings, self.embedding_space, n)
         if p and (self.cluster.min() < -1 or self.cluster.max() >= n):
             raise DataError(
                 f"PointClusters.cluster must be in [-1, {n}), found {self.cluster.min()} to {self.cluster.max()}"
@@ -313,6 +321,8 @@ class Instance:
     vertices: Int32  # (M,) indices of its vertices in the map's InstanceMesh
     aabb: Box
     obb: Box
+    embedding: Float32 | None = None  # (D,) unit vector in the map's `embedding_space`; None = nothing was embedded
+    embedding_spread: float | None = None  # in [0, 1], 1 - |mean of its unit vectors|: 0 = all alike
 
 
 @dataclass(frozen=True)
@@ -400,6 +410,24 @@ def check_array(name: str, array: Array, shape: tuple[int | None, ...], dtype: n
 def _check_scores(name: str, scores: Float32) -> None:
     if scores.size and (scores.min() < 0 or scores.max() > 1):
         raise DataError(f"{name} must be in [0, 1], found {scores.min()} to {scores.max()}")
+
+
+def _check_embeddings(name: str, rows: Float32 | None, space: str, n: int) -> None:
+    if not isinstance(cast(object, space), str) or len(space) > LONGEST_SPACE:
+        raise DataError(f"{name}: embedding_space must be at most {LONGEST_SPACE} characters, found {space!r:.60}")
+    if rows is None:
+        if space:
+            raise DataError(f"{name}: there are none, and embedding_space is {space!r}")
+        return
+    if not space:
+        raise DataError(f"{name}: embedding_space must name what they are of")
+    check_array(name, rows, (n, None), np.float32)
+    if not 1 <= rows.shape[1] <= LONGEST_EMBEDDING:
+        raise DataError(f"{name} must have 1 to {LONGEST_EMBEDDING} columns, found {rows.shape[1]}")
+    lengths = np.linalg.norm(rows, axis=1)
+    wrong = (lengths != 0) & (np.abs(lengths - 1) > UNIT_TOLERANCE)
+    if wrong.any():
+        raise DataError(f"{name}: each row must be a unit vector, or 0, found one of length {lengths[wrong][0]:.4g}")
 
 
 def _check_distributions(name: str, rows: Float32, shape: tuple[int, int]) -> None:

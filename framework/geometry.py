@@ -137,6 +137,8 @@ def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
         scores=detections.scores,
         classes=detections.classes,
         exact=detections.exact,
+        embeddings=detections.embeddings,
+        embedding_space=detections.embedding_space,
     )
 
 

@@ -6,10 +6,10 @@
                   '------------- view of the map ---------------'
 
 A plugin is a dataclass that implements one of the four interfaces. Its dataclass fields are its parameters (bool, int,
-float, str, Path or Enum, with unit and bounds beside the default), checked in `__post_init__`; whatever else it keeps
-is assigned there as a plain attribute, never declared as a field. What several plugins do by the same parameters is a
-part, a field of another dataclass that has these and the methods; in a config they are the plugin's own. One YAML file
-in the stage's config group registers it.
+float, str, Path, Enum or list[str], with unit and bounds beside the default), checked in `__post_init__`; whatever else
+it keeps is assigned there as a plain attribute, never declared as a field. What several plugins do by the same
+parameters is a part, a field of another dataclass that has these and the methods; in a config they are the plugin's
+own. A field may be another plugin, or several by name. One YAML file in the stage's config group registers it.
 """
 
 from __future__ import annotations
@@ -182,6 +182,11 @@ class SceneMap(ABC):
     def evictions(self) -> int:
         """How often a voxel had to forget a label for want of room; a map that never forgets leaves it at 0."""
         return 0
+
+    @property
+    def embedding_space(self) -> str:
+        """What the `embedding` of its objects is of, as in Detections; "" where none has one."""
+        return ""
 
     @property
     def instance_count(self) -> int:

@@ -20,7 +20,7 @@ from hydra._internal.defaults_list import create_defaults_list
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.configs import config_directory
@@ -210,7 +210,7 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
         hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
         raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
-    return {name: plugins[name] if name in stages else schema[name] for name in fields}
+    return {name: plugins[name] if name in stages else _plain(schema[name]) for name in fields}
 
 
 def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
@@ -231,7 +231,7 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         schema = _schema(plugin_class.__name__, {name: of for name, of in fields.items() if name not in stages})
     except OmegaConfBaseException as error:
         raise ConfigError(
-            f"{where}: parameters must be bool, int, float, str, Path or Enum: {_first_line(error)}"
+            f"{where}: parameters must be bool, int, float, str, Path, Enum or list[str]: {_first_line(error)}"
         ) from error
     names = list(fields)
     plugins: dict[str, Any] = {}
@@ -241,7 +241,8 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         if key not in names:
             raise ConfigError(f"{where}: there is no parameter {str(key)!r}{_did_you_mean(str(key), names, 'it has')}")
         if key in stages:
-            plugins[str(key)] = _plugins(f"{where}: {key}", stages[str(key)], node[key])
+            given = _plugin if holds_one(plugin_class, str(key)) else _plugins
+            plugins[str(key)] = given(f"{where}: {key}", stages[str(key)], node[key])
             continue
         try:
             schema[key] = node[key]
@@ -250,14 +251,26 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
     return schema, plugins
 
 
+def _plain(value: Any) -> Any:
+    """A list as Python has it."""
+    return list(value) if isinstance(value, ListConfig) else value
+
+
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """The fields that hold other plugins by name, Mapping[str, interface], and their interfaces."""
+    """The fields that hold another plugin, or several by name (Mapping[str, interface]), and their interfaces."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)
+        if hint in STAGES.values():
+            found[name] = hint
         if get_origin(hint) is Mapping and len(of) == 2 and of[1] in STAGES.values():
             found[name] = of[1]
     return found
+
+
+def holds_one(plugin_class: type, name: str) -> bool:
+    """Whether a field that holds plugins holds one, and not several by name."""
+    return get_type_hints(plugin_class)[name] in STAGES.values()
 
 
 def _schema(name: str, fields: Mapping[str, tuple[dataclasses.Field[Any], Any]]) -> DictConfig:
@@ -268,6 +281,14 @@ def _schema(name: str, fields: Mapping[str, tuple[dataclasses.Field[Any], Any]])
     ]
     schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(name, kept))
     return schema
+
+
+def _plugin(where: str, interface: type[Plugin], node: Any) -> Plugin:
+    """The plugin that a config in another one's describes."""
+    try:
+        return build(interface, node)
+    except InstanceMapError as error:
+        raise type(error)(f"{where}: {error}") from error
 
 
 def _plugins(where: str, interface: type[Plugin], node: Any) -> dict[str, Plugin]:

@@ -160,6 +160,21 @@ def _transformers_segmentation(folder: Path) -> list[str]:
     return [f"detector.model={write_network(folder, 'mask2former')}", "detector.score_threshold=0.02"]
 
 
+def _with_embeddings(folder: Path) -> list[str]:
+    pytest.importorskip("transformers")
+    from tests.tiny_image_text import write_image_text
+
+    return [f"detector.model={write_image_text(folder)}", "detector.min_pixels=20"]
+
+
+def _open_vocabulary(folder: Path) -> list[str]:
+    pytest.importorskip("transformers")
+    from tests.tiny_open_vocabulary import write_owlv2, write_sam
+
+    boxes, masks = write_owlv2(folder / "owlv2"), write_sam(folder / "sam", "sam")
+    return [f"detector.model={boxes}", f"detector.masks={masks}", "detector.words=[red chair,bed]"]
+
+
 def _rf_detr_seg(folder: Path) -> list[str]:
     pytest.importorskip("transformers")
     from tests.tiny_transformers import write_network
@@ -187,8 +202,10 @@ WRITERS: dict[tuple[str, str], Callable[[Path], list[str]]] = {
     ("detector", "mask_rcnn"): _mask_rcnn,
     ("detector", "onnx_boxes"): _onnx_boxes,
     ("detector", "onnx_segmentation"): _onnx_segmentation,
+    ("detector", "open_vocabulary"): _open_vocabulary,
     ("detector", "precomputed"): _precomputed,
     ("detector", "rf_detr_seg"): _rf_detr_seg,
     ("detector", "transformers_segmentation"): _transformers_segmentation,
+    ("detector", "with_embeddings"): _with_embeddings,
     ("tracker", "trajectory_file"): _trajectory_file,
 }

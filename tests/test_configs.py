@@ -13,9 +13,10 @@ from omegaconf import OmegaConf
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
 from framework.interfaces import RGBDSequence
-from framework.registry import STAGES, find_class, parameter_fields, parameters, plugin_fields
+from framework.registry import STAGES, find_class, holds_one, parameter_fields, parameters, plugin_fields
 from framework.tables.comparison import TableChoice
 from framework.training.trainer import Schedule
+from framework.training.word_trainer import WordSchedule
 from tests import registered
 
 
@@ -68,8 +69,13 @@ def test_every_value_in_the_yaml_is_the_default_of_the_class(stage: str, name: s
     plugin_class = find_class(STAGES[stage], node["_target_"])
     links = plugin_fields(plugin_class)
     for key in links:
-        for link in node[key]:
-            assert node[key][link] == registered.composed(stage, link)[stage], "a link is the option of its name"
+        one = holds_one(plugin_class, key)
+        shown = next(
+            parameter.default for parameter in registered.OPTION[stage, name].parameters if parameter.name == key
+        )
+        for link in [shown] if one else node[key]:
+            found = node[key] if one else node[key][link]
+            assert found == registered.composed(stage, link)[stage], "a link is the option of its name"
     fields = [field for name, (field, _) in parameter_fields(plugin_class).items() if name not in links]
     asked = [field.name for field in fields if OmegaConf.is_missing(node, field.name)]
     answered = set(own) if is_variant else set()  # desk says where its frames are
@@ -90,6 +96,9 @@ def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> N
     schedule = OmegaConf.load(CONF / "train_detector.yaml").schedule
     assert Schedule(**schedule) == Schedule()
     assert set(schedule) == {field.name for field in dataclasses.fields(Schedule)} - {"seed", "budget"}
+    words = OmegaConf.load(CONF / "train_words.yaml").schedule
+    assert WordSchedule(**words) == WordSchedule()
+    assert set(words) == {field.name for field in dataclasses.fields(WordSchedule)} - {"seed"}
     table = OmegaConf.load(CONF / "parts" / "experiment.yaml").table
     assert TableChoice.of(table) == TableChoice(columns=list(table.columns))
     assert set(table) == {field.name for field in dataclasses.fields(TableChoice)}

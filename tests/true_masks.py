@@ -26,8 +26,12 @@ def fuse_masks(
     masks: Sequence[np.ndarray],
     scores: Sequence[float],
     probabilities: Sequence[tuple[float, float]] | None = None,
+    embeddings: np.ndarray | None = None,
+    space: str = "words@1",
 ) -> None:
-    """Fuses the frame at its true pose, with these masks detected, each with its distribution over the classes."""
+    """Fuses the frame at its true pose, with these masks detected, each with its distribution over the classes, and
+    with an embedding (n, D) of this space where there are some.
+    """
     assert frame.T_world_camera is not None
     n = len(masks)
     detections = Detections(
@@ -36,6 +40,8 @@ def fuse_masks(
         scores=np.array(scores, np.float32),
         class_probabilities=np.float32(probabilities or [PROBABILITIES] * n).reshape(n, 2),
         classes=CLASSES,
+        embeddings=None if embeddings is None else embeddings.astype(np.float32),
+        embedding_space="" if embeddings is None else space,
     )
     pose = Pose(frame.T_world_camera)
     fuser.fuse(frame, pose, lift(detections, frame, pose))

@@ -13,6 +13,7 @@ import importlib.resources
 import inspect
 import re
 import textwrap
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +27,15 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError, DataError
-from framework.registry import STAGES, check_option, composition, find_class, parameter_fields, plugin_fields
+from framework.registry import (
+    STAGES,
+    check_option,
+    composition,
+    find_class,
+    holds_one,
+    parameter_fields,
+    plugin_fields,
+)
 
 COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -86,12 +95,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
     except (ConfigError, DataError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
         return Option(stage, name, target, source.provider, f"cannot be used: {one_line(error)}", ())
     given: Any = OmegaConf.to_container(node, resolve=False)
-    nested = {
-        field: ", ".join(
-            dict.fromkeys(package.rpartition(".")[2] for package in made_of.values() if f"{stage}.{field}." in package)
-        )
-        for field in plugin_fields(plugin_class)
-    }
+    nested = {name: _nested(made_of, f"{stage}.{name}", plugin_class) for name in plugin_fields(plugin_class)}
     comments = {match["key"]: match["comment"] for text in texts for match in COMMENTED_KEY.finditer(text)}
     parameters = tuple(
         Parameter(
@@ -107,6 +111,15 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
     if change and len(texts) > 1:
         documentation += f" Here: {change['comment']}."
     return Option(stage, name, target, source.provider, documentation, parameters)
+
+
+def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
+    """The options that a field at `place` (detector.of) holds: one, or several by name."""
+    if holds_one(plugin_class, place.rpartition(".")[2]):
+        own = [path for path, package in made_of.items() if package == place]
+        return own[-1].rpartition("/")[2] if own else ""  # after those that it inherits from
+    packages = (package for package in made_of.values() if f"{place}." in package)
+    return ", ".join(dict.fromkeys(package.rpartition(".")[2] for package in packages))
 
 
 def _default(field: dataclasses.Field[Any]) -> object:

@@ -30,6 +30,7 @@ CHECKSUM_BYTES = 32  # SHA-256 of an entry's place and content, before the conte
 SUFFIX = ".detections"
 LARGEST_ENTRY = 2**30  # bytes; a thousand masks of 1 MB of run lengths
 FRAME_FIELDS = tuple(field.name for field in fields(Frame))
+EMBEDDINGS, SPACE = "embeddings", "embedding_space"  # of Detections, in entries that have them
 KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored as they are
 
 
@@ -209,6 +210,9 @@ def pack(detections: Detections) -> bytes:
         rows = np.ascontiguousarray(mask[y1 : y2 + 1, x1 : x2 + 1])
         runs.append(coco.encode(rows.view(np.uint8).T)["counts"])
     arrays = {name: np.ascontiguousarray(getattr(detections, name)) for name in KEPT}
+    if detections.embeddings is not None:
+        arrays[EMBEDDINGS] = np.ascontiguousarray(detections.embeddings)
+        arrays[SPACE] = np.frombuffer(detections.embedding_space.encode(), np.uint8)
     return save(
         {
             **arrays,
@@ -229,7 +233,10 @@ def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
     masks = _unpack_masks(stored["runs"].tobytes(), stored["run_bytes"], stored["mask_boxes"], stored["shape"])
     # copies: arrays that a later stage could not write to would be a difference
     arrays = {name: stored[name].copy() for name in KEPT}
-    return Detections(masks=masks, classes=classes, exact=bool(stored["exact"][0]), **arrays)
+    embeddings = stored[EMBEDDINGS].copy() if EMBEDDINGS in stored else None
+    space = stored[SPACE].tobytes().decode() if SPACE in stored else ""
+    exact = bool(stored["exact"][0])
+    return Detections(masks=masks, classes=classes, exact=exact, embeddings=embeddings, embedding_space=space, **arrays)
 
 
 def _unpack_masks(runs: bytes, run_bytes: Int32, boxes: Int32, shape: Int32) -> Bool:

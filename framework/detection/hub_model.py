@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,10 @@ WHOLE, INDEX, PICKLED = "model.safetensors", "model.safetensors.index.json", "py
 log = logging.getLogger(__name__)
 
 
-def find_model(model: str, revision: str) -> Path:
+def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
     """The folder of a model: `model` itself, or that of a model id in the cache, downloaded if need be.
 
+    `more` are files that it needs beside its config, preprocessing and weights: those of its tokenizer.
     A model id that is in the cache is not asked for again. Needs huggingface_hub, which transformers brings. Raises
     DataError, with what to do, when there is no such model, it cannot be downloaded, or is not what was published.
     """
@@ -36,16 +37,16 @@ def find_model(model: str, revision: str) -> Path:
         for file in filter(Path.exists, (folder / name for name in (CONFIG, PREPROCESSING, WHOLE, INDEX, PICKLED))):
             check_regular(file)  # transformers would wait for what a pipe says
         return folder
-    cached = _cached(model, revision)
+    cached = _cached(model, revision, more)
     if cached is None:
-        _download(model, revision)
-        cached = _cached(model, revision)
+        _download(model, revision, more)
+        cached = _cached(model, revision, more)
     if cached is None:
         raise DataError(f"detector.model: {model} was downloaded, and is not whole in the cache: try again")
     return cached
 
 
-def _cached(model: str, revision: str) -> Path | None:
+def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
     """The folder of a model id in the cache, if what is needed of it is there."""
     from huggingface_hub import try_to_load_from_cache
     from huggingface_hub.errors import HFValidationError
@@ -61,7 +62,7 @@ def _cached(model: str, revision: str) -> Path | None:
     weights = _weights(names)
     if INDEX in weights:
         weights = _listed(folder / INDEX)
-    return folder if weights and {PREPROCESSING, *weights} <= names else None
+    return folder if weights and {PREPROCESSING, *more, *weights} <= names else None
 
 
 def _listed(index: Path) -> list[str]:
@@ -81,7 +82,7 @@ def _weights(names: Collection[str]) -> list[str]:
     return [PICKLED] if PICKLED in names else []
 
 
-def _download(model: str, revision: str) -> None:
+def _download(model: str, revision: str, more: Sequence[str]) -> None:
     """Fetches what is needed, with progress bars of huggingface_hub, each file whole or not at all."""
     if variable := _forbidden_by():
         raise DataError(
@@ -94,7 +95,7 @@ def _download(model: str, revision: str) -> None:
     try:
         info = hub.model_info(model, revision=revision, files_metadata=True)
         files = {file.rfilename: file for file in info.siblings or ()}
-        wanted = [CONFIG, PREPROCESSING, *(_weights(files) or [WHOLE])]
+        wanted = [CONFIG, PREPROCESSING, *more, *(_weights(files) or [WHOLE])]
         if missing := [name for name in wanted if name not in files]:
             raise DataError(f"detector.model: {model} on {constants.ENDPOINT} has no {' and no '.join(missing)}")
         size = sum(files[name].size or 0 for name in wanted)

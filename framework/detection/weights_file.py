@@ -15,13 +15,13 @@ Tensor = TypeVar("Tensor")  # what a library tells of an input
 Shape = tuple[int, ...]
 
 
-def find_file(path: Path) -> Path:
-    """The file `path`. A relative one is tried from the working folder, then from the project's."""
+def find_file(path: Path, parameter: str = "detector.weights") -> Path:
+    """The file `path` of a parameter. A relative one is tried from the working folder, then from the project's."""
     for candidate in candidates(path):
         if candidate.is_file():
             return candidate
     looked = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
-    raise DataError(f"detector.weights: there is no file {looked}; put the network there, or name another")
+    raise DataError(f"{parameter}: there is no file {looked}; put the network there, or name another")
 
 
 def checked_hash(path: Path, sha256: str) -> str:

@@ -9,6 +9,7 @@ lies on it. A cluster that finds none there looks for one among the next likelie
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import combinations
@@ -22,6 +23,7 @@ from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointCl
 from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance, labeled_voxel, next_instance
 from framework.mapping.instance_table import InstanceTable
+from framework.mapping.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.pixel_lists import PixelLists, cover_another
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import Pinhole
@@ -217,11 +219,23 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, lea
     An instance is in view where at least `least` pixels see it, or where it was detected.
     """
     instance_ids, scores = matches.instance_ids, matches.clusters.scores
+    embeddings = weighted_embeddings(matches.clusters)
+    if any(instance_ids[k] for k in embeddings):
+        table.embedding_space = agreed_space(table.embedding_space, matches.clusters.embedding_space)
     for k in np.flatnonzero(instance_ids):
-        table.observe(int(instance_ids[k]), class_evidence[k], float(scores[k]), matches.frame_index)
+        score, embedding = float(scores[k]), embeddings.get(int(k))
+        table.observe(int(instance_ids[k]), class_evidence[k], score, matches.frame_index, embedding)
     in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= least].tolist())
     for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
         table.records[instance_id].in_view.add(matches.frame_index)
+
+
+def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
+    """The clusters' embeddings by cluster, each with the detection's score for a weight, as far as they have any."""
+    if clusters.embeddings is None:
+        return {}
+    there = np.flatnonzero(clusters.embeddings.any(axis=1) & (clusters.scores > 0))
+    return {int(k): ObjectEmbedding.of(clusters.embeddings[k], float(clusters.scores[k])) for k in there}
 
 
 @dataclass

@@ -104,6 +104,8 @@ def _instance(
         vertices=vertices,
         aabb=aligned_box(points),
         obb=box_around(points, up),
+        embedding=None if record.embedding is None else record.embedding.mean,
+        embedding_spread=None if record.embedding is None else record.embedding.spread,
     )
 
 

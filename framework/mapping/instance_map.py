@@ -22,6 +22,7 @@ from framework.mapping.map_file import (
     faults_of,
     plain_table,
     read_map,
+    table_arrays,
     table_of,
     write_map,
 )
@@ -69,6 +70,10 @@ class InstanceMap(SceneMap):
     @property
     def evictions(self) -> int:
         return self.labels.evicted
+
+    @property
+    def embedding_space(self) -> str:
+        return self.table.embedding_space
 
     @property
     def instance_count(self) -> int:
@@ -136,14 +141,14 @@ class InstanceMap(SceneMap):
             "evicted": self.labels.evicted,
             "table": plain_table(self.table),
         }
-        write_map(path, header, arrays | self.labels.in_use()._asdict())
+        write_map(path, header, arrays | self.labels.in_use()._asdict() | table_arrays(self.table))
 
     @classmethod
     def load(cls, path: Path | str) -> InstanceMap:
         header, arrays = read_map(path, FORMAT, (*BLOCK_ARRAYS, *Evidence._fields))
         with faults_of(path):
             classes, storage = header.classes(), header.option("storage", Storage)
-            table = table_of(header.part("table"), len(classes))
+            table = table_of(header.part("table"), len(classes), arrays)
             volume = TsdfVolume.load(header, arrays, len(arrays["labeled"]))
             scene = cls(volume, Confirmation.of(header.part("confirmation")), table.combine, table.logarithmic, storage)
             scene.begin(classes)

@@ -9,6 +9,7 @@ import numpy as np
 
 from framework.data import Float32, Float64, Int32
 from framework.mapping.evidence import Combine
+from framework.mapping.object_embedding import ObjectEmbedding, added
 
 
 class FrameSet:
@@ -56,6 +57,7 @@ class InstanceRecord:
     in_view: FrameSet = field(default_factory=FrameSet)  # frames in which it could have been detected
     score_sum: float = 0.0  # over its detections
     detections: int = 0
+    embedding: ObjectEmbedding | None = None  # of those of its detections that have one
 
     @property
     def observations(self) -> int:
@@ -87,6 +89,7 @@ class InstanceTable:
         self._counted_on = 0  # frames, that this recording's numbers are moved by
         self.combine = combine
         self.logarithmic = logarithmic
+        self.embedding_space = ""  # what the embeddings of its instances are of; "" = there is none yet
 
     def create(self, classes: int, frame_index: int) -> InstanceRecord:
         """A new instance without observations."""
@@ -107,7 +110,14 @@ class InstanceTable:
             self._counted_on = self._last_before + 1
         return frame_index + self._counted_on
 
-    def observe(self, instance_id: int, class_evidence: Float64, score: float, frame_index: int) -> None:
+    def observe(
+        self,
+        instance_id: int,
+        class_evidence: Float64,
+        score: float,
+        frame_index: int,
+        embedding: ObjectEmbedding | None = None,
+    ) -> None:
         """Counts one detection with the evidence (C,) for its classes."""
         record = self.records[instance_id]
         record.class_evidence = _combined(record.class_evidence, class_evidence, self.combine)
@@ -115,6 +125,7 @@ class InstanceTable:
         record.observed_in.add(frame_index)
         record.score_sum += score
         record.detections += 1
+        record.embedding = added(record.embedding, embedding)
 
     def merge(self, kept: int, dropped: int) -> None:
         """Adds the history of `dropped` to `kept` and forgets it."""
@@ -125,6 +136,7 @@ class InstanceTable:
         a.in_view |= b.in_view
         a.score_sum += b.score_sum
         a.detections += b.detections
+        a.embedding = added(a.embedding, b.embedding)
         a.first_frame = min(a.first_frame, b.first_frame)
         a.last_frame = max(a.last_frame, b.last_frame)
 

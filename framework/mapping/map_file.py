@@ -8,7 +8,7 @@ import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, cast
 
@@ -21,6 +21,7 @@ from framework.files.whole_files import check_regular, written_whole
 from framework.mapping.evidence import Combine
 from framework.mapping.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.map_header import LARGEST_COUNT, MapHeader, whole
+from framework.mapping.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
 from framework.mapping.voxel_grid import FARTHEST_BLOCK
 
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
@@ -48,7 +49,7 @@ def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, 
 
 
 def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
-    """The header and the named arrays of a saved map.
+    """The header and the named arrays of a saved map, and those of its objects' embeddings where it has any.
 
     Raises DataError for a file that is none, for another format, for a checksum that fails, and before memory is asked
     for where the arrays do not have the sizes that they claim or are more than this machine holds.
@@ -61,7 +62,9 @@ def read_map(path: Path | str, expected_format: object, names: Sequence[str]) ->
         damaged = archive.testzip()
         if damaged is not None:
             raise DataError(f"the checksum of {damaged} does not hold; the file is damaged")
-        return header, {name: _array(archive, name) for name in names}
+        there = set(archive.namelist())
+        optional = [name for name in ARRAYS if f"{name}.npy" in there]
+        return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
 
 
 def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
@@ -161,14 +164,16 @@ def check_blocks(coords: Any) -> None:
 
 
 def plain_table(table: InstanceTable) -> dict[str, Any]:
-    """The table of instances as JSON can hold it."""
+    """The table of instances as JSON can hold it; the vectors are in `table_arrays`."""
+    space = {SPACE: table.embedding_space} if table_arrays(table) else {}
     return {
         "combine": table.combine.name,
         "logarithmic": table.logarithmic,
         "last_id": table.last_id,
+        **space,
         "instances": [
             {
-                **asdict(record),
+                **_numbers(record),
                 "class_evidence": record.class_evidence.tolist(),
                 "observed_in": sorted(record.observed_in),
                 "in_view": record.in_view.spans,
@@ -178,8 +183,22 @@ def plain_table(table: InstanceTable) -> dict[str, Any]:
     }
 
 
-def table_of(plain: MapHeader, classes: int) -> InstanceTable:
-    """The table that `plain_table` wrote down, of a map with so many classes. Raises DataError where it cannot be."""
+def _numbers(record: InstanceRecord) -> dict[str, Any]:
+    """Of an instance, all but its embedding."""
+    return {name: value for name, value in asdict(replace(record, embedding=None)).items() if name != "embedding"}
+
+
+def table_arrays(table: InstanceTable) -> dict[str, Array]:
+    """The arrays of a table: its objects' embeddings, where there are any."""
+    embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
+    return embedding_arrays(embeddings)
+
+
+def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> InstanceTable:
+    """The table that `plain_table` and `table_arrays` wrote down, of a map with so many classes.
+
+    Raises DataError where it cannot be.
+    """
     table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
     table.last_id = plain.whole("last_id", 0, LARGEST_ID)
     for entry in plain.parts("instances"):
@@ -187,6 +206,10 @@ def table_of(plain: MapHeader, classes: int) -> InstanceTable:
         if record.id in table.records:
             raise DataError(f"{entry.name}.id is {record.id}, as that of another instance")
         table.records[record.id] = record
+    table.embedding_space, embeddings = read_embeddings(plain, arrays)
+    check_known("embedding_ids", np.array(list(embeddings), np.int32), table.records)
+    for k, embedding in embeddings.items():
+        table.records[k].embedding = embedding
     return table
 
 

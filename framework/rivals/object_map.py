@@ -36,7 +36,7 @@ from framework.mapping.evidence import Combine
 from framework.mapping.frustum import boxes_in_view
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import check_like, faults_of, plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import check_like, faults_of, plain_table, read_map, table_arrays, table_of, write_map
 from framework.mapping.meshing import Surface
 from framework.mapping.sensor import pinhole
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
@@ -78,6 +78,10 @@ class ObjectMap(SceneMap):
     @property
     def depth_range(self) -> tuple[float, float]:
         return self.background.sensor.depth_range
+
+    @property
+    def embedding_space(self) -> str:
+        return self.table.embedding_space
 
     @property
     def instance_count(self) -> int:
@@ -231,7 +235,7 @@ class ObjectMap(SceneMap):
         }
         parts = [self._empty_volume().arrays(), *(volume.arrays() for volume in self.volumes.values())]
         arrays |= {OBJECT + name: np.concatenate([part[name] for part in parts]) for name in VOLUME_ARRAYS}
-        write_map(path, header, arrays)
+        write_map(path, header, arrays | table_arrays(self.table))
 
     @classmethod
     def load(cls, path: Path | str) -> ObjectMap:
@@ -239,7 +243,7 @@ class ObjectMap(SceneMap):
         with faults_of(path):
             scene = cls(TsdfVolume.load(header, arrays, 0), Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()
-            scene.table = table_of(header.part("table"), len(scene.classes))
+            scene.table = table_of(header.part("table"), len(scene.classes), arrays)
             objects = header.part("objects")
             if objects.values.keys() != {str(key) for key in scene.table.records}:
                 raise DataError("header.objects must be the instances of its table")

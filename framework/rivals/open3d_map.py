@@ -16,7 +16,7 @@ from framework.mapping.association import agreed_classes
 from framework.mapping.gravity import Gravity
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import check_known, faults_of, plain_table, read_map, table_of, write_map
+from framework.mapping.map_file import check_known, faults_of, plain_table, read_map, table_arrays, table_of, write_map
 from framework.rivals.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
 
 FORMAT = "open3d_vbg 5"  # of the saved file; a change of meaning counts it up
@@ -47,6 +47,10 @@ class Open3DMap(SceneMap):
     @property
     def depth_range(self) -> tuple[float, float]:
         return self.grid.settings.min_depth, self.grid.settings.max_depth
+
+    @property
+    def embedding_space(self) -> str:
+        return self.table.embedding_space
 
     @property
     def instance_count(self) -> int:
@@ -150,7 +154,7 @@ class Open3DMap(SceneMap):
             **self.gravity.saved(),
             "table": plain_table(self.table),
         }
-        write_map(path, header, self.grid.arrays())
+        write_map(path, header, self.grid.arrays() | table_arrays(self.table))
 
     @classmethod
     def load(cls, path: Path | str) -> Open3DMap:
@@ -159,7 +163,7 @@ class Open3DMap(SceneMap):
             settings = BlockGridSettings.of(header.part("settings"))
             scene = cls(settings, Confirmation.of(header.part("confirmation")))
             scene.classes = header.classes()
-            scene.table = table_of(header.part("table"), len(scene.classes))
+            scene.table = table_of(header.part("table"), len(scene.classes), arrays)
             scene.grid.frames = header.whole("frames")
             scene.gravity = Gravity.of(header)
             scene.grid.fill(arrays)

@@ -165,6 +165,7 @@ FAULTY = {
     "report": ["nowhere"],
     "diff": ["old", "old"],
     "export": ["nowhere", "--to", "glb"],
+    "query": ["old", "a red chair"],
     "evaluate": ["old"],
     "detect": ["dataset=synthetic", "detector=simulated"],
     "show-refinement": ["dataset=synthetic", "detector=simulated"],
@@ -173,6 +174,7 @@ FAULTY = {
     "new-plugin": ["refiner", "gmm_em"],
     "synthesize": ["new", "--scenes=999"],
     "train-detector": ["device=tpu"],
+    "train-words": ["schedule.epochs=0"],
     "convert-weights": ["nothing.pth", "out.safetensors"],
     "convert-oni": ["nothing.oni", "out"],
 }

@@ -165,7 +165,7 @@ def test_the_parameters_of_a_part_are_the_plugins_own() -> None:
         ({"_target_": f"{HERE}.Undecorated"}, ["@dataclass"]),
         ({"_target_": f"{HERE}.Abstract"}, ["does not implement detect of Detector"]),
         ({"_partial_": True}, ["no parameter '_partial_'"]),
-        ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path or Enum", "ndarray"]),
+        ({"_target_": f"{HERE}.OddField"}, ["bool, int, float, str, Path, Enum or list", "ndarray"]),
         ({"_target_": f"{HERE}.Assembled", "nms": 2}, ["Assembled", "nms", "[0, 1]", "found 2"]),
         ({"_target_": f"{HERE}.Assembled", "nms": "high"}, ["Assembled", "nms", "'high'", "Float"]),
         ({"_target_": f"{HERE}.Assembled", "suppression": {"nms": 0.1}}, ["no parameter 'suppression'"]),

@@ -105,6 +105,17 @@ def test_an_entry_without_detections_comes_back() -> None:
     assert_same(before, unpack(pack(before), COCO))
 
 
+def test_embeddings_come_back_and_are_only_there_where_there_were_some() -> None:
+    before = random_detections(1, (37, 53))
+    embedded = replace(before, embeddings=np.eye(7, 5, dtype=np.float32), embedding_space="words@1 \N{SNOWMAN}")
+    after = unpack(pack(embedded), COCO)
+    assert_same(before, after)
+    assert (after.embedding_space, after.embeddings is not None) == (embedded.embedding_space, True)
+    np.testing.assert_array_equal(after.embeddings, embedded.embeddings)
+    assert unpack(pack(before), COCO).embeddings is None
+    assert b"embedding" not in pack(before)
+
+
 def test_the_second_time_the_detector_is_not_asked(room: CornerRoom, tmp_path: Path) -> None:
     first = CachedDetector(Noise(), tmp_path)
     plain = [Noise().detect(frame) for frame in room]

@@ -26,7 +26,7 @@ from tests.true_masks import fuse_masks, masks_of
 
 SLOWEST = 5.0  # s of this process: others may keep the machine busy
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
-KINDS = ("bayesian_tsdf", "exact", "last_write", "object_volumes", "open3d_vbg", "semantic_components")
+KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "semantic_components")
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,12 @@ class Saved:
 def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Saved:
     """Each kind of map once."""
     name = request.param
-    chosen = ["bayesian_tsdf", "fuser.storage=EXACT"] if name == "exact" else [name]
+    variants = {"exact": ["bayesian_tsdf", "fuser.storage=EXACT"], "words": ["bayesian_tsdf"]}
+    chosen = variants.get(name, [name])
     fuser: MapFuser = registered.built("fuser", chosen[0], "fuser.voxel_size=0.08", *chosen[1:])
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
-        fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3)
+        fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, embeddings=np.eye(3, 5) if name == "words" else None)
     path = tmp_path_factory.mktemp(name) / "map.npz"
     fuser.scene.save(path)
     use(load_scene(path))  # compiles what it takes
@@ -67,6 +68,9 @@ def use(scene: SceneMap) -> None:
         assert instance.class_probabilities.shape == (len(scene.classes),)
         assert instance.class_probabilities.sum() == pytest.approx(1, abs=1e-3)
         assert 0 <= instance.confidence < 1.001
+        if instance.embedding is not None:
+            assert np.linalg.norm(instance.embedding) < 1.001
+            assert 0 <= instance.embedding_spread <= 1
 
 
 def load_and_use(path: Path, content: bytes) -> str:

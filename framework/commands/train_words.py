@@ -1,0 +1,26 @@
+"""`python -m framework train-words`: trains the network that knows rendered rooms in words."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from framework.commands.command_line import one_line_errors
+from framework.files.search_paths import CONF
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="train_words")
+def job(config: DictConfig) -> None:
+    from framework.training.train_words import (
+        train,  # here, so that a misspelt key is answered before the heavy libraries load
+    )
+
+    train(config, Path(HydraConfig.get().runtime.output_dir))
+
+
+def main() -> None:
+    with one_line_errors():
+        job()

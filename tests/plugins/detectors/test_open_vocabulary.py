@@ -1,0 +1,181 @@
+"""Objects named in words: what networks say at known places comes out in pixels, whatever the image's shape."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from framework.data import Camera, Frame
+from framework.detection.box_prompted_masks import BoxPromptedMasks
+from framework.detection.word_boxes import WordBoxes
+from framework.errors import ConfigError, DataError
+from plugins.detectors.open_vocabulary import SOMETHING_ELSE, OpenVocabulary, word_distributions
+from tests import registered
+from tests.tiny_image_text import write_image_text
+from tests.tiny_open_vocabulary import SIDE, write_owlv2, write_sam
+
+pytest.importorskip("transformers")
+CPU = torch.device("cpu")
+SHAPES = ((60, 80), (80, 60), (64, 64))  # px: wide, high and square
+
+
+@pytest.fixture(scope="module")
+def owlv2(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_owlv2(tmp_path_factory.mktemp("owlv2"))
+
+
+@pytest.fixture(scope="module", params=["sam", "sam2"])
+def sam(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_sam(tmp_path_factory.mktemp(request.param), request.param)
+
+
+def picture(shape: tuple[int, int]) -> Frame:
+    height, width = shape
+    camera = Camera(width, height, 90.0, 90.0, (width - 1) / 2, (height - 1) / 2)
+    color = np.random.default_rng(1).integers(0, 255, (*shape, 3)).astype(np.uint8)
+    return Frame(0, 0.0, color, np.full(shape, 2, np.float32), camera)
+
+
+class Saying:
+    """In place of OWLv2: these boxes in px, with these probabilities of the words."""
+
+    def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
+        shares = (torch.tensor(boxes) + 0.5) / max(shape)  # of the square with the image in its upper left
+        centers = (shares[:, :2] + shares[:, 2:]) / 2
+        self.boxes = torch.cat([centers, shares[:, 2:] - shares[:, :2]], dim=1)[None]
+        self.logits = torch.logit(torch.tensor(probabilities))[None]
+
+    def __call__(self, **given: Any) -> Any:
+        assert given["pixel_values"].shape == (1, 3, SIDE, SIDE)
+        return SimpleNamespace(pred_boxes=self.boxes, logits=self.logits)
+
+
+class Filling:
+    """In place of a SAM: everything in the prompted box, in a grid of a quarter of the input's size."""
+
+    def __call__(self, pixel_values: torch.Tensor, input_boxes: torch.Tensor, multimask_output: bool) -> Any:
+        assert pixel_values.shape == (1, 3, SIDE, SIDE)
+        assert not multimask_output
+        cells = (torch.arange(SIDE) + 0.5)[None]
+        x1, y1, x2, y2 = input_boxes[0].T[..., None]
+        across, down = (x1 < cells) & (cells < x2), (y1 < cells) & (cells < y2)
+        inside = down[:, :, None] & across[:, None, :]
+        return SimpleNamespace(pred_masks=torch.where(inside, 9.0, -9.0)[None, :, None])
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_boxes_are_where_the_network_says(owlv2: Path, shape: tuple[int, int]) -> None:
+    boxes = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half=False)
+    wanted = [[4.5, 9.5, 24.5, 39.5], [30, 2, 55, 58]]
+    boxes._network = Saying(shape, wanted, [[0.8, 0.1], [0.3, 0.6]])
+    found, probabilities = boxes(picture(shape).color)
+    np.testing.assert_allclose(found, wanted, atol=1e-4)
+    np.testing.assert_allclose(probabilities, [[0.8, 0.1], [0.3, 0.6]], atol=1e-6)
+
+
+def test_the_image_lies_in_the_upper_left_of_a_gray_square(owlv2: Path) -> None:
+    boxes = WordBoxes(str(owlv2), "main", ("bed",), CPU, half=False)
+    seen: list[torch.Tensor] = []
+    saying = Saying((32, 64), [[0, 0, 9, 9]], [[0.5]])
+    boxes._network = lambda **given: seen.append(given["pixel_values"]) or saying(**given)
+    boxes(np.full((32, 64, 3), 255, np.uint8))
+    assert (seen[0][0, :, :31] > 1.5).all(), "white"
+    np.testing.assert_allclose(seen[0][0, 0, 33:], (128 / 255 - 0.48145466) / 0.26862954, atol=1e-5)
+
+
+def test_boxes_are_those_of_transformers(owlv2: Path) -> None:
+    from transformers import AutoTokenizer, Owlv2ForObjectDetection
+
+    color = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3)).astype(np.uint8)
+    found, probabilities = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half=False)(color)
+    mean, std = np.array((0.48145466, 0.4578275, 0.40821073)), np.array((0.26862954, 0.26130258, 0.27577711))
+    texts = ["a photo of a red chair", "a photo of a bed"]
+    tokens = AutoTokenizer.from_pretrained(owlv2)(texts, padding="max_length", max_length=16, return_tensors="pt")
+    with torch.inference_mode():
+        output = Owlv2ForObjectDetection.from_pretrained(owlv2).eval()(
+            pixel_values=torch.tensor((color / 255 - mean) / std).float().permute(2, 0, 1)[None],
+            input_ids=tokens["input_ids"],
+            attention_mask=tokens["attention_mask"],
+        )
+    np.testing.assert_allclose(probabilities, torch.sigmoid(output.logits[0]).numpy(), atol=1e-5)
+    sizes = found[:, 2:] - found[:, :2]
+    np.testing.assert_allclose(sizes, output.pred_boxes[0, :, 2:].numpy() * SIDE, atol=1e-3)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_masks_are_where_the_boxes_are(sam: Path, shape: tuple[int, int]) -> None:
+    masks = BoxPromptedMasks(str(sam), "main", CPU, half=False)
+    frame = picture(shape)
+    random = masks(frame.color, np.float32([[5, 5, 30, 30]]))
+    assert random.shape == (1, *shape)
+    masks._network = Filling()
+    found = masks(frame.color, np.float32([[9.5, 19.5, 29.5, 49.5], [-0.5, -0.5, 59.5, 9.5]]))
+    expected = np.zeros((2, *shape), np.bool_)
+    expected[0, 20:50, 10:30] = expected[1, :10, :60] = True
+    overlap = (found & expected).sum(axis=(1, 2)) / (found | expected).sum(axis=(1, 2))
+    assert (overlap > 0.9).all(), "but for what the grid rounds"
+    for mask, wanted in zip(found, expected, strict=True):
+        center, middle = (np.argwhere(area).mean(axis=0) for area in (mask, wanted))
+        np.testing.assert_allclose(center, middle, atol=0.5)
+    assert masks(frame.color, np.zeros((0, 4), np.float32)).shape == (0, *shape)
+
+
+def test_the_distribution_is_by_odds_and_has_something_else() -> None:
+    rows = word_distributions(np.float32([[0.1, 0.1], [0.5, 0.1], [0.9, 0.001]]), 0.1)
+    np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-6)
+    np.testing.assert_allclose(rows[0], [1 / 3] * 3, atol=1e-6)
+    np.testing.assert_allclose(rows[1], np.array([9, 1, 1]) / 11, atol=1e-6)
+    assert rows[2, 0] > 0.98
+    assert np.isfinite(word_distributions(np.float32([[0, 1]]), 0.1)).all()
+
+
+@pytest.mark.parametrize("masks", ["sam", "depth"])
+def test_detections_are_what_both_networks_say(owlv2: Path, masks: str, tmp_path: Path) -> None:
+    folder = str(write_sam(tmp_path / "sam", "sam2")) if masks == "sam" else ""
+    detector = OpenVocabulary(["red chair", "bed"], str(owlv2), masks=folder, score_threshold=0.2, device="cpu")
+    assert detector.classes == ("red chair", "bed", SOMETHING_ELSE)
+    shape = (64, 64)
+    boxes = [[4, 4, 28, 28], [5, 4, 28, 28], [35, 35, 60, 60], [0, 0, 63, 63]]
+    detector._boxes._network = Saying(shape, boxes, [[0.8, 0.1], [0.7, 0.3], [0.1, 0.6], [0.1, 0.1]])
+    if detector._masks is not None:
+        detector._masks._network = Filling()
+    found = detector.detect(picture(shape))
+    np.testing.assert_allclose(found.scores, [0.8, 0.6], atol=1e-6)
+    assert found.class_probabilities.argmax(axis=1).tolist() == [0, 1]
+    assert found.masks[0, 16, 16]
+    assert found.masks[1, 47, 47]
+    assert not found.masks[0, 47, 47]
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        ("[]", "detector.words must be 1 to 500 different words"),
+        ("[chair,chair]", "different words"),
+        ("[chair,' ']", "different words"),
+        ("['something else']", "different words"),
+        ("3", "words"),
+    ],
+)
+def test_words_must_be_different_and_some(words: str, fault: str) -> None:
+    with pytest.raises(ConfigError, match=fault):
+        registered.built("detector", "open_vocabulary", f"detector.words={words}")
+
+
+def test_other_models_are_refused_by_name(owlv2: Path, tmp_path: Path) -> None:
+    siglip = str(write_image_text(tmp_path / "siglip"))
+    with pytest.raises(ConfigError, match=r"detector\.model must be an OWLv2, found .*, a siglip"):
+        OpenVocabulary(model=siglip, masks="", device="cpu")
+    with pytest.raises(ConfigError, match=r"detector\.masks must be a SAM, a SAM 2 or an EdgeTAM, found .*, a siglip"):
+        OpenVocabulary(model=str(owlv2), masks=siglip, device="cpu")
+    (owlv2 / "config.json").rename(owlv2 / "away.json")
+    try:
+        with pytest.raises(DataError, match=r"its config\.json could not be read"):
+            OpenVocabulary(model=str(owlv2), masks="", device="cpu")
+    finally:
+        (owlv2 / "away.json").rename(owlv2 / "config.json")
