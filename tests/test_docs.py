@@ -93,7 +93,7 @@ def test_plugins_and_parameters_that_pages_name_are_there(built: Path) -> None:
     text = "\n".join(PAGES.values())
     for stage in STAGES:
         reference = (built / "configuration" / f"{stage}.html").read_text()
-        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - {"color_blobs", "nearby"}
+        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - {"color_blobs", "nearby", "my_refiner"}
         assert len(chosen) > 2
         assert not [name for name in chosen if f'id="{stage}-{name.replace("_", "-")}"' not in reference]
         given = set(re.findall(rf"(?<![\w./:]){stage}\.([a-z]\w*)\b(?![.(])", text)) - {"hue", "scene"}
