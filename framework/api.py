@@ -27,7 +27,16 @@ from framework.datasets.recording import FRAME_RATE
 from framework.detection.cache import with_cache
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
-from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence, SceneMap
+from framework.interfaces import (
+    ClusterRefiner,
+    Detector,
+    LiveVideo,
+    MapFuser,
+    PoseTracker,
+    RGBDSequence,
+    SceneMap,
+    Viewer,
+)
 from framework.journal import Journal
 from framework.kernels import compile_for_run
 from framework.object_queries import Map
@@ -72,8 +81,9 @@ def pipeline_of(config: DictConfig) -> Pipeline:
     """The stages that a config names, the detector behind the cache that it asks for."""
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
+    viewer = build(Viewer, config.get("viewer"))
     detector = with_cache(build(Detector, config.get("detector")), config)  # last, as loading a network takes its time
-    return Pipeline(detector, tracker, refiner, fuser, config.ahead)
+    return Pipeline(detector, tracker, refiner, fuser, config.ahead, viewer)
 
 
 def go_on(pipeline: Pipeline, run: Path) -> None:

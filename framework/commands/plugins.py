@@ -22,7 +22,7 @@ from omegaconf import OmegaConf
 from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError
-from framework.registry import STAGES, composition, find_class, parameter_fields, plugin_fields
+from framework.registry import GROUPS, composition, find_class, parameter_fields, plugin_fields
 
 _COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
 _HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
@@ -66,7 +66,7 @@ def _option(loader: Any, stage: str, name: str) -> Option:
         given = OmegaConf.to_container(OmegaConf.merge(*(file.config for file in files.values())), resolve=False)
         assert isinstance(given, dict)
         target = str(given.get("_target_"))
-        plugin_class = find_class(STAGES[stage], target)
+        plugin_class = find_class(GROUPS[stage], target)
     except (ConfigError, HydraException) as error:
         return Option(stage, name, target, own.provider, f"cannot be used: {one_line(error)}", ())
     nested = {
@@ -122,13 +122,13 @@ def describe(option: Option) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Lists the registered plugins.")
-    parser.add_argument("stage", nargs="?", choices=STAGES, help="only this stage")
+    parser.add_argument("stage", nargs="?", choices=GROUPS, help="only this stage")
     parser.add_argument("name", nargs="?", help="only this option")
     asked = arguments(parser)
     with one_line_errors():
-        for stage in [asked.stage] if asked.stage else STAGES:
+        for stage in [asked.stage] if asked.stage else GROUPS:
             options = registered(stage, asked.name)
             if asked.name and not options:
                 raise ConfigError(f"there is no {stage}={asked.name}")
-            print(f"{stage} ({STAGES[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
+            print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             print("\n\n".join(map(describe, options)) or "  (none)", end="\n\n")
