@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from framework.configs import composed, config_directory
 from framework.files.search_paths import CONF, PROJECT_ROOT
-from framework.registry import STAGES
+from framework.registry import GROUPS
 from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go
 from tests import registered
 
@@ -115,4 +115,4 @@ def test_the_wheel_has_networks_and_configs_where_an_installed_run_looks(tmp_pat
     assert {f"{WEIGHTS}/LICENSE", "plugins/detectors/maskrcnn2go.md", "framework/conf/config.yaml"} <= names
     assert any(name.endswith(f"licenses/{WEIGHTS}/LICENSE") for name in names)
     assert "plugins/detectors/mask_rcnn_rooms.safetensors" in names
-    assert not STAGES.keys() - {name.split("/")[2] for name in names if name.startswith("framework/conf/")}
+    assert not GROUPS.keys() - {name.split("/")[2] for name in names if name.startswith("framework/conf/")}

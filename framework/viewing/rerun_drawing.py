@@ -53,7 +53,8 @@ class RerunDrawing:
         self._first_s: float | None = None  # timestamp of the first frame
         self._path: list[Float32] = []  # (3,) of the last piece
         self._pieces = 0
-        self._up: Float64 | None = None  # as it is drawn
+        self._up: Float64 | None = None  # (3,) as it is drawn
+        self._ahead: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) where the first camera looked
         self._mesh: InstanceMesh | None = None  # as it was drawn last, its instances those that are shown
         self._names: dict[int, str] = {}  # of these
         self._named: dict[int, str] = {}  # of all so far, as they are in images of masks
@@ -105,14 +106,14 @@ class RerunDrawing:
         """Turns the world so that `up` (3,) is the view's z."""
         if self._up is None or not np.allclose(self._up, up, atol=LEAST_TURN):
             self._up = up
-            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=_turned(up)))
+            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._ahead)))
 
     def _begin_world(self, T_world_camera: Float64) -> None:
         """Turns the world as the first camera was held, until the map knows better, and looks over its shoulder."""
-        up = -T_world_camera[:3, 1]
+        up, self._ahead = -T_world_camera[:3, 1], T_world_camera[:3, 2]
         self._turn(up)
         T_view_camera = T_world_camera.copy()
-        T_view_camera[:3] = _turned(up) @ T_world_camera[:3]
+        T_view_camera[:3] = turned(up, self._ahead) @ T_world_camera[:3]
         self._recording.send_blueprint(at.layout(T_view_camera))
 
     def _note(self, note: FrameNote) -> None:
@@ -239,9 +240,10 @@ class RerunDrawing:
         self._recording.log(at.OBJECT_NAMES, names)
 
 
-def _turned(up: Float64) -> Float64:
-    """R_view_world (3, 3), which turns `up` (3,) to z."""
-    across = np.linalg.svd(up[None])[2][1]
+def turned(up: Float64, ahead: Float64) -> Float64:
+    """R_view_world (3, 3): turns the unit vector `up` (3,) to z, and the level part of `ahead` (3,) to y."""
+    across = np.cross(ahead, up)
+    across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
     return np.stack([across, np.cross(up, across), up])
 
 

@@ -34,7 +34,8 @@ STAGE_COLORS = {
 
 
 TIMES_SHOWN = 300  # frames, up to the chosen one
-EYE_BACK, EYE_ABOVE, EYE_AHEAD = 1.5, 1.0, 1.5  # m, from the first camera: to the eye, and to what it looks at
+EYE_BACK, EYE_ABOVE = 1.2, 0.8  # m, from the first camera to the eye
+AIM_AHEAD, AIM_BELOW = 1.5, 0.4  # m, from the first camera to what the eye looks at
 
 
 def layout(T_view_camera: Float64 | None = None) -> rrb.Blueprint:
@@ -85,5 +86,6 @@ def _eye(T_view_camera: Float64) -> rrb.EyeControls3D:
     import rerun.blueprint as rrb
 
     position, ahead = T_view_camera[:3, 3], T_view_camera[:3, 2]
-    eye = position - EYE_BACK * ahead + np.array([0, 0, EYE_ABOVE])
-    return rrb.EyeControls3D(position=eye, look_target=position + EYE_AHEAD * ahead, eye_up=(0, 0, 1))
+    up = np.array([0.0, 0.0, 1.0])
+    eye, aim = position - EYE_BACK * ahead + EYE_ABOVE * up, position + AIM_AHEAD * ahead - AIM_BELOW * up
+    return rrb.EyeControls3D(position=eye, look_target=aim, eye_up=up)

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from framework.commands.plugins import Option, Parameter, describe, registered
-from framework.registry import STAGES
+from framework.registry import GROUPS, STAGES
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 
@@ -178,7 +178,7 @@ def test_an_option_reads_like_its_yaml() -> None:
     ]
 
 
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", GROUPS)
 def test_every_registered_option_can_be_described(stage: str) -> None:
     for option in registered(stage):
         assert option.name in describe(option)
