@@ -112,8 +112,8 @@ class RerunViewer(Viewer):
 
 
 def _file_sink(rr: Any, path: Path) -> Any:
-    path.parent.mkdir(parents=True, exist_ok=True)
     with _faults(f"{path} cannot be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
         path.open("wb").close()  # rerun itself would only say so on stderr
         return rr.FileSink(path)
 
