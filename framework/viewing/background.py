@@ -23,7 +23,7 @@ from framework.viewing.pace import Pace
 log = logging.getLogger(__name__)
 
 SNAPSHOT_SHARE = 0.02  # of the loop's time, at most, for snapshots of the map
-UP_SHARE = 0.005  # likewise, for asking the map what is up, which may take a tenth of a second
+UP_GROWTH = 4  # the map is asked what is up after 1, 4, 16 ... snapshots: it takes a tenth of a second
 PICTURE_SHARE = 0.08  # of a core's time, at most, for drawing pictures ...
 MAP_SHARE = 0.08  # ... and maps
 IDLE_S = 0.5  # after which what is there is drawn where no frame follows
@@ -35,7 +35,8 @@ class Background:
 
     def __init__(self, scene: SceneMap, drawing: Drawing, every: int, map_every: float) -> None:
         self._scene, self._drawing, self._every = scene, drawing, every
-        self._snapshots, self._ups = Pace(map_every, SNAPSHOT_SHARE), Pace(map_every, UP_SHARE)
+        self._snapshots = Pace(map_every, SNAPSHOT_SHARE)
+        self._taken, self._next_up = 0, 1  # snapshots
         self._pictures = Pace(0.0, PICTURE_SHARE, time.thread_time)
         self._maps = Pace(map_every, MAP_SHARE, time.thread_time)
         self._frames = 0
@@ -90,9 +91,10 @@ class Background:
         try:
             with self._snapshots.kept():
                 mesh, objects = self._scene.mesh(), self._scene.likeliest_classes()
-            if self._ups.due():
-                with self._ups.kept():
-                    self._up = self._scene.up()
+            self._taken += 1
+            if self._taken == self._next_up:
+                self._up = self._scene.up()
+                self._next_up *= UP_GROWTH
         except Exception as error:
             self._give_up(error)
             return

@@ -7,7 +7,7 @@ import numpy as np
 from framework.data import Bool, Float64, Frame, InstanceMesh, Int32
 from framework.geometry import inverse, project, transform
 
-MOST_POINTS = 20_000  # of the map's instances, that are looked for in a frame
+MOST_POINTS = 8_000  # of the map, that are looked for in a frame
 NEAR = 0.05  # of the depth, by which a point may lie before or behind the reading
 LEAST_SHARE = 0.3  # of the points under a mask, that its instance has
 

@@ -49,8 +49,8 @@ class RerunViewer(Viewer):
 
     mode: Mode = Mode.RECORD  # RECORD, WINDOW or BROWSER
     file: str = ""  # "" = recording.rrd in the run's directory in mode RECORD, none in the others
-    every: int = 1  # frames from one picture to the next, from 1
-    mesh_every: float = 1.0  # s, from one look at the map to the next at least, in [0.1, 3600]
+    every: int = 2  # frames from one picture to the next, from 1
+    mesh_every: float = 2.0  # s, from one look at the map to the next at least, in [0.1, 3600]
     stride: int = 2  # px of a frame for one of its picture, in [1, 16]
     jpeg_quality: int = 75  # in [1, 100]
     region: float = 1.0  # m, in [0.1, 1000], side of the cubes that the mesh is drawn in

@@ -73,7 +73,7 @@ def entities(file: Path) -> set[str]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of six frames, of which 2 cannot be read and 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
-    viewer = RerunViewer(stride=1, mesh_every=0.1, min_confidence=0.1)
+    viewer = RerunViewer(every=1, stride=1, mesh_every=0.1, min_confidence=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
     return directory / "recording.rrd"
 
