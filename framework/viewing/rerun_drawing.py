@@ -60,6 +60,7 @@ class RerunDrawing:
         recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stages, colors = [*at.STAGE_COLORS], [*at.STAGE_COLORS.values()]
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
+        self._name_masks()
 
     def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: Picture | None) -> None:
         for note in notes:
@@ -85,7 +86,9 @@ class RerunDrawing:
         members = vertices_by_id(ids)
         self._names = {key: mesh.classes[shown[key][0]] for key in members}
         self._colors.add({key: mesh.vertices[of].mean(axis=0, dtype=np.float64) for key, of in members.items()})
-        self._name_masks()
+        if not self._named.items() >= self._names.items():
+            self._named |= self._names
+            self._name_masks()
         self._draw_mesh(self._mesh)
         self._draw_boxes(members, {key: shown[key][1] for key in members}, snapshot)
 
@@ -181,7 +184,7 @@ class RerunDrawing:
         form = self._rr.Box2DFormat.XYXY
         self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
         middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # below its box, a name may lie outside of the picture
-        names = self._rr.Points2D(middles, labels=labels, colors=_lighter(colors), radii=2.0, show_labels=True)
+        names = self._rr.Points2D(middles, labels=labels, colors=_middling(colors), radii=2.0, show_labels=True)
         self._recording.log(at.NAMES, names)
 
     def _draw_camera(self, frame: Frame, pose: Pose) -> None:
@@ -201,12 +204,10 @@ class RerunDrawing:
         )
 
     def _name_masks(self) -> None:
-        """Says what the numbers in images of masks mean, where there are new ones."""
-        if not self._named.items() >= self._names.items():
-            self._named = {**self._named, **self._names}
-            known = [(key, name, self._colors[key]) for key, name in self._named.items()]
-            nothing, unknown = (0, "nothing", np.zeros(4, np.uint8)), (UNKNOWN, "not in the map", UNKNOWN_COLOR)
-            self._recording.log(at.MASKS, self._rr.AnnotationContext([nothing, unknown, *known]), static=True)
+        """Says what the numbers in images of masks mean."""
+        known = [(key, name, self._colors[key]) for key, name in self._named.items()]
+        nothing, unknown = (0, "nothing", np.zeros(4, np.uint8)), (UNKNOWN, "not in the map", UNKNOWN_COLOR)
+        self._recording.log(at.MASKS, self._rr.AnnotationContext([nothing, unknown, *known]), static=True)
 
     def _draw_mesh(self, mesh: InstanceMesh) -> None:
         colors = self._colors.painted(mesh)
@@ -235,7 +236,7 @@ class RerunDrawing:
             fill_mode="MajorWireframe",
         )
         self._recording.log(at.OBJECTS, drawn)
-        names = self._rr.Points3D(centers, labels=labels, colors=_lighter(colors), radii=NAME_RADIUS, show_labels=True)
+        names = self._rr.Points3D(centers, labels=labels, colors=_middling(colors), radii=NAME_RADIUS, show_labels=True)
         self._recording.log(at.OBJECT_NAMES, names)
 
 
@@ -246,6 +247,6 @@ def turned(up: Float64, ahead: Float64) -> Float64:
     return np.stack([across, np.cross(up, across), up])
 
 
-def _lighter(colors: Sequence[UInt8]) -> UInt8:
-    """Colours (N, 3) RGB for texts on a dark ground."""
-    return (np.array(colors, np.uint16).reshape(-1, 3) // 2 + 127).astype(np.uint8)
+def _middling(colors: Sequence[UInt8]) -> UInt8:
+    """Colours (N, 3) RGB for texts that are to be read on a dark and on a light ground."""
+    return (np.array(colors, np.uint16).reshape(-1, 3) // 3 + 90).astype(np.uint8)

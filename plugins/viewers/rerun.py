@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
 from uuid import uuid4
 
 from framework.data import Detections, Frame, Pose
@@ -22,11 +21,11 @@ from framework.errors import ConfigError, in_one_line
 from framework.interfaces import SceneMap, Viewer
 from framework.parameters import check_bounds, require
 from framework.viewing.background import Background
+from framework.viewing.sealed_page import HERE, SealedPage
 
 log = logging.getLogger(__name__)
 
 RECORDING = "recording.rrd"
-HERE = "127.0.0.1"
 FLUSH_S = 0.2  # after which what was drawn is in the file: what a killed run loses
 
 
@@ -73,6 +72,7 @@ class RerunViewer(Viewer):
         )
         limit = self.memory_limit.removesuffix("B").removesuffix("i").rstrip("kMGT%")
         require(limit.isdecimal(), "RerunViewer.memory_limit", self.memory_limit, "like 2GB or 25%")
+        self._page: SealedPage | None = None
         if importlib.util.find_spec("rerun") is None:
             raise ConfigError("rerun, which draws the run, is not there: pip install instancemap[viewer]")
 
@@ -97,6 +97,8 @@ class RerunViewer(Viewer):
 
     def end(self) -> None:
         self._background.end()
+        if self._page is not None:
+            self._page.close()
 
     def _sinks(self, rr: Any, directory: Path) -> list[Any]:
         """Where the drawing goes."""
@@ -107,7 +109,10 @@ class RerunViewer(Viewer):
         if self.mode is Mode.WINDOW:
             sinks.append(_open_window(rr, self.port, self.memory_limit))
         if self.mode is Mode.BROWSER:
-            sinks.append(_server(rr, self.port, self.web_port, self.memory_limit))
+            sinks.append(_server(rr, self.port, self.memory_limit))
+            with _faults(f"port {self.web_port} cannot be had: set viewer.web_port"):
+                self._page = SealedPage(self.web_port, self.port)
+            log.info("viewer: %s until the run ends", self._page.url)
         return sinks
 
 
@@ -118,22 +123,13 @@ def _file_sink(rr: Any, path: Path) -> Any:
         return rr.FileSink(path)
 
 
-def _server(rr: Any, port: int, web_port: int, memory_limit: str) -> Any:
-    """Serves the data and the page that shows them, to this machine alone."""
-    with _faults(f"ports {port} and {web_port} cannot be had: set viewer.port and viewer.web_port"):
-        _check_free(port)
-        _check_free(web_port)
-        sink = rr.GrpcServerSink(bind_ip=HERE, port=port, server_memory_limit=memory_limit)
-        rr.serve_web_viewer(web_port=web_port, open_browser=False)
-    source = quote(f"rerun+http://{HERE}:{port}/proxy", safe="")
-    log.info("viewer: http://%s:%d/?url=%s until the run ends", HERE, web_port, source)
-    return sink
-
-
-def _check_free(port: int) -> None:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        probe.bind((HERE, port))
+def _server(rr: Any, port: int, memory_limit: str) -> Any:
+    """Serves the data, to this machine alone."""
+    with _faults(f"port {port} cannot be had: set viewer.port"):
+        with socket.socket() as probe:  # rerun itself would only say so on stderr
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((HERE, port))
+        return rr.GrpcServerSink(bind_ip=HERE, port=port, server_memory_limit=memory_limit)
 
 
 def _open_window(rr: Any, port: int, memory_limit: str) -> Any:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -23,6 +24,7 @@ from framework.errors import ConfigError, FrameError
 from framework.interfaces import SceneMap
 from framework.pipeline import Pipeline
 from framework.registry import assemble
+from framework.viewing.sealed_page import free_port
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.viewers.rerun import Mode, RerunViewer
 from tests import registered
@@ -259,5 +261,20 @@ def test_a_port_that_is_taken_is_one_line(tmp_path: Path) -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         port = taken.getsockname()[1]
-        with pytest.raises(ConfigError, match=rf"viewer: ports {port} and 9090 cannot be had: set viewer.port"):
+        with pytest.raises(ConfigError, match=rf"viewer: port {port} cannot be had: set viewer\.port"):
             begun(RerunViewer(mode=Mode.BROWSER, port=port), tmp_path)
+
+
+def test_a_browser_gets_a_page_that_may_talk_to_nobody_else(tmp_path: Path) -> None:
+    viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port(), file="also.rrd")
+    begun(viewer, tmp_path)
+    with urlopen(f"http://127.0.0.1:{viewer.web_port}/", timeout=30) as page:
+        text, policy = page.read().decode(), page.headers["Content-Security-Policy"]
+    viewer.end()
+    assert "<html" in text
+    sources = {word for word in policy.replace(";", " ").split() if word.startswith("http")}
+    assert sources == {f"http://{name}:{viewer.port}" for name in ("127.0.0.1", "localhost")}
+    assert "*" not in policy
+    assert (tmp_path / "also.rrd").exists()
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", viewer.web_port)) != 0, "it is closed"
