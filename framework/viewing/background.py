@@ -23,7 +23,7 @@ from framework.viewing.pace import Pace
 log = logging.getLogger(__name__)
 
 SNAPSHOT_SHARE = 0.02  # of the loop's time, at most, for snapshots of the map
-UP_GROWTH = 4  # the map is asked what is up after 1, 4, 16 ... snapshots: it takes a tenth of a second
+FIRST_UP, UP_GROWTH = 2, 4  # the map is asked what is up with snapshots 2, 8, 32 ...: that takes a tenth of a second
 PICTURE_SHARE = 0.08  # of a core's time, at most, for drawing pictures ...
 MAP_SHARE = 0.08  # ... and maps
 IDLE_S = 0.5  # after which what is there is drawn where no frame follows
@@ -36,7 +36,7 @@ class Background:
     def __init__(self, scene: SceneMap, drawing: Drawing, every: int, map_every: float) -> None:
         self._scene, self._drawing, self._every = scene, drawing, every
         self._snapshots = Pace(map_every, SNAPSHOT_SHARE)
-        self._taken, self._next_up = 0, 1  # snapshots
+        self._taken, self._next_up = 0, FIRST_UP  # snapshots
         self._pictures = Pace(0.0, PICTURE_SHARE, time.thread_time)
         self._maps = Pace(map_every, MAP_SHARE, time.thread_time)
         self._frames = 0
@@ -77,6 +77,7 @@ class Background:
 
     def end(self) -> None:
         """Draws what is left, the whole map included, and closes the drawing."""
+        self._next_up = self._taken + 1
         self._take_snapshot()
         self._ending = True
         self._wanted.set()

@@ -38,7 +38,7 @@ class RerunDrawing:
     """A `Drawing` that logs to a recording stream.
 
     Pictures have every `stride`-th pixel of a frame in either direction, JPEG of `jpeg_quality`; the mesh lies in
-    regions of `region` m; instances below `min_confidence` are background.
+    regions of `region` m; instances below `min_confidence` are background, detections below it have no name.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class RerunDrawing:
         for mask, number in zip(found.masks[::-1, ::stride, ::stride], numbers[::-1], strict=True):
             image[mask] = number  # the best is painted last
         self._recording.log(at.MASKS, self._rr.SegmentationImage(image, opacity=MASK_OPACITY))
-        named = np.flatnonzero((ids > 0) | (found.scores >= self._min_confidence)).tolist()
+        named = np.flatnonzero(found.scores >= self._min_confidence).tolist()
         classes = found.class_probabilities.argmax(axis=1)
         labels = [f"{found.classes[classes[k]]} {found.scores[k]:.2f}" for k in named]
         colors = [self._colors.known().get(int(ids[k]), UNKNOWN_COLOR) for k in named]
@@ -184,7 +184,7 @@ class RerunDrawing:
         form = self._rr.Box2DFormat.XYXY
         self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
         middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # below its box, a name may lie outside of the picture
-        names = self._rr.Points2D(middles, labels=labels, colors=_middling(colors), radii=2.0, show_labels=True)
+        names = self._rr.Points2D(middles, labels=labels, colors=_lighter(colors), radii=2.0, show_labels=True)
         self._recording.log(at.NAMES, names)
 
     def _draw_camera(self, frame: Frame, pose: Pose) -> None:
@@ -236,7 +236,7 @@ class RerunDrawing:
             fill_mode="MajorWireframe",
         )
         self._recording.log(at.OBJECTS, drawn)
-        names = self._rr.Points3D(centers, labels=labels, colors=_middling(colors), radii=NAME_RADIUS, show_labels=True)
+        names = self._rr.Points3D(centers, labels=labels, colors=_lighter(colors), radii=NAME_RADIUS, show_labels=True)
         self._recording.log(at.OBJECT_NAMES, names)
 
 
@@ -247,6 +247,6 @@ def turned(up: Float64, ahead: Float64) -> Float64:
     return np.stack([across, np.cross(up, across), up])
 
 
-def _middling(colors: Sequence[UInt8]) -> UInt8:
-    """Colours (N, 3) RGB for texts that are to be read on a dark and on a light ground."""
-    return (np.array(colors, np.uint16).reshape(-1, 3) // 3 + 90).astype(np.uint8)
+def _lighter(colors: Sequence[UInt8]) -> UInt8:
+    """Colours (N, 3) RGB for texts on a dark ground."""
+    return (np.array(colors, np.uint16).reshape(-1, 3) // 2 + 115).astype(np.uint8)

@@ -53,7 +53,7 @@ class RerunViewer(Viewer):
     stride: int = 2  # px of a frame for one of its picture, in [1, 16]
     jpeg_quality: int = 75  # in [1, 100]
     region: float = 1.0  # m, in [0.1, 1000], side of the cubes that the mesh is drawn in
-    min_confidence: float = 0.3  # in [0, 1], from which on an object is drawn
+    min_confidence: float = 0.3  # in [0, 1], from which on an object is drawn, and a detection named
     memory_limit: str = "2GB"  # of what WINDOW or BROWSER keep; what is oldest goes first
     port: int = 9876  # of the data, in [1024, 65535]; WINDOW takes the viewer that listens there, if one does
     web_port: int = 9090  # of the page of BROWSER, in [1024, 65535]
