@@ -73,6 +73,7 @@ __all__ = [
     "RGBDSequence",
     "SceneMap",
     "View",
+    "Viewer",
     "load_map",
     "open_dataset",
 ]
