@@ -48,7 +48,7 @@ class RerunViewer(Viewer):
 
     mode: Mode = Mode.RECORD  # RECORD, WINDOW or BROWSER
     file: str = ""  # "" = recording.rrd in the run's directory in mode RECORD, none in the others
-    every: int = 2  # frames from one picture to the next, from 1
+    every: int = 3  # frames from one picture to the next, from 1
     mesh_every: float = 2.0  # s, from one look at the map to the next at least, in [0.1, 3600]
     stride: int = 2  # px of a frame for one of its picture, in [1, 16]
     jpeg_quality: int = 75  # in [1, 100]
