@@ -6,6 +6,7 @@ import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from weakref import finalize
 
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
@@ -28,7 +29,16 @@ from framework.datasets.recording import FRAME_RATE
 from framework.detection.cache import with_cache
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
-from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence, SceneMap
+from framework.interfaces import (
+    ClusterRefiner,
+    Detector,
+    LiveVideo,
+    MapFuser,
+    PoseTracker,
+    RGBDSequence,
+    SceneMap,
+    Viewer,
+)
 from framework.journal import Journal
 from framework.kernels import compile_for_run
 from framework.object_queries import Map
@@ -64,6 +74,7 @@ __all__ = [
     "RGBDSequence",
     "SceneMap",
     "View",
+    "Viewer",
     "export",
     "load_map",
     "open_dataset",
@@ -74,8 +85,9 @@ def pipeline_of(config: DictConfig) -> Pipeline:
     """The stages that a config names, the detector behind the cache that it asks for."""
     fuser, refiner = build(MapFuser, config.get("fuser")), build(ClusterRefiner, config.get("refiner"))
     tracker = build(PoseTracker, config.get("tracker"))
+    viewer = build(Viewer, config.get("viewer"))
     detector = with_cache(build(Detector, config.get("detector")), config)  # last, as loading a network takes its time
-    return Pipeline(detector, tracker, refiner, fuser, config.ahead)
+    return Pipeline(detector, tracker, refiner, fuser, config.ahead, viewer)
 
 
 def go_on(pipeline: Pipeline, run: Path) -> None:
@@ -132,7 +144,8 @@ class Mapper(Map):
 
     The arguments are those of a run on the command line, as words or by name, with its defaults for what is recorded;
     `dataset` is left out, since the frames are yours, and `ahead` and `resume` mean nothing here. `map=DIR` goes on
-    with the map of the run in DIR. Raises ConfigError for a name or a value that there is not.
+    with the map of the run in DIR, `viewer="rerun"` shows it, in `recording.rrd` in the working directory or as
+    `viewer.mode` says, until the mapper is gone. Raises ConfigError for a name or a value that there is not.
 
     Several threads may share one: they wait for each other. Whoever reads `scene` itself while another thread may be in
     `add` holds `lock` meanwhile, `with mapper.lock: mesh = mapper.scene.mesh()`: half a frame may be in it.
@@ -151,6 +164,9 @@ class Mapper(Map):
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
         self._journal = Journal(self.scene, 0, self.pipeline.tracker.pose_source)
+        viewer = self.pipeline.viewer
+        viewer.begin(self.scene, "frames from Python", Path())
+        finalize(self, viewer.end)  # with this mapper, or with the program
         self._camera: Camera | None = None  # of the last frame
         self._T_world_camera: Float64 | None = None  # of the last frame that was not lost
         self._frames = 0  # that `add` was given
@@ -182,12 +198,25 @@ class Mapper(Map):
             self._journal.timings.clear()  # nobody asks for them, or for the poses, and a camera may run for days
             self._journal.tracked.clear()
             before = self.scene.instance_ids()
-            found = self.pipeline.map_frame(frame, self.pipeline.detector.detect(frame), self._journal)
+            found = self._map(frame)
             if found.lost:
                 return Added(found.T_world_camera, lost=True, reason=found.reason)
             self._T_world_camera = found.T_world_camera
             now = self.scene.instance_ids()
         return Added(found.T_world_camera, new=tuple(sorted(now - before)), gone=tuple(sorted(before - now)))
+
+    def _map(self, frame: Frame) -> Pose:
+        """Detects and maps a frame, and has the viewer show it."""
+        pipeline, journal = self.pipeline, self._journal
+        try:
+            with journal.timed(frame.index, "detect"):
+                detections = pipeline.detector.detect(frame)
+            pose = pipeline.map_frame(frame, detections, journal)
+        except FrameError as error:
+            pipeline.viewer.skip(str(error))
+            raise
+        pipeline.viewer.show(frame, detections, pose, journal.stage_ms(frame.index))
+        return pose
 
     def _frame(
         self,

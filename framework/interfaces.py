@@ -1,11 +1,11 @@
-"""The contracts: four stages that plugins fill in, the map that they build, and the video that feeds them.
+"""The contracts: four stages that plugins fill in, the map that they build, the video that feeds them, who watches.
 
     frame --> Detector --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
       '-----> PoseTracker ----'                                 |
                   ^                                             |
                   '------------- view of the map ---------------'
 
-A plugin is a dataclass that implements one of the four interfaces. Its dataclass fields are its parameters (bool, int,
+A plugin is a dataclass that implements one of these interfaces. Its dataclass fields are its parameters (bool, int,
 float, str, Path, Enum or list[str], with unit and bounds beside the default), checked in `__post_init__`; whatever else
 it keeps is assigned there as a plain attribute, never declared as a field. What several plugins do by the same
 parameters is a part, a field of another dataclass that has these and the methods; in a config they are the plugin's
@@ -197,6 +197,14 @@ class SceneMap(ABC):
         """Their ids; asked after each frame by who maps frames as they come: override it where it can be cheap."""
         return frozenset(self.instances())
 
+    def likeliest_classes(self) -> Mapping[int, tuple[int, float]]:
+        """The likeliest class of each object, an index into `classes`, and its confidence, by id.
+
+        Asked about once a second by who watches the map grow: override it where it can be cheap.
+        """
+        found = self.instances().values()
+        return {one.id: (int(one.class_probabilities.argmax()), one.confidence) for one in found}
+
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         """What `camera` would see of the map, by ray-casting. Raises DataError where T_world_camera is no pose."""
@@ -239,3 +247,24 @@ class SceneMap(ABC):
     @abstractmethod
     def load(cls, path: Path | str) -> SceneMap:
         """The map that `save` wrote. Raises DataError when the file is not such a map or was damaged."""
+
+
+class Viewer:
+    """Shows a run while it goes on. This one shows nothing; a viewer has the verbs that it needs.
+
+    All are called by the loop, which waits for them: what takes time belongs into a thread of its own
+    (`framework.viewing.background`). The map may be read within a call, as nobody writes it then, and not after it.
+    Whatever a viewer does, it changes no result.
+    """
+
+    def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
+        """A video begins; files go to `directory`. Raises ConfigError where it cannot be shown."""
+
+    def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
+        """A frame is in the map, or its pose is lost. `stage_ms`: what each stage took, by its name."""
+
+    def skip(self, reason: str) -> None:
+        """A frame cannot be used."""
+
+    def end(self) -> None:
+        """No frame follows, however the run ended; called once after `begin`."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
+from itertools import takewhile
 from types import TracebackType
 
 import numpy as np
@@ -130,6 +131,11 @@ class Journal:
         started = time.perf_counter()
         yield
         self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
+
+    def stage_ms(self, frame: int) -> dict[str, float]:
+        """What each stage took for the last frame, ms; `frame` is its index."""
+        of_last = takewhile(lambda time: time.frame == frame, reversed(self.timings))
+        return {time.stage: time.milliseconds for time in of_last}
 
     def frame_begins(self) -> None:
         """Counts a frame that was taken from the sequence, whatever becomes of it."""

@@ -9,8 +9,9 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import repeat
+from pathlib import Path
 from typing import TypeVar, cast
 
 import numba
@@ -21,7 +22,17 @@ from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.frame_stream import FrameStream, stream_of
 from framework.geometry import lift
-from framework.interfaces import ClusterRefiner, Detector, LiveVideo, MapFuser, PoseTracker, RGBDSequence, RGBDVideo
+from framework.interfaces import (
+    ClusterRefiner,
+    Detector,
+    LiveVideo,
+    MapFuser,
+    PoseTracker,
+    RGBDSequence,
+    RGBDVideo,
+    SceneMap,
+    Viewer,
+)
 from framework.interruption import Interruption, signals_deferred
 from framework.journal import Journal, RunResult, StageTime
 from framework.refinement.refine import refine
@@ -43,6 +54,7 @@ class Pipeline:
     ahead: int = (
         2  # frames that a worker thread reads and detects in front of the mapping, 1 of a live video; 0 = no thread
     )
+    viewer: Viewer = field(default_factory=Viewer)
 
     def __post_init__(self) -> None:
         if self.ahead < 0:
@@ -63,8 +75,11 @@ class Pipeline:
             return result
         raise result.stopped_by
 
-    def run_to_any_end(self, video: RGBDVideo) -> RunResult:
-        """Maps `video` likewise; a stage's fault, too, is in `stopped_by` once a part of a frame is in the map."""
+    def run_to_any_end(self, video: RGBDVideo, directory: Path = Path()) -> RunResult:
+        """Maps `video` likewise; a stage's fault, too, is in `stopped_by` once a part of a frame is in the map.
+
+        `directory` is where a viewer leaves its files.
+        """
         frames_expected = len(video) if isinstance(video, RGBDSequence) else None
         if frames_expected == 0:
             raise DataError(f"{video.name}: there are no frames to map: start, stop and stride leave none")
@@ -73,7 +88,12 @@ class Pipeline:
             raise DataError(f"{video.name}: none of {frames} has a true pose; {WITHOUT_POSES}")
         warn_outside_domain(self.detector, video)
         journal = Journal(self.fuser.scene, frames_expected, self.tracker.pose_source)
-        with journal, sparing_what_is_there(), signals_deferred(signal.SIGINT) as interruption:
+        with (
+            watched(self.viewer, self.fuser.scene, video.name, directory),
+            journal,
+            sparing_what_is_there(),
+            signals_deferred(signal.SIGINT) as interruption,
+        ):
             try:
                 with interruption.second_ends_at_once("after this frame"):
                     self.map_all(video, journal, interruption)
@@ -124,12 +144,23 @@ class Pipeline:
         sharing = CoreSharing(with_a_thread_ahead=self.ahead > 0)
         with closing(self.detect_ahead(video, journal, interruption, sharing)) as detected:
             for frame, detections in detected:
-                try:
-                    with sharing.mapping():
-                        self.map_frame(frame, detections, journal)
-                except FrameError as error:
-                    journal.frame_skipped(error)
+                with sharing.mapping():
+                    self.map_and_show(frame, detections, journal)
                 interruption.check()
+
+    def map_and_show(self, frame: Frame, detections: Detections, journal: Journal) -> None:
+        """What happens to one frame, and that the viewer hears of it."""
+        try:
+            pose = self.map_frame(frame, detections, journal)
+        except FrameError as error:
+            self.skip(error, journal)
+        else:
+            self.viewer.show(frame, detections, pose, journal.stage_ms(frame.index))
+
+    def skip(self, error: FrameError, journal: Journal) -> None:
+        """A frame cannot be used."""
+        journal.frame_skipped(error)
+        self.viewer.skip(str(error))
 
     def detect_ahead(
         self, video: RGBDVideo, journal: Journal, interruption: Interruption, sharing: CoreSharing
@@ -155,7 +186,7 @@ class Pipeline:
                     return
                 journal.frame_begins()
                 if isinstance(outcome, FrameError):
-                    journal.frame_skipped(outcome)
+                    self.skip(outcome, journal)
                     continue
                 frame, detections, timings = outcome
                 journal.timings += timings
@@ -201,6 +232,16 @@ class Pipeline:
             self.fuser.fuse(frame, pose, clusters)
         journal.frame_fused(frame)
         return pose
+
+
+@contextmanager
+def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Iterator[None]:
+    """Has the viewer begin, and end whatever comes."""
+    viewer.begin(scene, video, directory)
+    try:
+        yield
+    finally:
+        viewer.end()
 
 
 @contextmanager

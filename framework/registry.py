@@ -26,7 +26,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.configs import config_directory
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF, PROJECT_ROOT
-from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
 
 STAGES: Mapping[str, type[Any]] = {
     "dataset": RGBDVideo,
@@ -35,7 +35,10 @@ STAGES: Mapping[str, type[Any]] = {
     "refiner": ClusterRefiner,
     "fuser": MapFuser,
 }
-"""The config groups and the interface that their options implement."""
+"""The config groups whose choice a result depends on, and the interface that their options implement."""
+
+GROUPS: Mapping[str, type[Any]] = {**STAGES, "viewer": Viewer}
+"""All config groups whose options are plugins."""
 
 REGISTER = "; a class of your own needs a YAML {stage}/NAME.yaml in a folder that --config-dir names"
 
@@ -110,7 +113,7 @@ def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]
 
 def stage_of(interface: type) -> str:
     """The config group whose options implement `interface`, or one that it is a kind of."""
-    return next(stage for stage, of in STAGES.items() if issubclass(interface, of))
+    return next(stage for stage, of in GROUPS.items() if issubclass(interface, of))
 
 
 def _refuse_unregistered(loader: Any, stage: str, target: str) -> None:
@@ -175,7 +178,7 @@ def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
     if found is None:
         fitting = [name for name, value in vars(module).items() if _implements(value, interface)]
         raise ConfigError(f"{where}: module {module_name} has no {class_name}{_did_you_mean(class_name, fitting)}")
-    if _implements(found, STAGES[stage_of(interface)]) and not _implements(found, interface):
+    if _implements(found, GROUPS[stage_of(interface)]) and not _implements(found, interface):
         what = (inspect.getdoc(interface) or "").partition("\n")[0].removesuffix(".")
         raise ConfigError(f"{where}: here it must be of the kind {interface.__name__} ({what})")
     if not _implements(found, interface):

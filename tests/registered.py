@@ -9,9 +9,9 @@ from omegaconf import DictConfig
 
 from framework.commands.plugins import registered
 from framework.files.search_paths import CONF
-from framework.registry import STAGES, build, find_class
+from framework.registry import GROUPS, build, find_class
 
-OPTION = {(option.stage, option.name): option for option in registered(*STAGES)}
+OPTION = {(option.stage, option.name): option for option in registered(*GROUPS)}
 OPTIONS = [*OPTION]
 
 
@@ -20,17 +20,17 @@ def names(stage: str, kind: type = object) -> list[str]:
     return [
         option.name
         for option in OPTION.values()
-        if option.stage == stage and issubclass(find_class(STAGES[stage], option.target), kind)
+        if option.stage == stage and issubclass(find_class(GROUPS[stage], option.target), kind)
     ]
 
 
 def composed(stage: str, name: str, *overrides: str) -> DictConfig:
     """The main config with this option and no other stage."""
-    others = [f"~{other}" for other in STAGES if other != stage]
+    others = [f"~{other}" for other in GROUPS if other != stage]
     with initialize_config_dir(str(CONF), version_base="1.3"):
         return compose("config", overrides=[f"{stage}={name}", *others, *overrides])
 
 
 def built(stage: str, name: str, *overrides: str) -> Any:
     """The option as the command would build it."""
-    return build(STAGES[stage], composed(stage, name, *overrides)[stage])
+    return build(GROUPS[stage], composed(stage, name, *overrides)[stage])

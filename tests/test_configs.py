@@ -13,7 +13,15 @@ from omegaconf import OmegaConf
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
 from framework.interfaces import RGBDSequence
-from framework.registry import STAGES, find_class, holds_one, parameter_fields, parameters, plugin_fields
+from framework.registry import (
+    GROUPS,
+    STAGES,
+    find_class,
+    holds_one,
+    parameter_fields,
+    parameters,
+    plugin_fields,
+)
 from framework.tables.comparison import TableChoice
 from framework.training.trainer import Schedule
 from framework.training.word_trainer import WordSchedule
@@ -22,7 +30,7 @@ from tests import registered
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_every_option_composes_and_builds(stage: str, name: str, ready: Callable[..., object]) -> None:
-    assert isinstance(ready(stage, name), STAGES[stage])
+    assert isinstance(ready(stage, name), GROUPS[stage])
 
 
 NEEDY = {  # by option: the first parameter that only the user knows
@@ -66,7 +74,7 @@ def test_every_value_in_the_yaml_is_the_default_of_the_class(stage: str, name: s
     is_variant = "_target_" not in own  # of the option that it inherits
     assert not is_variant or re.match(r"# (?!@)\S", path.read_text()), "a variant says first what it changes"
     node = registered.composed(stage, name)[stage]
-    plugin_class = find_class(STAGES[stage], node["_target_"])
+    plugin_class = find_class(GROUPS[stage], node["_target_"])
     links = plugin_fields(plugin_class)
     for key in links:
         one = holds_one(plugin_class, key)
@@ -113,7 +121,7 @@ def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_w
     defaults = OmegaConf.to_container(OmegaConf.load(CONF / "config.yaml").defaults)
     assert isinstance(defaults, list)
     assert defaults[0] == "_self_"
-    after_the_stages = ["dataset", "launcher", "experiment"]  # which may override what stages are
+    after_the_stages = ["dataset", "viewer", "launcher", "experiment"]  # which may override what stages are
     stages = [stage for stage in STAGES if stage not in after_the_stages]
     assert [next(iter(entry)) for entry in defaults[1:]] == stages + after_the_stages
     assert defaults[-1] == {"experiment": None}

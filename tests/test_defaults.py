@@ -15,7 +15,7 @@ from omegaconf import DictConfig
 
 from framework.configs import composed, config_directory
 from framework.files.search_paths import CONF, PROJECT_ROOT
-from framework.registry import STAGES
+from framework.registry import GROUPS, STAGES
 from framework.reporting.markup import SCRIPTS, STYLE
 from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go
 from tests import registered
@@ -119,6 +119,6 @@ def test_the_wheel_has_networks_and_configs_where_an_installed_run_looks(tmp_pat
     assert {f"framework/reporting/assets/{name}" for name in (*SCRIPTS, STYLE, "page.html", "three.LICENSE")} <= names
     assert any(name.endswith("licenses/framework/reporting/assets/three.LICENSE") for name in names)
     assert not [name for name in names if "viewer_source" in name]
-    assert not STAGES.keys() - {name.split("/")[2] for name in names if name.startswith("framework/conf/")}
+    assert not GROUPS.keys() - {name.split("/")[2] for name in names if name.startswith("framework/conf/")}
     assert not {f"framework/templates/{stage}/plugin.py.template" for stage in STAGES} - names
     assert not [name for name in names if name.startswith(("examples", "tests"))]

@@ -28,7 +28,7 @@ from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory, one_line
 from framework.errors import ConfigError, DataError
 from framework.registry import (
-    STAGES,
+    GROUPS,
     check_option,
     composition,
     find_class,
@@ -90,7 +90,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
             configs.append(part.config)
         node: Any = OmegaConf.merge(*configs)
         target = str(node.get("_target_"))
-        plugin_class = find_class(STAGES[stage], target)
+        plugin_class = find_class(GROUPS[stage], target)
         check_option(f"{stage} {target}", plugin_class, node)
     except (ConfigError, DataError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
         return Option(stage, name, target, source.provider, f"cannot be used: {one_line(error)}", ())
@@ -153,17 +153,17 @@ def describe(option: Option) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Lists the registered plugins.")
-    parser.add_argument("stage", nargs="?", choices=STAGES, help="only this stage")
+    parser.add_argument("stage", nargs="?", choices=GROUPS, help="only this stage")
     parser.add_argument("name", nargs="?", help="only this option")
     asked = arguments(parser)
     with one_line_errors():
-        stages = [asked.stage] if asked.stage else list(STAGES)
+        stages = [asked.stage] if asked.stage else list(GROUPS)
         gc.disable()  # going through all that torch and Open3D leave in memory takes a fifth of the time
         options = registered(*stages, only=asked.name)
         gc.enable()
         if asked.name and not options:
             raise ConfigError(f"there is no {asked.stage}={asked.name}")
         for stage in stages:
-            print(f"{stage} ({STAGES[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
+            print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             described = [describe(option) for option in options if option.stage == stage]
             print("\n\n".join(described) or "  (none)", end="\n\n")

@@ -79,7 +79,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
         warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption:
-        result = pipeline.run_to_any_end(video)
+        result = pipeline.run_to_any_end(video, directory)
         with interruption.second_ends_at_once("once the record is written"):
             fault = record.write(video, result, cache_metrics(pipeline.detector))
     if fault is None:

@@ -53,6 +53,11 @@ class Confirmation:
         """Of those that count, whatever their area."""
         return frozenset(np.flatnonzero(self.counts(table)).tolist())
 
+    def likeliest_classes(self, table: InstanceTable) -> dict[int, tuple[int, float]]:
+        """The class and the confidence of those that count, by id, whatever their area."""
+        counted = (record for record in table.records.values() if self.is_met(record))
+        return {record.id: (int(record.class_evidence.argmax()), record.confidence) for record in counted}
+
     def count(self, table: InstanceTable) -> int:
         """How many count, whatever their area."""
         return int(self.counts(table).sum())

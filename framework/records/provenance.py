@@ -17,7 +17,7 @@ from framework.settings import available_cores
 PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
-    *("hydra", "debug", "resume", "ahead", "detection_cache", "detection_cache_dir"),
+    *("hydra", "debug", "resume", "ahead", "detection_cache", "detection_cache_dir", "viewer"),
     "threads",  # but for networks' last digits: a sweep goes on with another number of jobs at once
     *("row", "rows", "sequences", "table", "figure"),  # of an experiment: what its runs are compared for
 )

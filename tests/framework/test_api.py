@@ -39,7 +39,7 @@ def test_a_mapper_makes_the_map_of_a_run(room: CornerRoom) -> None:
     np.testing.assert_array_equal(poses[3].T_world_camera, pose_at(3))
     config = composed("~dataset", *STAGES)
     stages = {
-        stage: build(registered.STAGES[stage], config[stage]) for stage in registered.STAGES if stage != "dataset"
+        stage: build(registered.GROUPS[stage], config[stage]) for stage in registered.GROUPS if stage != "dataset"
     }
     result = Pipeline(**stages).run(room)
     ours, of_run = mapper.scene.mesh(), result.scene.mesh()

@@ -24,7 +24,7 @@ LAYERS = [
     ["detection", "mapping", "refinement", "tracking"],
     ["rivals", "datasets"],
     ["checking", "importing", "synthetic"],
-    ["journal", "object_changes", "object_queries"],
+    ["journal", "object_changes", "object_queries", "viewing"],
     ["object_search"],
     ["pipeline"],
     ["evaluation"],

@@ -10,6 +10,7 @@ import sys
 import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from tqdm import TMonitor
 
 from framework.data import Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
-from framework.interfaces import SceneMap
+from framework.interfaces import SceneMap, Viewer
 from framework.journal import RunResult
 from framework.pipeline import Pipeline, map_ahead
 from framework.registry import assemble
@@ -377,3 +378,58 @@ def test_quiet_when_not_a_terminal(room: CornerRoom, capfd: pytest.CaptureFixtur
 def test_a_program_without_a_console_maps(room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "stderr", None)  # as under pythonw
     assert pipeline().run(room).frames == len(room)
+
+
+@dataclass
+class Listener(Viewer):
+    """Notes what it hears."""
+
+    heard: list[str] = field(default_factory=list)
+    stages: list[set[str]] = field(default_factory=list)
+
+    def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
+        self.heard.append(f"begin {video} in {directory.name}")
+
+    def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
+        self.heard.append(f"{'lost' if pose.lost else 'mapped'} {frame.index} with {len(detections)}")
+        self.stages.append(set(stage_ms))
+
+    def skip(self, reason: str) -> None:
+        self.heard.append(f"skipped {reason}")
+
+    def end(self) -> None:
+        self.heard.append("end")
+
+
+@AHEAD
+def test_a_viewer_hears_of_every_frame_in_order(ahead: int, tmp_path: Path) -> None:
+    @dataclass
+    class GetsLost(GivenPose):
+        def track(self, frame: Frame, scene: SceneMap) -> Pose:
+            return replace(super().track(frame, scene), lost=frame.index == 3)
+
+    listener = Listener()
+    pipeline(ahead, tracker=GetsLost(), viewer=listener).run_to_any_end(CornerRoom(unreadable=1), tmp_path)
+    skipped = "skipped frame 1: depth/000001.png is truncated"
+    assert listener.heard == [
+        f"begin corner_room in {tmp_path.name}",
+        *("mapped 0 with 2", skipped, "mapped 2 with 2", "lost 3 with 2", "mapped 4 with 2", "mapped 5 with 2"),
+        "end",
+    ]
+    every = {"read", "detect", "track", "lift", "refine", "fuse"}
+    assert listener.stages == [every, every, {"read", "detect", "track"}, every, every]
+
+
+@pytest.mark.parametrize("stages", [{"fuser": GridFuser(capacity=2)}, {"detector": SphereDetector(broken_at=0)}])
+def test_a_viewer_hears_of_the_end_however_it_comes(room: CornerRoom, stages: dict[str, object]) -> None:
+    listener = Listener()
+    pipeline(viewer=listener, **stages).run_to_any_end(room)
+    assert listener.heard[-1] == "end"
+    assert listener.heard.count("end") == 1
+
+
+def test_a_viewer_hears_of_the_end_of_what_cannot_be_mapped() -> None:
+    listener = Listener()
+    with pytest.raises(DataError):
+        pipeline(viewer=listener).run(CornerRoom(frames=1, unreadable=0))
+    assert listener.heard[-1] == "end"

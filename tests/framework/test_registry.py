@@ -21,7 +21,7 @@ from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker, RGBDSequence, RGBDVideo
 from framework.parameters import check_bounds
-from framework.registry import STAGES, assemble, build, find_class, parameter_fields
+from framework.registry import GROUPS, STAGES, assemble, build, find_class, parameter_fields
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 HERE = "build_targets"
@@ -265,6 +265,7 @@ def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
 
 def test_every_stage_has_its_interface() -> None:
     assert list(STAGES) == ["dataset", "detector", "tracker", "refiner", "fuser"]
+    assert list(GROUPS) == [*STAGES, "viewer"]
 
 
 def test_a_video_of_the_wrong_kind_is_named() -> None:

@@ -11,7 +11,7 @@ import pytest
 
 from framework import configs
 from framework.commands.plugins import Option, Parameter, describe, registered
-from framework.registry import STAGES
+from framework.registry import GROUPS, STAGES
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 
@@ -214,8 +214,8 @@ def test_options_of_a_folder_are_listed_and_each_faulty_one_is_told(
 
 
 def test_every_registered_option_can_be_described() -> None:
-    options = registered(*STAGES)
-    assert {option.stage for option in options} == set(STAGES)
+    options = registered(*GROUPS)
+    assert {option.stage for option in options} == set(GROUPS)
     for option in options:
         assert option.name in describe(option)
         assert option.provider == "main"

@@ -1,0 +1,12 @@
+"""No viewer: a run is seen when it is over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from framework.interfaces import Viewer
+
+
+@dataclass
+class NoViewer(Viewer):
+    """Shows nothing."""

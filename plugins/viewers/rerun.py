@@ -1,0 +1,151 @@
+"""The run in rerun (https://rerun.io, Apache-2.0 and MIT): in its own window, in a browser, or in a file for later."""
+
+from __future__ import annotations
+
+import importlib.util
+import logging
+import os
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+from uuid import uuid4
+
+from framework.data import Detections, Frame, Pose
+from framework.errors import ConfigError, in_one_line
+from framework.interfaces import SceneMap, Viewer
+from framework.parameters import check_bounds, require
+from framework.viewing.background import Background
+from framework.viewing.sealed_page import HERE, SealedPage
+
+log = logging.getLogger(__name__)
+
+RECORDING = "recording.rrd"
+FLUSH_S = 0.2  # after which what was drawn is in the file: what a killed run loses
+
+
+class Mode(Enum):
+    """Where a run is shown."""
+
+    RECORD = "record"
+    WINDOW = "window"
+    BROWSER = "browser"
+
+
+@dataclass
+class RerunViewer(Viewer):
+    """Shows the camera, what it sees and the growing map, in rerun's viewer or in a file that it opens later.
+
+    Drawn are the camera's path, the newest frame with its masks and depth, the parts of the mesh that have changed,
+    boxes around the objects, milliseconds by stage, and lost frames. Where drawing is slower than mapping, pictures are
+    left out, and never a pose, a time or a lost frame.
+    """
+
+    mode: Mode = Mode.RECORD  # RECORD, WINDOW or BROWSER
+    file: str = ""  # "" = recording.rrd in the run's directory in mode RECORD, none in the others
+    every: int = 3  # frames from one picture to the next, from 1
+    mesh_every: float = 2.0  # s, from one look at the map to the next at least, in [0.1, 3600]
+    stride: int = 2  # px of a frame for one of its picture, in [1, 16]
+    jpeg_quality: int = 75  # in [1, 100]
+    region: float = 1.0  # m, in [0.1, 1000], side of the cubes that the mesh is drawn in
+    min_confidence: float = 0.3  # in [0, 1], from which on an object is drawn, and a detection named
+    memory_limit: str = "2GB"  # of what WINDOW or BROWSER keep; what is oldest goes first
+    port: int = 9876  # of the data, in [1024, 65535]; WINDOW takes the viewer that listens there, if one does
+    web_port: int = 9090  # of the page of BROWSER, in [1024, 65535]
+
+    def __post_init__(self) -> None:
+        check_bounds(
+            self,
+            every=(1, 10**6),
+            mesh_every=(0.1, 3600.0),
+            stride=(1, 16),
+            jpeg_quality=(1, 100),
+            region=(0.1, 1000.0),
+            min_confidence=(0.0, 1.0),
+            port=(1024, 65535),
+            web_port=(1024, 65535),
+        )
+        limit = self.memory_limit.removesuffix("B").removesuffix("i").rstrip("kMGT%")
+        require(limit.isdecimal(), "RerunViewer.memory_limit", self.memory_limit, "like 2GB or 25%")
+        self._page: SealedPage | None = None
+        if importlib.util.find_spec("rerun") is None:
+            raise ConfigError("rerun, which draws the run, is not there: pip install instancemap[viewer]")
+
+    def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
+        import rerun as rr
+
+        from framework.viewing.rerun_drawing import RerunDrawing
+        from framework.viewing.rerun_layout import layout
+
+        batches = rr.ChunkBatcherConfig(flush_tick=FLUSH_S)
+        recording = rr.RecordingStream("instancemap", recording_id=uuid4(), batcher_config=batches)
+        recording.set_sinks(*self._sinks(rr, directory), default_blueprint=layout())
+        recording.send_recording_name(video)
+        drawing = RerunDrawing(recording, self.stride, self.jpeg_quality, self.region, self.min_confidence)
+        self._background = Background(scene, drawing, self.every, self.mesh_every)
+
+    def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
+        self._background.show(frame, detections, pose, stage_ms)
+
+    def skip(self, reason: str) -> None:
+        self._background.skip(reason)
+
+    def end(self) -> None:
+        self._background.end()
+        if self._page is not None:
+            self._page.close()
+
+    def _sinks(self, rr: Any, directory: Path) -> list[Any]:
+        """Where the drawing goes."""
+        sinks = []
+        file = self.file or (RECORDING if self.mode is Mode.RECORD else "")
+        if file:
+            sinks.append(_file_sink(rr, directory / Path(file).expanduser()))
+        if self.mode is Mode.WINDOW:
+            sinks.append(_open_window(rr, self.port, self.memory_limit))
+        if self.mode is Mode.BROWSER:
+            sinks.append(_server(rr, self.port, self.memory_limit))
+            with _faults(f"port {self.web_port} cannot be had: set viewer.web_port"):
+                self._page = SealedPage(self.web_port, self.port)
+            log.info("viewer: %s until the run ends", self._page.url)
+        return sinks
+
+
+def _file_sink(rr: Any, path: Path) -> Any:
+    with _faults(f"{path} cannot be written"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.open("wb").close()  # rerun itself would only say so on stderr
+        return rr.FileSink(path)
+
+
+def _server(rr: Any, port: int, memory_limit: str) -> Any:
+    """Serves the data, to this machine alone."""
+    with _faults(f"port {port} cannot be had: set viewer.port"):
+        with socket.socket() as probe:  # rerun itself would only say so on stderr
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            probe.bind((HERE, port))
+        return rr.GrpcServerSink(bind_ip=HERE, port=port, server_memory_limit=memory_limit)
+
+
+def _open_window(rr: Any, port: int, memory_limit: str) -> Any:
+    """Opens rerun's viewer, unless one is there. It sends no statistics of its use to its makers."""
+    if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
+        raise ConfigError("mode WINDOW needs a screen, and there is none: viewer.mode=BROWSER or RECORD")
+    with _faults("rerun's viewer cannot be started"):
+        off = [sys.executable, "-m", "rerun", "analytics", "disable"]
+        subprocess.run(off, check=True, capture_output=True, timeout=60)
+        rr.spawn(port=port, connect=False, memory_limit=memory_limit, hide_welcome_screen=True)
+    return rr.GrpcSink(f"rerun+http://{HERE}:{port}/proxy")
+
+
+@contextmanager
+def _faults(what: str) -> Iterator[None]:
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError, subprocess.SubprocessError) as error:
+        raise ConfigError(f"viewer: {what}: {in_one_line(error)}") from error

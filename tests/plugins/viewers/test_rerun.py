@@ -1,0 +1,280 @@
+"""A run in rerun's files: what is in them, what is left of a killed run, and what stands in the way."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.request import urlopen
+
+import numpy as np
+import pytest
+
+from framework.api import Mapper
+from framework.data import Frame, Pose
+from framework.errors import ConfigError, FrameError
+from framework.interfaces import SceneMap
+from framework.pipeline import Pipeline
+from framework.registry import assemble
+from framework.viewing.sealed_page import free_port
+from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from plugins.viewers.rerun import Mode, RerunViewer
+from tests import registered
+from tests.scenes.corner_room import CAMERA, CornerRoom, GivenPose, KeepAll, SphereDetector, pose_at
+
+pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not installed")
+from pyarrow.types import is_temporal
+from rerun.chunk import RrdReader
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
+FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+PATIENCE_S = 120
+
+
+class GetsLost(GivenPose):
+    """Loses frame 4."""
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        pose = super().track(frame, scene)
+        return Pose(pose.T_world_camera, lost=True, reason="too dark") if frame.index == 4 else pose
+
+
+def pipeline(viewer: RerunViewer, **stages: Any) -> Pipeline:
+    fuser = assemble(BayesianTsdf, voxel_size=0.04, min_observations=1)
+    stages = {"detector": SphereDetector(), "tracker": GetsLost(), "refiner": KeepAll(), "fuser": fuser} | stages
+    return Pipeline(**stages, viewer=viewer)
+
+
+def rows(file: Path, entity: str) -> Iterator[dict[str, Any]]:
+    """What was logged to an entity as time went by: the values by column, the times by time line, in ns."""
+    for chunk in RrdReader(file).stream():
+        if chunk.entity_path == f"/{entity}" and not chunk.is_static:
+            batch = chunk.to_record_batch()
+            columns = {
+                name: column.cast("int64") if is_temporal(column.type) else column
+                for name, column in zip(batch.schema.names, batch.columns, strict=True)
+            }
+            for k in range(batch.num_rows):
+                yield {name: column[k].as_py() for name, column in columns.items()}
+
+
+def entities(file: Path) -> set[str]:
+    return {chunk.entity_path for chunk in RrdReader(file).stream()}
+
+
+@pytest.fixture(scope="module")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of six frames, of which 2 cannot be read and 4 is lost."""
+    directory = tmp_path_factory.mktemp("run")
+    viewer = RerunViewer(every=1, stride=1, mesh_every=0.1, min_confidence=0.1)
+    pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
+    return directory / "recording.rrd"
+
+
+def test_the_file_is_complete(recorded: Path) -> None:
+    verified = [sys.executable, "-m", "rerun", "rrd", "verify", str(recorded)]
+    home = os.environ | {"HOME": str(recorded.parent)}  # where rerun notes that it has run
+    done = subprocess.run(verified, capture_output=True, text=True, timeout=PATIENCE_S, env=home)
+    assert done.returncode == 0, done.stderr
+    assert len(RrdReader(recorded).blueprints()) >= 1
+
+
+def test_every_time_is_there_and_what_was_not_done_has_none(recorded: Path) -> None:
+    times = {row["frame"]: row["Scalars:scalars"] for row in rows(recorded, "milliseconds")}
+    assert sorted(times) == [0, 1, 3, 4, 5]
+    assert all(np.isfinite(times[k]).all() and len(times[k]) == 6 for k in (0, 1, 3, 5))
+    assert np.isfinite(times[4]).tolist() == [True, True, True, False, False, False], "it was read, detected, tracked"
+
+
+def test_lost_and_skipped_frames_are_told(recorded: Path) -> None:
+    told = {row["TextLog:text"][0]: row["frame"] for row in rows(recorded, "log")}
+    assert told["lost: too dark"] == 4
+    assert "skipped: frame 2: depth/000002.png is truncated" in told
+
+
+def test_the_path_is_that_of_the_camera_and_broken_where_it_was_lost(recorded: Path) -> None:
+    pieces = {}
+    for entity in entities(recorded):
+        if entity.startswith("/world/path/"):
+            pieces[entity] = list(rows(recorded, entity[1:]))[-1]["LineStrips3D:strips"][0]
+    assert [len(pieces[f"/world/path/{k}"]) for k in range(2)] == [3, 1]
+    np.testing.assert_allclose(pieces["/world/path/0"], [pose_at(k)[:3, 3] for k in (0, 1, 3)], atol=1e-6)
+
+
+def test_the_mesh_in_the_file_is_the_maps(recorded: Path, tmp_path: Path) -> None:
+    last = {}
+    for entity in entities(recorded):
+        if entity.startswith("/world/mesh/"):
+            last[entity] = list(rows(recorded, entity[1:]))[-1]
+    points = np.concatenate([np.array(row["Mesh3D:vertex_positions"]) for row in last.values()])
+    triangles = sum(len(row["Mesh3D:triangle_indices"]) for row in last.values())
+    mesh = pipeline(RerunViewer()).run_to_any_end(CornerRoom(unreadable=2), tmp_path).scene.mesh()
+    assert triangles == len(mesh.triangles) > 1000
+    used = mesh.vertices[np.unique(mesh.triangles)]
+    assert {tuple(row) for row in points.astype(np.float32).tolist()} == {tuple(row) for row in used.tolist()}
+
+
+def test_objects_and_masks_have_the_same_colors_and_names(recorded: Path) -> None:
+    boxes = list(rows(recorded, "world/objects/boxes"))[-1]
+    names = list(rows(recorded, "world/objects/names"))[-1]
+    assert sorted(label.split()[0] for label in names["Points3D:labels"]) == ["chair", "couch"]
+    assert len(set(boxes["Boxes3D:colors"])) == 2
+    found = list(rows(recorded, "world/camera/found"))[-1]
+    assert found["frame"] == 5
+    assert set(found["Boxes2D:colors"]) == set(boxes["Boxes3D:colors"])
+    labels = list(rows(recorded, "world/camera/names"))[-1]["Points2D:labels"]
+    assert sorted(label.split()[0] for label in labels) == ["chair", "couch"]
+    buffer = list(rows(recorded, "world/camera/masks"))[-1]["SegmentationImage:buffer"][0]
+    image = np.array(buffer, np.uint8).view(np.uint16)
+    masks = SphereDetector().detect(CornerRoom()[5]).masks
+    assert np.count_nonzero(image) == masks.any(axis=0).sum()
+    assert len(set(image[image > 0].tolist())) == 2
+
+
+def test_the_camera_looks_from_where_it_is(recorded: Path) -> None:
+    camera = list(rows(recorded, "world/camera"))[-1]
+    assert camera["frame"] == 5
+    np.testing.assert_allclose(camera["Transform3D:translation"][0], pose_at(5)[:3, 3], atol=1e-6)
+    assert camera["Pinhole:resolution"][0] == [CAMERA.width, CAMERA.height]
+    K = np.array(camera["Pinhole:image_from_camera"][0]).reshape(3, 3).T
+    np.testing.assert_allclose(K, [[90, 0, 48], [0, 90, 36], [0, 0, 1]])  # rerun's pixels begin at whole numbers
+
+
+def test_who_watches_changes_nothing(tmp_path: Path) -> None:
+    """To the byte, with a viewer that looks at the map after every frame."""
+    maps = {}
+    for name in ("none", "rerun"):
+        viewer = build_viewer(name, "viewer.mesh_every=0.1") if name == "rerun" else build_viewer(name)
+        (tmp_path / name).mkdir()
+        result = pipeline(viewer).run_to_any_end(CornerRoom(frames=12), tmp_path / name)
+        result.scene.save(tmp_path / name / "map.npz")
+        poses = [frame.pose.T_world_camera.tobytes() for frame in result.tracked]
+        maps[name] = (tmp_path / name / "map.npz").read_bytes(), poses
+    assert maps["none"] == maps["rerun"]
+    assert not (tmp_path / "none" / "recording.rrd").exists()
+    assert (tmp_path / "rerun" / "recording.rrd").stat().st_size > 10_000
+
+
+def build_viewer(name: str, *overrides: str) -> Any:
+    return registered.built("viewer", name, *overrides)
+
+
+def test_a_killed_run_leaves_all_up_to_its_last_second(tmp_path: Path) -> None:
+    """By the computer's clock, which rerun notes with everything, and by when the last frame was fused."""
+    endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
+    line = [sys.executable, "-m", "framework", "--config-dir", str(CHECKOUT / "tests" / "fake_conf"), *FAKES, *endless]
+    run = subprocess.Popen(
+        [*line, "viewer=rerun", "hydra.run.dir=run"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+    )
+    try:
+        deadline = time.monotonic() + PATIENCE_S
+        while not (tmp_path / "note").exists():
+            assert run.poll() is None, run.communicate()[1]
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        time.sleep(3)
+    finally:
+        os.kill(run.pid, signal.SIGKILL)
+        run.communicate()
+    fused_at = (tmp_path / "note").stat().st_mtime  # later than that nothing can have been drawn, and the rest must be
+    file = tmp_path / "run" / "recording.rrd"
+    frames = list(rows(file, "world/camera/color"))
+    assert len(frames) > 3
+    last = max(row["log_time"] for row in frames) / 1e9
+    assert abs(fused_at - last) < 1.5, f"{fused_at - last:.2f} s are missing"
+
+
+def test_a_mapper_is_shown_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    mapper = Mapper(*STAGES, viewer="rerun")
+    room = CornerRoom()
+    mapper.add(room[0])
+    with pytest.raises(FrameError):
+        mapper.add(replace(room[1], T_world_camera=None))
+    mapper.add(room[2])
+    del mapper
+    times = {row["frame"]: row["Scalars:scalars"] for row in rows(tmp_path / "recording.rrd", "milliseconds")}
+    assert sorted(times) == [0, 2]
+    assert np.isnan(times[0]).tolist() == [True, False, False, False, False, False], "nobody has read the frame"
+    assert [row["TextLog:text"] for row in rows(tmp_path / "recording.rrd", "log")]
+
+
+def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    find_spec = importlib.util.find_spec
+    there = {"rerun": None}
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: there.get(name, find_spec(name, *rest)))
+    with pytest.raises(ConfigError, match=r"rerun, .* is not there: pip install instancemap\[viewer\]$"):
+        build_viewer("rerun")
+
+
+@pytest.mark.parametrize(
+    ("parameter", "said"),
+    [
+        ("every=0", r"every must be in \[1, 1e\+06\], found 0"),
+        ("mesh_every=nan", "mesh_every must be in"),
+        ("memory_limit=lots", "memory_limit must be like 2GB or 25%, found lots"),
+        ("mode=WINDOWS", "mode"),
+        ("port=80", "port must be in"),
+    ],
+)
+def test_parameters_have_bounds(parameter: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        build_viewer("rerun", f"viewer.{parameter}")
+
+
+def begun(viewer: RerunViewer, directory: Path) -> None:
+    viewer.begin(assemble(BayesianTsdf).scene, "nothing", directory)
+
+
+def test_a_file_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "recording.rrd").mkdir()
+    with pytest.raises(ConfigError, match=r"viewer: .*recording.rrd cannot be written: .*Is a directory"):
+        begun(RerunViewer(), tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be written"):
+        begun(RerunViewer(file="file/below.rrd"), tmp_path)
+
+
+def test_a_window_needs_a_screen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    with pytest.raises(ConfigError, match=r"needs a screen, and there is none: viewer\.mode=BROWSER or RECORD"):
+        begun(RerunViewer(mode=Mode.WINDOW), tmp_path)
+
+
+def test_a_port_that_is_taken_is_one_line(tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        with pytest.raises(ConfigError, match=rf"viewer: port {port} cannot be had: set viewer\.port"):
+            begun(RerunViewer(mode=Mode.BROWSER, port=port), tmp_path)
+
+
+def test_a_browser_gets_a_page_that_may_talk_to_nobody_else(tmp_path: Path) -> None:
+    viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port(), file="also.rrd")
+    begun(viewer, tmp_path)
+    with urlopen(f"http://127.0.0.1:{viewer.web_port}/", timeout=30) as page:
+        text, policy = page.read().decode(), page.headers["Content-Security-Policy"]
+    viewer.end()
+    assert "<html" in text
+    sources = {word for word in policy.replace(";", " ").split() if word.startswith("http")}
+    assert sources == {f"http://{name}:{viewer.port}" for name in ("127.0.0.1", "localhost")}
+    assert "*" not in policy
+    assert (tmp_path / "also.rrd").exists()
+    with socket.socket() as probe:
+        assert probe.connect_ex(("127.0.0.1", viewer.web_port)) != 0, "it is closed"
