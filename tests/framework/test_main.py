@@ -180,7 +180,7 @@ FAULTY = {
 }
 
 
-@pytest.mark.parametrize("command", COMMANDS.keys() - {"doctor"})  # whose findings are no faults of its own
+@pytest.mark.parametrize("command", sorted(COMMANDS.keys() - {"doctor"}))  # whose findings are no faults of its own
 def test_debug_shows_where_a_fault_of_any_command_comes_from(
     command: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

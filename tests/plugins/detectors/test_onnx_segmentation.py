@@ -5,17 +5,12 @@ import numpy as np
 import onnx
 import pytest
 
+from framework.contracts.detector import DetectorContract
 from framework.data import Camera, Frame
 from framework.detection.masks import tight_boxes
 from framework.errors import ConfigError, DataError
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
 from tests.rewritten_exports import LAYOUTS, rewritten
-from tests.test_contracts import (  # noqa: F401  the contract of every detector, on the `detector` below
-    test_detector_gives_the_same_for_the_same_frame_in_any_order,
-    test_detector_needs_no_truth_or_says_so,
-    test_detector_returns_distributions_and_masks_in_the_image,
-    test_detector_takes_a_blank_image,
-)
 from tests.tiny_networks import constant_network
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -53,6 +48,12 @@ def tiny(folder, objectness=False, transposed=False, **parameters):
 @pytest.fixture
 def detector(tmp_path):
     return tiny(tmp_path)
+
+
+class TestContract(DetectorContract):
+    @pytest.fixture(autouse=True)
+    def network(self, detector):
+        self.plugin = lambda: detector
 
 
 @pytest.mark.parametrize(("objectness", "transposed"), [(False, False), (True, True)])

@@ -10,6 +10,8 @@ import pytest
 import torch
 from torch.nn import functional
 
+# a detector that any config registers keeps these; here they run on the networks below
+from framework.contracts.detector import DetectorContract
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
 from framework.label_spaces import COCO, COCO_BY_ID
@@ -20,14 +22,6 @@ from plugins.detectors.transformers_segmentation import (
     TransformersSegmentation,
     class_distributions,
     resample_masks,
-)
-
-# a detector that any config registers keeps these; here they run on the networks below
-from tests.test_contracts import (  # noqa: F401
-    test_detector_gives_the_same_for_the_same_frame_in_any_order,
-    test_detector_needs_no_truth_or_says_so,
-    test_detector_returns_distributions_and_masks_in_the_image,
-    test_detector_takes_a_blank_image,
 )
 from tests.tiny_transformers import FIXED, LABELS, MODELS, write_network
 
@@ -50,6 +44,12 @@ def built(folder, **parameters):
 @pytest.fixture(params=MODELS)
 def detector(request, folders):
     return built(folders[request.param], score_threshold=0.02, agnostic_nms=0.9)
+
+
+class TestContract(DetectorContract):
+    @pytest.fixture(autouse=True)
+    def network(self, detector):
+        self.plugin = lambda: detector
 
 
 def frame(seed=0, camera=CAMERA):
