@@ -8,8 +8,7 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parent.parent
 DOCS = CHECKOUT / "docs"
 PAGES = {
-    str(path.relative_to(CHECKOUT)): path.read_text()
-    for path in sorted([*CHECKOUT.glob("README*.md"), *DOCS.rglob("*.md")])
+    str(path.relative_to(CHECKOUT)): path.read_text() for path in [CHECKOUT / "README.md", *sorted(DOCS.rglob("*.md"))]
 }
 """Text by path, from the checkout."""
 

@@ -19,6 +19,7 @@ from tests.test_readme import BENCHMARKS, COMMANDS, OWN_DATA, OWN_PLUGIN, RUNNAB
 
 EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # in test_readme.py
 ACME = block("python", "class AcmeSearchPath")
+CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
 
 
@@ -53,7 +54,13 @@ def test_nothing_is_shown_that_no_test_runs() -> None:
         *(line for line in LINES if line.startswith("docker ") and f"#   {line}\n" in shown_in),
     }
     assert not [line for line in LINES if line.split()[0] in OURS and line not in looked_at]
-    scripts = {ACME, *OWN_DATA, *blocks("python", "docs/python.md"), *(block("python", words) for words in EXECUTED)}
+    scripts = {
+        ACME,
+        CONTRACT,
+        *OWN_DATA,
+        *blocks("python", "docs/python.md"),
+        *(block("python", words) for words in EXECUTED),
+    }
     assert not set(blocks("python")) - scripts
 
 
@@ -70,3 +77,10 @@ def test_a_package_registers_its_options() -> None:
     path = ConfigSearchPathImpl()
     names["AcmeSearchPath"]().manipulate_search_path(path)
     assert [(element.provider, element.path) for element in path.get_path()] == [("acme", "pkg://acme.conf")]
+
+
+def test_a_contract_is_inherited() -> None:
+    names: dict[str, Any] = {"__name__": "my_package"}
+    exec(CONTRACT, names)
+    inherited = {name for name in dir(names["TestMyRefiner"]) if name.startswith("test_")}
+    assert {"test_option_is_listed_with_every_parameter_and_a_comment", "test_refiner_is_repeatable"} <= inherited

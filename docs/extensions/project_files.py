@@ -1,6 +1,7 @@
 """Links out of these pages: relative, as on any code host, and right in the built pages, too.
 
-Some files of the project are pages here as well; in `docs/` each has a page of one line that links to it.
+Some files of the project are pages here as well; in `docs/` each has a page of one line that links to it. A folder is
+no page: of a link to one, its words are left.
 """
 
 from __future__ import annotations
@@ -18,11 +19,14 @@ PAGES = {
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
     "data/desk/README.md": "desk.md",
+    "examples/README.md": "tutorials/examples.md",
     "plugins/detectors/mask_rcnn_rooms.md": "guides/mask_rcnn_rooms.md",
     "plugins/detectors/maskrcnn2go.md": "guides/maskrcnn2go.md",
+    "plugins/detectors/room_words.md": "guides/room_words.md",
 }
 """The pages that show files of the project."""
 
+_FOLDER = re.compile(r"\[(?P<words>[^\]]*)\]\((?!\w+:|#)(?P<path>[^)#\s]+)\)")
 _LINK = re.compile(r"(?<=\]\()(?!\w+:|#)(?P<path>[^)#\s]+)(?P<anchor>#[^)\s]*)?(?=\))")
 
 
@@ -38,7 +42,10 @@ def show(app: Sphinx, name: str, source: list[str]) -> None:
             target = DOCS / PAGES.get(str(target.relative_to(PROJECT)), target)
         return os.path.relpath(target, page.parent) + (link["anchor"] or "")
 
-    source[0] = _LINK.sub(relinked, text)
+    def without_folders(link: re.Match[str]) -> str:
+        return link["words"] if (shown.parent / link["path"]).is_dir() else link[0]
+
+    source[0] = _LINK.sub(relinked, _FOLDER.sub(without_folders, text))
 
 
 def setup(app: Sphinx) -> dict[str, bool]:

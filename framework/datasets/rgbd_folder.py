@@ -132,7 +132,9 @@ def _recorded(images: ImageFiles, index: int, line: TumLine | None, up: Float64 
 
 def _read_json(path: Path) -> dict[str, Any]:
     if not path.is_file():
-        raise DataError(f"{path} is missing; an RGB-D folder needs camera.json, color/ and depth/ (see README)")
+        raise DataError(
+            f"{path} is missing; an RGB-D folder needs camera.json, color/ and depth/ (see docs/tutorials/own_data.md)"
+        )
     return read_json_object(path)
 
 

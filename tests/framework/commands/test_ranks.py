@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import re
 import shlex
 import subprocess
 import sys
 from pathlib import Path
 
+from tests.doc_pages import CHECKOUT, LINES
 from tests.framework.tables.test_ranks import experiment
 
-CHECKOUT = Path(__file__).resolve().parents[3]
+RANKS = "python -m framework ranks "
 FIGURES = {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)}
 
 
@@ -20,8 +20,8 @@ def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
 
 
-def test_the_readmes_command_prints_and_writes(tmp_path: Path) -> None:
-    [command] = re.findall(r"^python -m framework ranks (.*)$", (CHECKOUT / "README.md").read_text(), re.MULTILINE)
+def test_the_command_of_the_pages_prints_and_writes(tmp_path: Path) -> None:
+    [command] = [line.removeprefix(RANKS) for line in LINES if line.startswith(RANKS)]
     folders = [word for word in shlex.split(command) if word.startswith("outputs/ranks_")]
     assert len(folders) == 3
     for folder in folders:
