@@ -127,7 +127,14 @@ class Painting(Viewer):
         (Late(), ViewerContract.test_viewer_leaves_its_files_in_the_runs_directory),
     ],
 )
-def test_a_broken_viewer_is_found(viewer: Viewer, test: Callable[..., None], request: pytest.FixtureRequest) -> None:
+def test_a_broken_viewer_is_found(
+    viewer: Viewer,
+    test: Callable[..., None],
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
     tests = ViewerContract()
     tests.plugin = lambda: viewer  # type: ignore[method-assign]
     fixtures = [name for name in inspect.signature(test).parameters if name != "self"]
