@@ -79,7 +79,10 @@ def leave_working_folder(arguments: list[str]) -> None:
 
     It may be a record that somebody sent. With --config-dir, which registers modules of one's own, it comes last.
     """
-    here = str(Path.cwd())
+    try:
+        here = str(Path.cwd())
+    except FileNotFoundError:
+        sys.exit("error: the working folder has been removed; change to another one")
     if sys.flags.safe_path or sys.path[0] not in ("", here) or Path(here) == Path(__file__).resolve().parents[1]:
         return
     del sys.path[0]

@@ -33,6 +33,7 @@ SAY_NOTHING = frozenset(
         "three",
     )
 )
+SHADES = frozenset(("light", "dark", "bright", "pale", "deep"))  # of a colour, which light makes as well
 IRREGULAR = {"people": "person", "men": "person", "women": "person", "mice": "mouse", "knives": "knife",
              "shelves": "shelf", "scissors": "scissors", "skis": "skis", "glasses": "glass"}  # fmt: skip
 EVERYDAY = {
@@ -62,8 +63,8 @@ class ObjectWords:
 def object_words(query: str, classes: Collection[str]) -> ObjectWords:
     """Takes a query apart; `classes` are the names that a class may have.
 
-    Case, articles and plurals do not matter, and words of other label spaces count as what they mean (sofa = couch). A
-    word that is a colour and a class, orange, is a colour where another class follows.
+    Case, articles, plurals and shades of colours do not matter, and words of other label spaces count as what they mean
+    (sofa = couch). A word that is a colour and a class, orange, is a colour where another class follows.
     """
     words = re.findall(r"[^\W_]+(?:[-'][^\W_]+)*", query.lower())
     known = {name.lower(): name for name in classes}
@@ -73,7 +74,7 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
     at = 0
     while at < len(words):
         length, name = _class_at(words, at, known)
-        color = OTHER_SPELLINGS.get(words[at], words[at])
+        color = _color(words[at : at + 1])
         is_color = color in COLOR_NAMES and (length < 2)
         if is_color and (not name or any(_class_at(words, k, known)[1] for k in range(at + 1, len(words)))):
             colors.append(color)
@@ -82,10 +83,16 @@ def object_words(query: str, classes: Collection[str]) -> ObjectWords:
             found.append(name)
             at += length
         else:
-            if words[at] not in SAY_NOTHING:
+            shade = words[at] in SHADES and _color(words[at + 1 : at + 2]) in COLOR_NAMES
+            if words[at] not in SAY_NOTHING and not shade:
                 unknown.append(words[at])
             at += 1
     return ObjectWords(tuple(dict.fromkeys(found)), tuple(dict.fromkeys(colors)), tuple(dict.fromkeys(unknown)))
+
+
+def _color(word: list[str]) -> str:
+    """A word as COLOR_NAMES has it where it is a colour; "" for no word."""
+    return OTHER_SPELLINGS.get(word[0], word[0]) if word else ""
 
 
 def _class_at(words: list[str], at: int, known: dict[str, str]) -> tuple[int, str]:

@@ -36,6 +36,7 @@ from framework.interfaces import (
 from framework.interruption import Interruption, signals_deferred
 from framework.journal import Journal, RunResult, StageTime
 from framework.refinement.refine import refine
+from framework.viewing.guarded_viewer import GuardedViewer
 
 WITHOUT_POSES = "add the sequence's poses, or choose a tracker that needs none, tracker=voxel_hashing_icp"
 
@@ -59,6 +60,7 @@ class Pipeline:
     def __post_init__(self) -> None:
         if self.ahead < 0:
             raise ConfigError(f"Pipeline: ahead must be 0 or more frames, found {self.ahead}")
+        self.viewer = GuardedViewer(self.viewer)
 
     def run(self, video: RGBDVideo) -> RunResult:
         """Maps `video` frame by frame.

@@ -125,3 +125,13 @@ def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_w
     stages = [stage for stage in STAGES if stage not in after_the_stages]
     assert [next(iter(entry)) for entry in defaults[1:]] == stages + after_the_stages
     assert defaults[-1] == {"experiment": None}
+
+
+def test_what_shows_a_run_is_not_in_the_name_of_an_experiments_run() -> None:
+    """Else a run that was watched would not be found again."""
+    part = OmegaConf.load(CONF / "parts" / "experiment.yaml")
+    left_out = set(OmegaConf.select(part, "hydra.job.config.override_dirname.exclude_keys"))
+    shown = {
+        f"viewer.{key}" for name in registered.names("viewer") for key in registered.composed("viewer", name).viewer
+    }
+    assert shown - {"viewer._target_"} | {"viewer"} <= left_out

@@ -19,6 +19,7 @@ from framework.contracts.detector import DetectorContract
 from framework.contracts.fuser import FuserContract
 from framework.contracts.refiner import RefinerContract
 from framework.contracts.tracker import TrackerContract
+from framework.contracts.viewer import ViewerContract
 from framework.data import Frame
 from framework.interfaces import LiveVideo, RGBDSequence
 from tests import option_files, registered
@@ -57,6 +58,14 @@ class TestFusers(FuserContract):
     @pytest.fixture(autouse=True, params=registered.names("fuser"))
     def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
         self.plugin = lambda: ready("fuser", request.param)
+
+
+class TestViewers(ViewerContract):
+    @pytest.fixture(autouse=True, params=registered.names("viewer"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        if request.param == "rerun":
+            pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not installed")
+        self.plugin = lambda: ready("viewer", request.param)
 
 
 # Live videos

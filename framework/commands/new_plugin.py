@@ -14,6 +14,8 @@ from pathlib import Path
 from string import Template
 
 from hydra.core.global_hydra import GlobalHydra
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
 
 import framework
 from framework.commands.command_line import arguments, one_line_errors
@@ -103,13 +105,21 @@ def check_name(stage: str, name: str) -> None:
             f"NAME must be words of a-z and 0-9 with _ between them, like my_{stage}, at most {LONGEST_NAME} "
             f"characters; found {name!r}"
         )
+    if is_value(name):
+        raise ConfigError(f"NAME {name} is a value and no name on a command line or in YAML; choose another, my_{name}")
     if keyword.iskeyword(name) or name in FOLDERS:
         raise ConfigError(f"NAME {name} means something else in a Python package; choose another, like my_{name}")
     if name in options_of(stage):
         raise ConfigError(f"there is a {stage}={name} already: `instancemap plugins {stage} {name}` shows it")
     class_name = names_of(stage, name)["class_name"]
-    if re.search(rf"\b{class_name}\b", _template(stage, "plugin.py")):
+    if any(re.search(rf"\b{class_name}\b", _template(stage, template)) for template in ("plugin.py", "test.py")):
         raise ConfigError(f"NAME {name}: its class {class_name} would have the name of another; choose a longer one")
+
+
+def is_value(name: str) -> bool:
+    """Whether Hydra, or a YAML file, takes the word for null, a truth value or a number."""
+    on_a_line = OverridesParser.create().parse_override(f"option={name}").value()
+    return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
 
 
 def options_of(stage: str) -> list[str]:

@@ -34,6 +34,8 @@ def main() -> None:
     asked = arguments(parser)
     if asked.top < 1:
         parser.error(f"--top must be at least 1, found {asked.top}")
+    if asked.model and asked.by == "names":
+        parser.error("--model is of embeddings, and --by names asks for none")
     if not 0 < len(asked.text.strip()) <= LONGEST_QUERY:
         parser.error(f"WORDS must be 1 to {LONGEST_QUERY} characters")
     with one_line_errors():
@@ -41,7 +43,7 @@ def main() -> None:
 
         scene = Map(scene_of("query", asked.run))
         space = scene.scene.embedding_space
-        by = asked.by or ("embeddings" if space else "names")
+        by = asked.by or ("embeddings" if space or asked.model else "names")
         found = by_names(scene, asked.text) if by == "names" else embedded(scene, asked.run, asked.text, asked.model)
         shown = found[: asked.top]
         if asked.json:

@@ -8,7 +8,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from framework.commands.plugins import registered
 from framework.configs import composed
-from framework.registry import STAGES, build, find_class, parameters
+from framework.registry import GROUPS, build, find_class, parameters
 
 
 class OptionContract:
@@ -19,10 +19,10 @@ class OptionContract:
     overrides: tuple[str, ...] = ()  # what only a user knows: ("detector.weights=FILE",)
 
     def plugin(self) -> Any:
-        return build(STAGES[self.stage], self.node())
+        return build(GROUPS[self.stage], self.node())
 
     def node(self) -> DictConfig:
-        others = [f"~{stage}" for stage in STAGES if stage != self.stage]
+        others = [f"~{stage}" for stage in GROUPS if stage != self.stage]
         node: DictConfig = composed(f"{self.stage}={self.option}", *others, *self.overrides)[self.stage]
         return node
 
@@ -37,7 +37,7 @@ class OptionContract:
 
     def test_values_in_the_yaml_are_the_defaults_of_the_class(self) -> None:
         node = self.node()
-        plugin_class = find_class(STAGES[self.stage], str(node["_target_"]))
+        plugin_class = find_class(GROUPS[self.stage], str(node["_target_"]))
         of_the_user = [override.partition("=")[0].partition(".")[2] for override in self.overrides]
         bare = OmegaConf.masked_copy(node, ["_target_", *of_the_user])
         given, default = (parameters(self.option, plugin_class, of) for of in (node, bare))

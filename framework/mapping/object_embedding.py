@@ -110,7 +110,8 @@ def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, d
         raise DataError(f"embedding_weights must be in (0, {MOST_WEIGHT:g}], found {weights.min()} to {weights.max()}")
     if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
         raise DataError(f"embedding_counts must be at least 1, found {counts.min()}")
-    lengths = np.linalg.norm(sums / weights[:, None], axis=1)
+    with np.errstate(over="ignore"):  # of what cannot be
+        lengths = np.linalg.norm(sums / weights[:, None], axis=1)
     if n and lengths.max() > 1 + 1e-3:
         raise DataError(f"embedding_sums must be no longer than their weights, found {lengths.max():.4g} of one")
     return space, {

@@ -113,8 +113,10 @@ class Background:
             self._draw()
         except Exception as error:
             self._give_up(error)
-        finally:
+        try:
             self._drawing.close()
+        except Exception as error:  # a disk that is full says so when the file is closed
+            self._give_up(error)
 
     def _draw(self) -> None:
         with self._lock:
@@ -129,7 +131,8 @@ class Background:
 
     def _give_up(self, error: Exception) -> None:
         """A run goes on whatever becomes of its viewer."""
-        log.warning("viewer: it failed, and the run goes on without it: %s", in_one_line(error))
+        if not self._failed:
+            log.warning("viewer: it failed, and the run goes on without it: %s", in_one_line(error))
         with self._lock:
             self._failed = True
             self._notes, self._faults, self._picture, self._snapshot = [], [], None, None

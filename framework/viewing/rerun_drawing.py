@@ -93,8 +93,10 @@ class RerunDrawing:
         self._draw_boxes(members, {key: shown[key][1] for key in members}, snapshot)
 
     def close(self) -> None:
-        self._recording.flush()
-        self._recording.disconnect()
+        try:
+            self._recording.flush()
+        finally:
+            self._recording.disconnect()
 
     def _set_time(self, index: int, timestamp: float) -> None:
         self._recording.set_time(at.FRAME, sequence=index)

@@ -21,7 +21,8 @@ from framework.errors import ConfigError, in_one_line
 from framework.interfaces import SceneMap, Viewer
 from framework.parameters import check_bounds, require
 from framework.viewing.background import Background
-from framework.viewing.sealed_page import HERE, SealedPage
+from framework.viewing.rerun_program import HERE, open_window
+from framework.viewing.sealed_page import SealedPage
 
 log = logging.getLogger(__name__)
 
@@ -110,7 +111,7 @@ class RerunViewer(Viewer):
             sinks.append(_open_window(rr, self.port, self.memory_limit))
         if self.mode is Mode.BROWSER:
             sinks.append(_server(rr, self.port, self.memory_limit))
-            with _faults(f"port {self.web_port} cannot be had: set viewer.web_port"):
+            with _faults(f"the page cannot be served on port {self.web_port} (viewer.web_port)"):
                 self._page = SealedPage(self.web_port, self.port)
             log.info("viewer: %s until the run ends", self._page.url)
         return sinks
@@ -133,13 +134,10 @@ def _server(rr: Any, port: int, memory_limit: str) -> Any:
 
 
 def _open_window(rr: Any, port: int, memory_limit: str) -> Any:
-    """Opens rerun's viewer, unless one is there. It sends no statistics of its use to its makers."""
     if sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigError("mode WINDOW needs a screen, and there is none: viewer.mode=BROWSER or RECORD")
     with _faults("rerun's viewer cannot be started"):
-        off = [sys.executable, "-m", "rerun", "analytics", "disable"]
-        subprocess.run(off, check=True, capture_output=True, timeout=60)
-        rr.spawn(port=port, connect=False, memory_limit=memory_limit, hide_welcome_screen=True)
+        open_window(port, memory_limit)
     return rr.GrpcSink(f"rerun+http://{HERE}:{port}/proxy")
 
 

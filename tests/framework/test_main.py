@@ -94,6 +94,14 @@ def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> No
         assert f"frame skipped: {tmp_path}/color/\\udcff_0.png is neither a JPEG nor a PNG file" in said
 
 
+def test_a_working_folder_that_is_gone_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "gone").mkdir()
+    monkeypatch.chdir(tmp_path / "gone")
+    (tmp_path / "gone").rmdir()
+    with pytest.raises(SystemExit, match=r"^error: the working folder has been removed; change to another one$"):
+        leave_working_folder([])
+
+
 @pytest.mark.parametrize(("options", "at"), [([], None), (["--config-dir", "conf"], -1), (["-cd=conf"], -1)])
 def test_modules_are_not_looked_for_in_the_working_folder(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

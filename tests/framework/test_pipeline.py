@@ -428,6 +428,26 @@ def test_a_viewer_hears_of_the_end_however_it_comes(room: CornerRoom, stages: di
     assert listener.heard.count("end") == 1
 
 
+@AHEAD
+@pytest.mark.parametrize("verb", ["show", "skip", "end"])
+def test_a_viewer_that_fails_takes_nothing_from_the_run(
+    verb: str, ahead: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object) -> None:
+        calls.append(verb)
+        raise RuntimeError("no screen\nany more")
+
+    calls: list[str] = []
+    listener = Listener()
+    monkeypatch.setattr(listener, verb, fails)
+    result = pipeline(ahead, viewer=listener).run_to_any_end(CornerRoom(unreadable=1))
+    assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
+    told = [record.message for record in caplog.records if "viewer" in record.message]
+    assert told == ["viewer: it failed, and the run goes on without it: no screen any more"]
+    assert calls == [verb], "it is left alone"
+    assert verb == "end" or listener.heard[-1] == "end"
+
+
 def test_a_viewer_hears_of_the_end_of_what_cannot_be_mapped() -> None:
     listener = Listener()
     with pytest.raises(DataError):

@@ -61,6 +61,10 @@ def test_what_is_written_is_in_style(stage: str, name: str, tmp_path: Path) -> N
         ("x" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME} characters"),
         ("class", "means something else"),
         ("conf", "means something else"),
+        ("null", "NAME null is a value"),
+        ("nan", "NAME nan is a value"),
+        ("on", "NAME on is a value"),
+        ("config_error", "its class ConfigError would have the name of another"),
         ("cluster_refiner", "its class ClusterRefiner would have the name of another"),
     ],
 )

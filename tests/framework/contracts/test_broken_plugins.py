@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import threading
+from collections.abc import Callable
 from dataclasses import FrozenInstanceError, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,8 +19,9 @@ from framework.contracts.fuser import FuserContract
 from framework.contracts.option import OptionContract
 from framework.contracts.refiner import RefinerContract
 from framework.contracts.tracker import TrackerContract
+from framework.contracts.viewer import ViewerContract
 from framework.data import Detections, Frame, PointClusters, Pose
-from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap
+from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, Viewer
 from tests.scenes.corner_room import CornerRoom, GridFuser, SphereDetector
 
 
@@ -92,6 +96,50 @@ def test_a_broken_plugin_is_found(contract: type[Any], plugin: object, test: str
     tests.plugin = lambda: plugin
     with pytest.raises((AssertionError, FrozenInstanceError)):
         getattr(tests, test)()
+
+
+class Late(Viewer):
+    """Looks at the map when the call is over, and notes it in the working folder."""
+
+    def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
+        self.scene = scene
+
+    def show(self, *_: object) -> None:
+        looking = threading.Timer(0.0, self.scene.mesh)
+        self.scene.within_a_call.clear()  # type: ignore[attr-defined]
+        looking.start()
+        looking.join()
+        Path("note").touch()
+
+
+class Painting(Viewer):
+    """Paints into the frame."""
+
+    def show(self, frame: Frame, *_: object) -> None:
+        frame.color[0, 0] = 255 - frame.color[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("viewer", "test"),
+    [
+        (Painting(), ViewerContract.test_viewer_takes_all_that_happens_to_frames_and_changes_nothing),
+        (Late(), ViewerContract.test_viewer_reads_the_map_within_a_call_only),
+        (Late(), ViewerContract.test_viewer_leaves_its_files_in_the_runs_directory),
+    ],
+)
+def test_a_broken_viewer_is_found(
+    viewer: Viewer,
+    test: Callable[..., None],
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tests = ViewerContract()
+    tests.plugin = lambda: viewer  # type: ignore[method-assign]
+    fixtures = [name for name in inspect.signature(test).parameters if name != "self"]
+    with pytest.raises(AssertionError):
+        test(tests, *map(request.getfixturevalue, fixtures))
 
 
 def option(folder: Path, text: str) -> OptionContract:

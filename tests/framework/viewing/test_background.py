@@ -26,6 +26,7 @@ class Notebook:
 
     waits_for: threading.Event | None = None
     fails: bool = False
+    fails_to_close: bool = False
     notes: list[FrameNote] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
@@ -48,6 +49,8 @@ class Notebook:
 
     def close(self) -> None:
         self.closed = True
+        if self.fails_to_close:
+            raise RuntimeError("the writer's thread has ended")
 
 
 def mapped(room: CornerRoom) -> GridMap:
@@ -112,6 +115,17 @@ def test_a_drawing_that_fails_is_told_once_and_ends_nothing(room: CornerRoom, ca
     told = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
     assert told == ["viewer: it failed, and the run goes on without it: [Errno 28] No space left on device"]
     assert book.closed
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_drawing_that_cannot_be_closed_is_told_once(
+    fails: bool, room: CornerRoom, caplog: pytest.LogCaptureFixture
+) -> None:
+    background = Background(mapped(room), Notebook(fails=fails, fails_to_close=True), every=1, map_every=3600)
+    background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
+    background.end()
+    [told] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert ("No space left" if fails else "the writer's thread has ended") in told
 
 
 def test_a_map_that_cannot_be_shown_ends_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:

@@ -13,6 +13,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 from urllib.request import urlopen
 
 import numpy as np
@@ -24,7 +25,8 @@ from framework.errors import ConfigError, FrameError
 from framework.interfaces import SceneMap
 from framework.pipeline import Pipeline
 from framework.registry import assemble
-from framework.viewing.sealed_page import free_port
+from framework.viewing import rerun_program
+from framework.viewing.rerun_program import free_port
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.viewers.rerun import Mode, RerunViewer
 from tests import registered
@@ -265,11 +267,55 @@ def test_a_port_that_is_taken_is_one_line(tmp_path: Path) -> None:
             begun(RerunViewer(mode=Mode.BROWSER, port=port), tmp_path)
 
 
+def listening() -> set[str]:
+    """ADDRESS:PORT, in /proc's hexadecimal, where this process waits for calls."""
+    own = {str(file.readlink()) for file in list(Path("/proc/self/fd").iterdir()) if file.is_symlink()}
+    lines = [line.split() for table in ("tcp", "tcp6") for line in Path("/proc/net", table).read_text().splitlines()]
+    return {line[1] for line in lines if line[3] == "0A" and f"socket:[{line[9]}]" in own}
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="who listens is in /proc")
+def test_a_browser_is_served_on_this_machine_alone(tmp_path: Path) -> None:
+    viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port())
+    begun(viewer, tmp_path)
+    served = {address.partition(":")[2]: address.partition(":")[0] for address in listening()}
+    viewer.end()
+    assert {served.pop(f"{port:04X}") for port in (viewer.port, viewer.web_port)} == {"0100007F"}
+    assert not {host for host in served.values() if not host.endswith("7F")}, "nothing else is open"
+
+
+def test_a_window_is_opened_for_this_machine_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By a program in rerun's place that notes how it was called, and listens for a while."""
+    program, port = tmp_path / "rerun", free_port()
+    program.write_text(
+        f"""#!{sys.executable}
+import socket, sys, time
+open({str(tmp_path / "calls")!r}, "a").write(" ".join(sys.argv[1:]) + "\\n")
+if "--port" in sys.argv:
+    with socket.create_server(("127.0.0.1", {port})):
+        time.sleep(3)
+"""
+    )
+    program.chmod(0o755)
+    monkeypatch.setattr(rerun_program, "program", lambda: str(program))
+    for _ in range(2):  # the second time one is there
+        rerun_program.open_window(port, "1GB")
+    disabled, opened, *others = (tmp_path / "calls").read_text().splitlines()
+    assert disabled == "analytics disable"
+    assert f"--bind 127.0.0.1 --port {port} --memory-limit 1GB" in opened
+    assert others == [disabled]
+    program.write_text("#!/bin/sh\n[ $1 = analytics ]\n")
+    with pytest.raises(OSError, match="it ended with status 1"):
+        rerun_program.open_window(free_port(), "1GB")
+
+
 def test_a_browser_gets_a_page_that_may_talk_to_nobody_else(tmp_path: Path) -> None:
     viewer = RerunViewer(mode=Mode.BROWSER, port=free_port(), web_port=free_port(), file="also.rrd")
     begun(viewer, tmp_path)
-    with urlopen(f"http://127.0.0.1:{viewer.web_port}/", timeout=30) as page:
+    with urlopen(f"http://127.0.0.1:{viewer.web_port}/?url=data", timeout=30) as page:
         text, policy = page.read().decode(), page.headers["Content-Security-Policy"]
+    with pytest.raises(HTTPError, match="404"):
+        urlopen(f"http://127.0.0.1:{viewer.web_port}/../../etc/passwd", timeout=30)
     viewer.end()
     assert "<html" in text
     sources = {word for word in policy.replace(";", " ").split() if word.startswith("http")}
