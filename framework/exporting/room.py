@@ -50,9 +50,8 @@ class RoomObject:
 
     @property
     def name(self) -> str:
-        """`chair_7`: letters of ASCII, digits and underscores, so that it may name a file, a node or a prim."""
-        plain = re.sub(r"[^A-Za-z0-9]+", "_", self.class_name).strip("_")[:LONGEST_NAME]
-        return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{self.id}"
+        """`chair_7`, each object another one."""
+        return plain_name(self.class_name, self.id)
 
     @property
     def footprint(self) -> Float64:
@@ -108,6 +107,12 @@ class Room:
                 raise DataError(f"no {word!r} has a confidence of {min_confidence:g}; the highest is {best:.2f}")
             found |= {one.id: one for one in (*by_id, *of_class)}
         return replace(self, objects=tuple(found[key] for key in sorted(found)))
+
+
+def plain_name(class_name: str, key: int) -> str:
+    """`chair_7`: letters of ASCII, digits and underscores, so that it may name a file, a node or a prim."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", class_name).strip("_")[:LONGEST_NAME]
+    return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{key}"
 
 
 def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> Room:

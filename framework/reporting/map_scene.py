@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import base64
 import gzip
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, Float64, Int32, UInt8
+from framework.data import Camera, Float64, InstanceMesh, Int32, UInt8
+from framework.exporting.decimation import with_finer_objects
 from framework.records.run_record import LIKELY
 from framework.rendering.palette import instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
-from framework.reporting.decimation import LightMesh, decimated
 from framework.reporting.footage import Footage
 from framework.reporting.run_contents import MappedObject, RunContents
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
@@ -30,8 +30,8 @@ class MapScene:
     """What the viewer shows of one run."""
 
     contents: RunContents
-    mesh: LightMesh
-    surface: Surface  # the same, wound so that it shows its front to where the camera was
+    mesh: InstanceMesh  # light, wound so that it shows its front to where the camera was
+    surface: Surface  # the same
     sightings: Sightings
     up: Float64  # (3,)
 
@@ -40,12 +40,13 @@ class MapScene:
         """None where nothing was mapped. `share` of the triangles and bytes that a file may have is for this one."""
         if contents.mesh is None or not len(contents.poses):
             return None
-        mesh = decimated(contents.mesh, contents.instance_ids(contents.mesh), max(1, int(share * MOST_TRIANGLES)))
+        mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
+        mesh = with_finer_objects(mesh, int(share * MOST_TRIANGLES))
         mesh = light_enough(mesh, int(share * MOST_BYTES))
         if not len(mesh.triangles):
             return None
         surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.poses)
-        mesh = LightMesh(surface.vertices, surface.triangles, mesh.colors, mesh.instance_ids)
+        mesh = replace(mesh, triangles=surface.triangles)
         up = contents.up if contents.up is not None else upward(contents.poses, surface)
         seen = sightings(mesh, mesh.instance_ids, contents.poses, footage.camera, footage.clarity)
         return cls(contents, mesh, surface, seen, up)
@@ -54,7 +55,7 @@ class MapScene:
         """The map as GLB, compressed by gzip, in base64: the same for the same record."""
         steps = max(1, len(self.sightings.chosen))
         names = {one.id: one.class_name for one in self.contents.objects}
-        content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names)
+        content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names, self.up)
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
     @property
