@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from framework.commands.command_line import arguments, one_line_errors
 from framework.errors import DataError
-from framework.files.whole_files import written_whole
+from framework.files.whole_files import check_regular, written_whole
 from framework.records.stored_runs import REPORT
 
 COMPARISON = "comparison.html"
@@ -48,8 +48,10 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
     from framework.reporting.run_page import RunReport
 
     places = [directory.resolve() for directory in directories]
-    if len(set(places)) < len(places):
-        raise DataError(f"{directories[0]}: each run is to be named once")
+    if again := [place for k, place in enumerate(places) if place in places[:k]]:
+        raise DataError(f"{again[0]}: each run is to be named once")
+    if out is not None:
+        _check_place(out)  # before the maps are looked at, which takes a while
     runs = [RunContents.read(directory) for directory in directories]
     if len(runs) == 1:
         path = out or directories[0] / REPORT
@@ -64,8 +66,13 @@ def write_reports(directories: Sequence[Path], out: Path | None = None) -> list[
     return [*pages, path]
 
 
-def _write(path: Path, page: str) -> None:
+def _check_place(path: Path) -> None:
     if not path.parent.is_dir():
         raise DataError(f"{path} could not be written: its folder does not exist")
+    if path.exists():
+        check_regular(path)
+
+
+def _write(path: Path, page: str) -> None:
     with written_whole(path) as temporary:
         temporary.write_text(page, encoding="utf-8", errors="backslashreplace")  # names may be no text

@@ -9,7 +9,6 @@ import numpy as np
 
 from framework.data import Float32, UInt8
 from framework.exporting.object_meshes import Part
-from framework.rendering.palette import instance_colors
 
 GREY = (176, 176, 172)  # of what is no object, where colours tell objects or classes
 
@@ -26,19 +25,13 @@ def part_colors(parts: Sequence[Part], coloring: Coloring) -> list[UInt8]:
     """For each part the colours (V, 3) of its vertices, sRGB."""
     if coloring is Coloring.APPEARANCE:
         return [part.mesh.colors for part in parts]
-    objects = [part.object for part in parts if part.object is not None]
-    if coloring is Coloring.INSTANCE:
-        centers = np.array([one.box.center for one in objects]).reshape(-1, 3)
-        chosen = {one.id: color for one, color in zip(objects, instance_colors(centers), strict=True)}
-    else:
-        names = sorted({one.class_name for one in objects})
-        # all in one place: each is to differ from all others
-        of_class = dict(zip(names, instance_colors(np.zeros((len(names), 3))), strict=True))
-        chosen = {one.id: of_class[one.class_name] for one in objects}
     grey = np.array(GREY, np.uint8)
-    return [
-        np.tile(grey if part.object is None else chosen[part.object.id], (len(part.mesh.vertices), 1)) for part in parts
-    ]
+    found = []
+    for part in parts:
+        one = part.object
+        own = grey if one is None else one.color if coloring is Coloring.INSTANCE else one.class_color
+        found.append(np.tile(own, (len(part.mesh.vertices), 1)))
+    return found
 
 
 def linear(colors: UInt8) -> Float32:

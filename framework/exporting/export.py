@@ -23,10 +23,9 @@ from framework.exporting.scene_graph import write_scene_graph
 from framework.exporting.usd import Collision, check_usd, write_usd
 from framework.files.whole_files import written_whole
 from framework.parameters import require
+from framework.records.run_record import LIKELY
 
 log = logging.getLogger(__name__)
-
-LIKELY = 0.3  # confidence from which on an object is exported, as pictures show it
 
 
 class Format(Enum):
@@ -49,7 +48,7 @@ class Chosen:
     """What of a room is exported, and how."""
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
-    min_confidence: float = LIKELY  # in [0, 1]
+    min_confidence: float = LIKELY  # in [0, 1]; LIKELY = what pictures show
     triangles: int | None = None  # >= 4, of the scene and of each object's own file; None = as many as there are
     coloring: Coloring = Coloring.APPEARANCE
     collision: Collision = Collision.HULL

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ from framework.exporting.geojson import outline
 from framework.exporting.occupancy import Plan
 from framework.exporting.room import Room, RoomObject
 from framework.files.whole_files import written_whole
-from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
+from framework.rendering.palette import FAINT_INK, INK, PAPER
 
 UNSEEN, FLOOR, FREE, OCCUPIED, WALL = (214, 216, 218), (240, 232, 206), PAPER, (150, 154, 160), INK
 TONES = {
@@ -76,23 +76,21 @@ def _drawn(room: Room, plan: Plan, robot_height: float) -> Figure:
     axes.set_yticks([])
     for side in axes.spines.values():
         side.set_visible(False)
-    centers = np.array([one.box.center for one in room.objects]).reshape(-1, 3)
-    colors = {one.id: color for one, color in zip(room.objects, instance_colors(centers), strict=True)}
     image = tones(plan)
-    for key, color in colors.items():
-        image[plan.highest == key] = (1 - TINT) * np.array(PAPER) + TINT * color
+    for one in room.objects:
+        image[plan.highest == one.id] = (1 - TINT) * np.array(PAPER) + TINT * one.color
     axes.imshow(image, origin="lower", extent=plan.extent, interpolation="nearest")
-    _draw_outlines(axes, room, colors)
+    _draw_outlines(axes, room)
     _draw_names(axes, room.objects)
     _draw_bar(axes)
     _draw_foot(figure, page, plan, robot_height)
     return figure
 
 
-def _draw_outlines(axes: Axes, room: Room, colors: Mapping[int, UInt8]) -> None:
+def _draw_outlines(axes: Axes, room: Room) -> None:
     """The hulls of the objects, the low ones first, so that what stands on another is seen."""
     for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
-        dark = _share([round(DARKER * channel) for channel in colors[one.id].tolist()])
+        dark = _share([round(DARKER * channel) for channel in one.color.tolist()])
         axes.add_patch(Polygon(outline(room, one), fill=False, edgecolor=dark, linewidth=1.0, joinstyle="round"))
 
 

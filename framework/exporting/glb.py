@@ -6,16 +6,16 @@ objects or classes are lit. The rest of the room shows its front only, so that o
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import trimesh
 
-from framework.data import Float32, UInt8, UInt16
+from framework.data import Float32, Float64, Int32, UInt8, UInt16
 from framework.exporting.coloring import Coloring, linear, part_colors
-from framework.exporting.object_meshes import Part, parts
-from framework.exporting.room import Room
+from framework.exporting.object_meshes import Part
 from framework.rendering.surface import Surface
 
 T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
@@ -24,37 +24,54 @@ UNLIT = "KHR_materials_unlit"
 UNSIGNED_SHORT = 5123
 
 
-def room_glb(room: Room, coloring: Coloring = Coloring.APPEARANCE, triangles: int | None = None) -> bytes:
-    """A room and its objects as one GLB file, with about so many triangles, None = as many as there are."""
-    return glb(parts(room, triangles), coloring)
+@dataclass(frozen=True)
+class Node:
+    """A named surface of V vertices and F triangles; without triangles it is a node without a mesh."""
+
+    name: str  # each another one
+    vertices: Float32  # (V, 3) m, in the node's frame
+    triangles: Int32  # (F, 3)
+    colors: UInt8  # (V, 3) sRGB
+    T_gltf_node: Float64  # (4, 4)
+    one_sided: bool  # seen from its front only
+    extras: Mapping[str, Any]
+    attributes: Mapping[str, Float32] = field(default_factory=dict)  # (V,) by name, which begins with _
 
 
 def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> bytes:
-    """Parts of a room as a GLB file, each where it stands in the room. The same parts give the same bytes.
+    """Parts of a room as a GLB file, each where it stands in the room. The same parts give the same bytes."""
+    return glb_of(
+        [_node(part, colors) for part, colors in zip(shown, part_colors(shown, coloring), strict=True)],
+        lit=coloring is not Coloring.APPEARANCE,
+    )
 
-    A part without triangles is a node without a mesh.
-    """
-    lit = coloring is not Coloring.APPEARANCE
+
+def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
+    """Nodes as a GLB file; the same nodes give the same bytes. Light falls on them where they are `lit`."""
     scene = trimesh.Scene(base_frame="world")
-    for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
-        T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
-        if not len(part.mesh.triangles):
-            scene.graph.update(part.name, matrix=T_gltf_part, metadata=extras(part))
+    for node in nodes:
+        extras = dict(node.extras)
+        if not len(node.triangles):
+            scene.graph.update(node.name, matrix=node.T_gltf_node, metadata=extras)
             continue
-        turned = Surface(part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T, part.mesh.triangles)
+        attributes: dict[str, Any] = {COLOR: _shorts(node.colors), **node.attributes}
+        normals = _unit(Surface(node.vertices, node.triangles).vertex_normals) if lit else None
         mesh = trimesh.Trimesh(
-            turned.vertices,
-            turned.triangles,
-            vertex_normals=_unit(turned.vertex_normals) if lit else None,
-            vertex_attributes={COLOR: _shorts(colors)},
-            process=False,
+            node.vertices, node.triangles, vertex_normals=normals, vertex_attributes=attributes, process=False
         )
-        scene.add_geometry(mesh, part.name, part.name, transform=T_gltf_part, metadata=extras(part))
+        scene.add_geometry(mesh, node.name, node.name, transform=node.T_gltf_node, metadata=extras)
 
     def finish(tree: dict[str, Any]) -> None:
-        _with_materials(tree, lit, {part.name for part in shown if part.object is None})
+        _with_materials(tree, lit, {node.name for node in nodes if node.one_sided})
 
     return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=lit, tree_postprocessor=finish))
+
+
+def _node(part: Part, colors: UInt8) -> Node:
+    """A part with y up in its own frame, too, as who loads an object by itself expects it."""
+    vertices = (part.mesh.vertices @ T_GLTF_ROOM[:3, :3].T).astype(np.float32)
+    T_gltf_part = T_GLTF_ROOM @ part.T_room_part @ T_GLTF_ROOM.T
+    return Node(part.name, vertices, part.mesh.triangles, colors, T_gltf_part, part.object is None, extras(part))
 
 
 def extras(part: Part) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import trimesh
 from framework.data import InstanceMesh
 from framework.exporting.coloring import Coloring, part_colors
 from framework.exporting.object_meshes import Part
+from framework.exporting.submeshes import joined
 from framework.files.whole_files import written_whole
 from framework.geometry import transform
 from framework.records.mesh_file import write_mesh
@@ -24,7 +25,7 @@ def write_parts_ply(path: Path, parts: Sequence[Part], coloring: Coloring = Colo
     meshes = [
         replace(_placed(part), colors=colors) for part, colors in zip(parts, part_colors(parts, coloring), strict=True)
     ]
-    write_mesh(path, _together(meshes))
+    write_mesh(path, joined(meshes))
 
 
 def write_parts_obj(path: Path, parts: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> None:
@@ -48,18 +49,3 @@ def _placed(part: Part) -> InstanceMesh:
     """A part's mesh where it stands in the room."""
     vertices = transform(part.T_room_part, part.mesh.vertices.astype(np.float64))
     return replace(part.mesh, vertices=vertices.astype(np.float32))
-
-
-def _together(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
-    """Meshes of one map, at least one, as one."""
-    offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
-    return InstanceMesh(
-        np.concatenate([mesh.vertices for mesh in meshes]),
-        np.concatenate([mesh.triangles + offset for mesh, offset in zip(meshes, offsets, strict=False)]).astype(
-            np.int32
-        ),
-        np.concatenate([mesh.colors for mesh in meshes]),
-        np.concatenate([mesh.instance_ids for mesh in meshes]),
-        np.concatenate([mesh.class_ids for mesh in meshes]),
-        meshes[0].classes,
-    )

@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from framework.data import Bool, Float64, InstanceMesh
+from framework.data import Float64, InstanceMesh
 from framework.exporting.decimation import decimated
 from framework.exporting.room import Room, RoomObject
+from framework.exporting.submeshes import corners_of, submesh
 from framework.geometry import inverse, transform
 
 REST = "room"  # the name of what is of no object
@@ -51,7 +52,7 @@ def object_part(room: Room, one: RoomObject) -> Part:
     T_room_part = np.eye(4)
     T_room_part[:3, :3] = one.box.rotation
     T_room_part[:3, 3] = one.box.center - (0.0, 0.0, one.box.extent[2] / 2)
-    mesh = _submesh(room.mesh, _marked(room.mesh, [one]).astype(np.bool_))
+    mesh = submesh(room.mesh, _marked(room.mesh, [one]).astype(np.bool_))
     placed = transform(inverse(T_room_part), mesh.vertices.astype(np.float64)).astype(np.float32)
     return Part(replace(mesh, vertices=placed), T_room_part, one)
 
@@ -61,9 +62,7 @@ def rest(room: Room) -> Part:
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]
     outside = (corners[:, 0] == 0) | (corners != corners[:, :1]).any(axis=1)
-    used = np.zeros(len(owner), np.bool_)
-    used[room.mesh.triangles[outside]] = True
-    return Part(_submesh(room.mesh, used | (owner == 0), outside), np.eye(4), None)
+    return Part(submesh(room.mesh, corners_of(room.mesh, outside) | (owner == 0), outside), np.eye(4), None)
 
 
 def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
@@ -72,20 +71,6 @@ def _marked(mesh: InstanceMesh, objects: Sequence[RoomObject]) -> np.ndarray:
     for number, one in enumerate(objects, start=1):
         owner[one.vertices] = number
     return owner
-
-
-def _submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
-    """The vertices (V,) that are kept, and of the triangles (F,), None = all, those between them."""
-    number = np.cumsum(kept, dtype=np.int32) - 1
-    chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
-    return InstanceMesh(
-        mesh.vertices[kept],
-        number[mesh.triangles[chosen]].astype(np.int32),
-        mesh.colors[kept],
-        mesh.instance_ids[kept],
-        mesh.class_ids[kept],
-        mesh.classes,
-    )
 
 
 def _with_fewer(found: list[Part], triangles: int | None) -> list[Part]:

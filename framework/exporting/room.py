@@ -18,7 +18,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from framework.data import Box, Float64, InstanceMesh, Int32
+from framework.data import Box, Float64, InstanceMesh, Int32, UInt8
 from framework.errors import DataError
 from framework.files.tum_trajectory import read_tum
 from framework.files.whole_files import is_there
@@ -26,8 +26,10 @@ from framework.geometry import skew, transform
 from framework.mapping.instance_list import upright_box
 from framework.records.instances_file import StoredInstance
 from framework.records.mesh_file import read_mesh
+from framework.records.run_record import LIKELY
 from framework.records.stored_map import read_labeled_mesh
 from framework.records.stored_runs import INSTANCES, MESH, TRAJECTORY, read_figures
+from framework.rendering.palette import class_colors, object_colors
 from framework.rendering.surface import Surface
 
 LONGEST_NAME = 60  # characters of a class, in the names of files and of nodes
@@ -47,12 +49,13 @@ class RoomObject:
     probability: float | None  # of its class, in [0, 1]; None = the record does not tell
     vertices: Int32  # (M,) of the room's mesh, M > 0, without specks
     box: Box  # upright, in the room
+    color: UInt8  # (3,) sRGB, of its own: that of overview.png
+    class_color: UInt8  # (3,) sRGB, of all objects of its class
 
     @property
     def name(self) -> str:
-        """`chair_7`: letters of ASCII, digits and underscores, so that it may name a file, a node or a prim."""
-        plain = re.sub(r"[^A-Za-z0-9]+", "_", self.class_name).strip("_")[:LONGEST_NAME]
-        return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{self.id}"
+        """`chair_7`, each object another one."""
+        return plain_name(self.class_name, self.id)
 
     @property
     def footprint(self) -> Float64:
@@ -110,6 +113,12 @@ class Room:
         return replace(self, objects=tuple(found[key] for key in sorted(found)))
 
 
+def plain_name(class_name: str, key: int) -> str:
+    """`chair_7`: letters of ASCII, digits and underscores, so that it may name a file, a node or a prim."""
+    plain = re.sub(r"[^A-Za-z0-9]+", "_", class_name).strip("_")[:LONGEST_NAME]
+    return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{key}"
+
+
 def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> Room:
     """The room of a run, whole or partial; `up` (3,) and `floor` (m along up) say what its record does not tell.
 
@@ -141,14 +150,30 @@ def objects_of(mesh: InstanceMesh, instances: Sequence[StoredInstance]) -> tuple
     pieces = _pieces(mesh)
     order = np.argsort(mesh.instance_ids, kind="stable").astype(np.int32)
     ids = mesh.instance_ids[order]
+    owned = {
+        one.id: order[np.searchsorted(ids, one.id) : np.searchsorted(ids, one.id, side="right")] for one in instances
+    }
+    seen = sorted((one for one in instances if len(owned[one.id])), key=lambda one: one.id)
+    likely = {one.id for one in seen if one.confidence >= LIKELY}
+    colors = object_colors({one.id: mesh.vertices[owned[one.id]].mean(axis=0) for one in seen}, likely)
+    of_class = class_colors([(one.class_name, one.confidence) for one in seen])
     found = []
-    for one in sorted(instances, key=lambda one: one.id):
-        own = order[np.searchsorted(ids, one.id) : np.searchsorted(ids, one.id, side="right")]
-        if len(own):
-            _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
-            own = own[(sizes >= min(SPECK * len(own), sizes.max()))[piece]]
-            box = facing(upright_box(mesh.vertices[own], UP))
-            found.append(RoomObject(one.id, one.class_name, one.confidence, one.probability, own, box))
+    for one in seen:
+        own = owned[one.id]
+        _, piece, sizes = np.unique(pieces[own], return_inverse=True, return_counts=True)
+        own = own[(sizes >= min(SPECK * len(own), sizes.max()))[piece]]
+        found.append(
+            RoomObject(
+                id=one.id,
+                class_name=one.class_name.encode(errors="backslashreplace").decode(),  # it may be no text
+                confidence=one.confidence,
+                probability=one.probability,
+                vertices=own,
+                box=facing(upright_box(mesh.vertices[own], UP)),
+                color=colors[one.id],
+                class_color=of_class[one.class_name],
+            )
+        )
     return tuple(found)
 
 

@@ -27,7 +27,7 @@ from framework.exporting.object_meshes import Part
 from framework.files.whole_files import written_whole
 
 MISSING = "USD files need the package usd-core: pip install instancemap[usd]"
-NOT_WRITTEN = "USD could not; the disk may be full"
+NOT_WRITTEN = "USD could not write it"
 THINNEST = 0.002  # m, of a box that things collide with: what was seen from one side may be flat
 GRAVITY = 9.81  # m/s^2
 

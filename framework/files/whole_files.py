@@ -7,7 +7,7 @@ import re
 import secrets
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from framework.errors import DataError
@@ -38,7 +38,8 @@ def written_whole(path: Path) -> Iterator[Path]:
         why = error.strerror or f"{error}; the disk may be full"  # NumPy only counts what it could write
         raise DataError(f"{path} could not be written: {why}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # where nothing can be written, nothing can be removed either
+            temporary.unlink(missing_ok=True)
 
 
 def is_there(path: Path) -> bool:

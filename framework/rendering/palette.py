@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence, Set
 
 import cv2
 import numpy as np
@@ -36,3 +36,20 @@ def instance_colors(centroids: Float64, shades: Sequence[tuple[int, int]] = CLEA
         clash = nearness[k, :k] @ likeness[chosen[:k]] if k else np.zeros(len(rgb))
         chosen[k] = int(np.argmin(clash))
     return np.asarray(rgb[chosen])
+
+
+def object_colors(centroids: Mapping[int, Float64], likely: Set[int]) -> dict[int, UInt8]:
+    """RGB (3,) by id of objects at centroids (3,) m: those of overview.png, which has the likely ones, then others."""
+    ordered = sorted(centroids, key=lambda key: (key not in likely, key))
+    places = np.array([centroids[key] for key in ordered], np.float64).reshape(-1, 3)
+    return dict(zip(ordered, instance_colors(places), strict=True))
+
+
+def class_colors(objects: Sequence[tuple[str, float]]) -> dict[str, UInt8]:
+    """RGB (3,) by class of objects of a class and a confidence; those of the likeliest are least like each other."""
+    most: dict[str, float] = {}
+    for name, confidence in objects:
+        most[name] = max(confidence, most.get(name, 0.0))
+    names = sorted(most, key=lambda name: (-most[name], name))
+    # all in one place: each is to differ from all others
+    return dict(zip(names, instance_colors(np.zeros((len(names), 3))), strict=True))

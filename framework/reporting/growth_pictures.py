@@ -8,7 +8,7 @@ from PIL import Image
 
 from framework.rendering.lit_view import LitView
 from framework.rendering.surface import Surface
-from framework.reporting.map_scene import MapScene, likely_ids, object_colors
+from framework.reporting.map_scene import MapScene, colors_by_id, likely_ids
 from framework.reporting.pictures import webp_url
 
 PARTS = 4  # pictures, equally many frames apart; the last one shows the whole map
@@ -32,7 +32,7 @@ def growth_pictures(scene: MapScene) -> list[GrowthPicture]:
         return []
     numbers = scene.contents.tracked_frames or tuple(range(len(scene.contents.poses)))
     camera, T_world_camera = scene.view
-    color_of = object_colors(scene.contents.objects)
+    color_of = colors_by_id(scene.contents.objects)
     colors = {place: color_of[key] for place, key in enumerate(likely_ids(scene.contents), start=1)}
     labels, growth = scene.likely_labels, scene.sightings.growth
     found = []

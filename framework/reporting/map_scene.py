@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import base64
 import gzip
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 
-from framework.data import Camera, Float64, Int32, UInt8
+from framework.data import Camera, Float64, InstanceMesh, Int32, UInt8
+from framework.exporting.decimation import with_finer_objects
 from framework.records.run_record import LIKELY
-from framework.rendering.palette import instance_colors
+from framework.rendering.palette import class_colors, object_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
-from framework.reporting.decimation import LightMesh, decimated
 from framework.reporting.footage import Footage
 from framework.reporting.run_contents import MappedObject, RunContents
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
@@ -30,8 +30,8 @@ class MapScene:
     """What the viewer shows of one run."""
 
     contents: RunContents
-    mesh: LightMesh
-    surface: Surface  # the same, wound so that it shows its front to where the camera was
+    mesh: InstanceMesh  # light, wound so that it shows its front to where the camera was
+    surface: Surface  # the same
     sightings: Sightings
     up: Float64  # (3,)
 
@@ -40,12 +40,13 @@ class MapScene:
         """None where nothing was mapped. `share` of the triangles and bytes that a file may have is for this one."""
         if contents.mesh is None or not len(contents.poses):
             return None
-        mesh = decimated(contents.mesh, contents.instance_ids(contents.mesh), max(1, int(share * MOST_TRIANGLES)))
+        mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
+        mesh = with_finer_objects(mesh, int(share * MOST_TRIANGLES))
         mesh = light_enough(mesh, int(share * MOST_BYTES))
         if not len(mesh.triangles):
             return None
         surface = Surface.seen_from(mesh.vertices, mesh.triangles, contents.poses)
-        mesh = LightMesh(surface.vertices, surface.triangles, mesh.colors, mesh.instance_ids)
+        mesh = replace(mesh, triangles=surface.triangles)
         up = contents.up if contents.up is not None else upward(contents.poses, surface)
         seen = sightings(mesh, mesh.instance_ids, contents.poses, footage.camera, footage.clarity)
         return cls(contents, mesh, surface, seen, up)
@@ -54,7 +55,7 @@ class MapScene:
         """The map as GLB, compressed by gzip, in base64: the same for the same record."""
         steps = max(1, len(self.sightings.chosen))
         names = {one.id: one.class_name for one in self.contents.objects}
-        content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names)
+        content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names, self.up)
         return base64.b64encode(gzip.compress(content, 6, mtime=0)).decode()
 
     @property
@@ -76,7 +77,8 @@ class MapScene:
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
         distance = float(np.median((self.mesh.vertices - eye) @ forward))
         numbers = self.contents.tracked_frames or tuple(range(len(poses)))
-        colors, class_colors = object_colors(self.contents.objects), colors_of_classes(self.contents.objects)
+        objects = self.contents.objects
+        colors, of_class = colors_by_id(objects), class_colors([(one.class_name, one.confidence) for one in objects])
         return {
             "up": _rounded(self.up),
             "eye": _rounded(eye),
@@ -90,9 +92,9 @@ class MapScene:
                     "class": one.class_name,
                     "confidence": one.confidence,
                     "color": hex_color(colors[one.id]),
-                    "classColor": class_colors[one.class_name],
+                    "classColor": hex_color(of_class[one.class_name]),
                 }
-                for one in self.contents.objects
+                for one in objects
             ],
         }
 
@@ -102,22 +104,11 @@ def likely_ids(contents: RunContents) -> list[int]:
     return [one.id for one in contents.objects if one.confidence >= LIKELY]
 
 
-def object_colors(objects: tuple[MappedObject, ...]) -> dict[int, UInt8]:
-    """RGB (3,) by id: those of overview.png, then others for what is too unlikely to be there."""
-    ordered = sorted(objects, key=lambda one: (one.confidence < LIKELY, one.id))
-    places = {one.id: one.centroid for one in ordered if one.centroid is not None}
-    chosen = instance_colors(np.array(list(places.values()), np.float64).reshape(-1, 3))
-    colors = dict(zip(places, chosen, strict=True))
+def colors_by_id(objects: tuple[MappedObject, ...]) -> dict[int, UInt8]:
+    """RGB (3,) by id; grey for what has no place."""
+    places = {one.id: one.centroid for one in objects if one.centroid is not None}
+    colors = object_colors(places, {one.id for one in objects if one.confidence >= LIKELY})
     return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}
-
-
-def colors_of_classes(objects: tuple[MappedObject, ...]) -> dict[str, str]:
-    """#rrggbb by class; those of the likeliest objects are least like each other."""
-    most: dict[str, float] = {}
-    for one in objects:
-        most[one.class_name] = max(one.confidence, most.get(one.class_name, 0.0))
-    names = sorted(most, key=lambda name: (-most[name], name))
-    return dict(zip(names, map(hex_color, instance_colors(np.zeros((len(names), 3)))), strict=True))
 
 
 def hex_color(color: UInt8) -> str:

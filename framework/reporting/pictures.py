@@ -11,11 +11,10 @@ import cv2
 import numpy as np
 from PIL import Image
 
-from framework.data import Bool, Float64, Int32, UInt8
+from framework.data import Bool, Float64, InstanceMesh, Int32, UInt8
 from framework.rendering.lit_view import LitView
 from framework.rendering.rasterizer import Rasterizer
 from framework.rendering.surface import Surface
-from framework.reporting.decimation import LightMesh
 from framework.reporting.footage import Footage
 
 WIDTH, HEIGHT = 264, 198  # px; shown half as large, or full in the panel
@@ -37,7 +36,7 @@ class Picture:
 class Photographer:
     """Takes pictures of the objects of one map."""
 
-    def __init__(self, mesh: LightMesh, surface: Surface, poses: Float64, footage: Footage) -> None:
+    def __init__(self, mesh: InstanceMesh, surface: Surface, poses: Float64, footage: Footage) -> None:
         self._mesh, self._surface, self._poses, self._footage = mesh, surface, poses, footage
         self._camera = footage.camera
         self._rasterizer = Rasterizer(mesh.vertices, mesh.triangles)

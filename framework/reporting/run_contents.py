@@ -28,6 +28,7 @@ from framework.records.stored_runs import (
 )
 from framework.records.timings_file import StageTimes, read_timings
 
+FARTHEST = 1e6  # m, of places and sizes; mesh.ply has no finer steps than 6 cm there
 LIKELY_CLASSES = 6  # of an object's class distribution, that a page shows
 
 
@@ -98,7 +99,8 @@ class RunContents:
         """(3,) against gravity, None where the map does not tell."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
-        return up if abs(np.linalg.norm(up) - 1) < UNIT_TOLERANCE else None  # NaN is not
+        length = np.linalg.norm(up)
+        return np.asarray(up / length) if abs(length - 1) < UNIT_TOLERANCE else None  # NaN is not
 
     @property
     def tracked_frames(self) -> tuple[int, ...]:
@@ -175,6 +177,8 @@ def _array(where: str, entry: Mapping[str, Any], key: str, shape: tuple[int, ...
         values = np.array(entry.get(key), np.float64)
     except (TypeError, ValueError):
         values = np.zeros(0)
-    if values.shape != shape or not np.isfinite(values).all():
-        raise DataError(f"{where}: {key} must hold numbers of shape {shape}, found {entry.get(key)!r:.40}")
+    if values.shape != shape or not (np.abs(values) <= FARTHEST).all():  # NaN is not
+        raise DataError(
+            f"{where}: {key} must hold numbers of shape {shape}, up to {FARTHEST:g}, found {entry.get(key)!r:.60}"
+        )
     return values

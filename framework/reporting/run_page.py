@@ -20,7 +20,7 @@ from framework.records.stored_runs import is_number
 from framework.registry import STAGES
 from framework.reporting.footage import Footage
 from framework.reporting.growth_pictures import GrowthPicture, growth_pictures
-from framework.reporting.map_scene import MapScene, hex_color, likely_ids, object_colors
+from framework.reporting.map_scene import MapScene, colors_by_id, hex_color, likely_ids
 from framework.reporting.markup import figure, page, section, table, tag, words
 from framework.reporting.object_table import object_data, object_table
 from framework.reporting.pictures import Photographer, Picture, webp_url
@@ -57,7 +57,7 @@ class RunReport:
         photographer, pictures = None, {}
         if scene is not None:
             photographer = Photographer(scene.mesh, scene.surface, contents.poses, footage)
-            colors = object_colors(contents.objects)
+            colors = colors_by_id(contents.objects)
             pictures = photographer.pictures(scene.mesh.instance_ids, scene.sightings.best, colors)
         truth, why = recording.scene_truth()
         check = TruthCheck.of(contents, truth, scene, photographer, footage) if truth is not None else None
@@ -131,7 +131,7 @@ class RunReport:
         contents = self.contents
         if not contents.objects:
             return section("objects", "Objects", tag("p", "No object was found.", class_="empty"))
-        colors = {key: hex_color(color) for key, color in object_colors(contents.objects).items()}
+        colors = {key: hex_color(color) for key, color in colors_by_id(contents.objects).items()}
         search = tag(
             "div",
             '<input type="search" id="search" placeholder="Search by class or number" aria-label="Search objects">',
@@ -160,7 +160,7 @@ class RunReport:
     def _top_views(self, up: Float64, caption: str) -> list[str]:
         """Among the objects, and larger where it is small among them."""
         contents = self.contents
-        colors = object_colors(contents.objects)
+        colors = colors_by_id(contents.objects)
         likely = set(likely_ids(contents))
         footprints = [
             Footprint(box_corners(one.center, one.extent, one.rotation), one.class_name, hex_color(colors[one.id]))

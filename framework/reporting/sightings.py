@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from framework.data import Bool, Camera, Float32, Float64, Int32
+from framework.data import Bool, Camera, Float32, Float64, InstanceMesh, Int32
 from framework.geometry import inverse
 from framework.rendering.rasterizer import Rasterizer
-from framework.reporting.decimation import LightMesh
 
 LOOKS = 80  # poses of a trajectory that are looked from: two or three a second of a short video
 LOOK_WIDTH = 200  # px, of the pictures that sightings are judged by
@@ -41,7 +40,7 @@ def spread_out(count: int, most: int = LOOKS) -> list[int]:
 
 
 def sightings(
-    mesh: LightMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
+    mesh: InstanceMesh, labels: Int32, poses: Float64, camera: Camera, clarity: Mapping[int, float]
 ) -> Sightings:
     """What the poses (P, 4, 4) saw of a mesh, by looking from some of them again.
 

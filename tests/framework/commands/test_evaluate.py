@@ -36,6 +36,7 @@ CONFIG = {
     "tracker": {"_target_": "tests.scenes.corner_room.GivenPose"},
     "refiner": {"_target_": "tests.scenes.corner_room.KeepAll"},
     "fuser": {"_target_": "plugins.fusers.bayesian_tsdf.BayesianTsdf", "voxel_size": 0.04, "min_observations": 2},
+    "viewer": {"_target_": "plugins.viewers.none.NoViewer"},
 }
 CODE = {"evaluation.git_commit": "abcdef0", "evaluation.git_dirty": False}
 

@@ -14,6 +14,7 @@ import pytest
 from framework import configs
 from framework.commands import report
 from framework.errors import DataError
+from framework.reporting.run_page import RunReport
 from tests.reported_run import rename_class, write_run
 from tests.scenes.corner_room import CornerRoom
 
@@ -152,6 +153,7 @@ def test_a_run_that_mapped_nothing_has_a_page(stored: Path, command) -> None:
     [
         ("instances.json", "{}", "instances.json must hold a list of instances"),
         ("instances.json", '[{"id": 1}]', "entry 1"),
+        ("instances.json", '[{"id": 1, "class": "cup", "confidence": NaN}]', "entry 1"),
         ("mesh.ply", "ply\n", "mesh.ply"),
         ("timings.csv", "frame,stage,milliseconds\n0,read,soon\n", "timings.csv, line 2"),
         ("trajectory.txt", "1 2 3\n", "trajectory.txt, line 1"),
@@ -166,10 +168,33 @@ def test_a_damaged_record_is_one_line_and_no_page(stored: Path, command, name: s
     assert not (stored / "report.html").exists()
 
 
+@pytest.mark.parametrize(("key", "value"), [("center", [1e300, 0, 0]), ("extent", [float("nan"), 1, 1])])
+def test_boxes_that_no_room_has_are_one_line(stored: Path, command, key: str, value: list[float]) -> None:
+    entries = json.loads((stored / "instances.json").read_text())
+    entries[1]["obb"][key] = value
+    (stored / "instances.json").write_text(json.dumps(entries))
+    status, _, err = command(stored)
+    assert (status, len(err.splitlines())) == (1, 1)
+    assert f"instances.json, entry 2: {key} must hold numbers of shape (3,), up to 1e+06" in err
+
+
+def test_where_the_page_cannot_go_is_told_before_the_map_is_looked_at(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RunReport, "of", pytest.fail)
+    assert "its folder does not exist" in command(stored, "--out", stored / "missing" / "page.html")[2]
+    assert "is no file but a folder" in command(stored, "--out", stored)[2]
+
+
+def test_the_address_is_one_that_a_browser_takes(stored: Path, command) -> None:
+    moved = stored.rename(stored.parent / "my run #2 50%")
+    _, out, _ = command(moved)
+    assert out.endswith("my%20run%20%232%2050%25/report.html\n")
+
+
 def test_what_is_no_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
     assert "holds no run" in command(tmp_path)[2]
     assert "each run is to be named once" in command(stored, stored.parent / "." / "first")[2]
-    assert "its folder does not exist" in command(stored, "--out", tmp_path / "missing" / "page.html")[2]
 
 
 def test_several_runs_are_set_side_by_side(mapped: Path, stored: Path, command) -> None:

@@ -26,6 +26,7 @@ from framework.exporting.surface_points import surface_points
 from framework.exporting.usd import Collision, convex_hull
 from framework.records.instances_file import StoredInstance
 from framework.records.mesh_file import read_mesh, write_mesh
+from framework.rendering.palette import instance_colors
 from tests.scenes.exported_room import Y_UP, ExportedRoom
 
 TURNED = ExportedRoom(R_world_room=Y_UP, shift=(0.5, -1.25, 2.0))
@@ -303,6 +304,33 @@ def test_names_are_identifiers_whatever_the_class(tmp_path: Path) -> None:
     prim = stage.GetPrimAtPath("/World/object_2")
     assert UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get() == ["日本"]
     assert export(run, [Format.GLB], tmp_path / "one", Chosen(("日本",))) == [tmp_path / "one/objects/object_2.glb"]
+
+
+def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> None:
+    run = ExportedRoom().write(tmp_path / "run")
+    path = run / "instances.json"
+    path.write_text(path.read_text().replace('"class": "cube"', '"class": "cube \\ud800"'))
+    export(run, list(Format), tmp_path / "out")
+    nodes = header((tmp_path / "out/scene.glb").read_bytes())["nodes"]
+    assert "cube \\ud800" in [node.get("extras", {}).get("class") for node in nodes]
+
+
+def test_an_object_has_the_colour_of_overview_png_in_all_files(tmp_path: Path) -> None:
+    """Also in its own file, and where another one is unlikely, or is not exported."""
+    run = ExportedRoom().write(tmp_path / "run")
+    entries = json.loads((run / "instances.json").read_text())
+    entries[0]["confidence"] = 0.1
+    (run / "instances.json").write_text(json.dumps(entries))
+    mesh = read_mesh(run / "mesh.ply")
+    centroids = np.array([mesh.vertices[mesh.instance_ids == key].mean(axis=0) for key in (2, 3)], np.float64)
+    expected = dict(zip((2, 3), instance_colors(centroids), strict=True))
+    for objects in ((), ("2", "3"), ("3",)):
+        files = export(run, [Format.PLY], tmp_path / "out", Chosen(objects, coloring=Coloring.INSTANCE))
+        for path in files:
+            found = read_mesh(path)
+            for key in {2, 3} & set(found.instance_ids.tolist()):
+                colors = found.colors[found.instance_ids == key]
+                np.testing.assert_array_equal(np.unique(colors, axis=0), [expected[key]])
 
 
 def test_an_object_of_three_vertices_is_exported(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from codecs import BOM_UTF8
 from collections.abc import Callable
@@ -139,3 +140,19 @@ def test_a_link_is_followed(tmp_path: Path) -> None:
         assert link.is_symlink()
         assert target.read_text() == "new"
         assert not target.is_symlink()
+
+
+def test_where_nothing_can_be_written_the_file_is_named_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not its temporary name: on a disk that is only to be read it cannot be removed either."""
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    with (
+        pytest.raises(DataError, match=r"page\.html could not be written: Read-only"),
+        written_whole(tmp_path / "page.html"),
+    ):
+        refused()

@@ -11,16 +11,20 @@ import pytest
 import trimesh
 
 from framework.data import InstanceMesh
-from framework.reporting.decimation import LightMesh, decimated
+from framework.exporting.decimation import with_finer_objects
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
 
 
-def two_squares() -> LightMesh:
+def two_squares() -> InstanceMesh:
     square = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], np.float32)
     vertices = np.concatenate([square, square + np.float32(2)])
     triangles = np.array([[0, 1, 2], [0, 2, 3], [4, 5, 6], [4, 6, 7]], np.int32)
     colors = np.full((8, 3), (188, 0, 255), np.uint8)
-    return LightMesh(vertices, triangles, colors, np.array([0, 0, 0, 0, 5, 5, 5, 5], np.int32))
+    ids = np.array([0, 0, 0, 0, 5, 5, 5, 5], np.int32)
+    return InstanceMesh(vertices, triangles, colors, ids, ids - 1, ())
+
+
+UP = np.array([0.0, 0.0, 1.0])
 
 
 def tree_of(content: bytes) -> tuple[dict, bytes]:
@@ -30,22 +34,20 @@ def tree_of(content: bytes) -> tuple[dict, bytes]:
 
 def test_each_object_is_a_node_with_its_class() -> None:
     mesh = two_squares()
-    content = scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"})
+    content = scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"}, UP)
     scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")
-    assert set(scene.geometry) == {"remainder", "object 5"}
-    np.testing.assert_array_equal(scene.geometry["object 5"].vertices, mesh.vertices[4:])
+    assert set(scene.geometry) == {"room", "b_cup_b_5"}
+    np.testing.assert_array_equal(scene.geometry["b_cup_b_5"].vertices, mesh.vertices[4:])
     tree, _ = tree_of(content)
-    assert {m["name"]: m["extras"] for m in tree["meshes"]} == {
-        "remainder": {"id": 0},
-        "object 5": {"id": 5, "class": "<b>cup</b>"},
-    }
-    assert content == scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"})
+    said = {node["name"]: node.get("extras") for node in tree["nodes"] if "mesh" in node}
+    assert said == {"room": None, "b_cup_b_5": {"id": 5, "class": "<b>cup</b>"}}
+    assert content == scene_glb(mesh, np.linspace(0, 1, 8, dtype=np.float32), {5: "<b>cup</b>"}, UP)
 
 
 def test_colours_are_linear_and_first_sights_are_there() -> None:
     first_seen = np.linspace(0, 1, 8, dtype=np.float32)
-    tree, binary = tree_of(scene_glb(two_squares(), first_seen, {5: "cup"}))
-    [attributes] = [m["primitives"][0]["attributes"] for m in tree["meshes"] if m["name"] == "object 5"]
+    tree, binary = tree_of(scene_glb(two_squares(), first_seen, {5: "cup"}, UP))
+    [attributes] = [m["primitives"][0]["attributes"] for m in tree["meshes"] if m["name"] == "cup_5"]
 
     def values(name: str, kind: type, width: int) -> np.ndarray:
         view = tree["bufferViews"][tree["accessors"][attributes[name]]["bufferView"]]
@@ -58,10 +60,19 @@ def test_colours_are_linear_and_first_sights_are_there() -> None:
     np.testing.assert_array_equal(values("_FIRST_SEEN", np.float32, 1)[:, 0], first_seen[4:])
 
 
+def test_a_saved_map_stands_upright_in_other_programs() -> None:
+    """Whatever is up in the map: glTF's y."""
+    up = np.array([0.6, 0.0, -0.8])
+    content = scene_glb(two_squares(), np.zeros(8, np.float32), {}, up)
+    scene = trimesh.load_scene(io.BytesIO(content), file_type="glb")
+    T, _ = scene.graph["room"]
+    np.testing.assert_allclose(T[:3, :3] @ up, (0, 1, 0), atol=1e-6)
+
+
 def test_labels_without_a_name_are_no_objects() -> None:
-    scene = trimesh.load_scene(io.BytesIO(scene_glb(two_squares(), np.zeros(8, np.float32), {})), file_type="glb")
-    assert set(scene.geometry) == {"remainder"}
-    assert len(scene.geometry["remainder"].faces) == 4
+    scene = trimesh.load_scene(io.BytesIO(scene_glb(two_squares(), np.zeros(8, np.float32), {}, UP)), file_type="glb")
+    assert set(scene.geometry) == {"room"}
+    assert len(scene.geometry["room"].faces) == 4
 
 
 @pytest.mark.parametrize("shared_vertices", [True, False])
@@ -78,6 +89,6 @@ def test_a_huge_map_is_no_file_of_ten_megabytes(shared_vertices: bool) -> None:
     mesh = InstanceMesh(
         vertices, triangles.astype(np.int32), np.full((len(vertices), 3), 90, np.uint8), zeros, zeros - 1, ()
     )
-    light = light_enough(decimated(mesh, zeros, MOST_TRIANGLES))
-    content = scene_glb(light, np.zeros(len(light.vertices), np.float32), {})
+    light = light_enough(with_finer_objects(mesh, MOST_TRIANGLES))
+    content = scene_glb(light, np.zeros(len(light.vertices), np.float32), {}, UP)
     assert 1_000_000 < len(content) <= MOST_BYTES

@@ -2,23 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from framework.data import Camera
-from framework.reporting.decimation import LightMesh
+from framework.data import Camera, InstanceMesh
+from framework.exporting.submeshes import joined
 from framework.reporting.sightings import LOOKS, sightings, spread_out
 
 CAMERA = Camera(200, 150, 150.0, 150.0, 99.5, 74.5)
 
 
-def wall(n: int = 41) -> LightMesh:
+def wall(n: int = 41) -> InstanceMesh:
     """x from -2 to 2 m, y from -0.5 to 0.5, 2 m before the world's origin; two objects at its ends, one cut by both."""
     x, y = np.meshgrid(np.linspace(-2, 2, n), np.linspace(-0.5, 0.5, n), indexing="ij")
     vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
     a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
     triangles = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
     ids = np.select([vertices[:, 0] < -1.2, vertices[:, 0] > 1.2], [3, 4]).astype(np.int32)
-    return LightMesh(vertices, triangles.astype(np.int32), np.zeros((n * n, 3), np.uint8), ids)
+    return InstanceMesh(vertices, triangles.astype(np.int32), np.zeros((n * n, 3), np.uint8), ids, ids - 1, ())
 
 
 def at(x: float) -> np.ndarray:
@@ -57,12 +59,12 @@ def test_a_blurred_picture_is_not_the_best_one() -> None:
 
 def test_what_stands_behind_something_is_not_seen() -> None:
     mesh = wall()
-    before = LightMesh(
-        np.concatenate([mesh.vertices, mesh.vertices - np.float32([0, 0, 1])]),
-        np.concatenate([mesh.triangles, mesh.triangles + len(mesh.vertices)]),
-        np.concatenate([mesh.colors, mesh.colors]),
-        np.concatenate([mesh.instance_ids, np.where(mesh.instance_ids > 0, 9, 0).astype(np.int32)]),
+    nearer = replace(
+        mesh,
+        vertices=mesh.vertices - np.float32([0, 0, 1]),
+        instance_ids=np.where(mesh.instance_ids > 0, 9, 0).astype(np.int32),
     )
+    before = joined([mesh, nearer])
     found = sightings(before, before.instance_ids, np.array([at(0.0)]), CAMERA, {})
     assert (found.first_seen[: len(mesh.vertices)] == 1).all()
     assert 3 not in found.best

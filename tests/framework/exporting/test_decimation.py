@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import trimesh
 
 from framework.data import InstanceMesh, Int32
-from framework.reporting.decimation import LightMesh, clustered, decimated
+from framework.exporting.decimation import clustered, decimated, with_finer_objects
 
 
 def wavy_plane(n: int = 120) -> InstanceMesh:
@@ -29,10 +30,10 @@ def areas(vertices: np.ndarray, triangles: Int32) -> np.ndarray:
     return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2)
 
 
-@pytest.mark.parametrize("most", [8000, 300])  # collapsed; clustered and then collapsed
-def test_surface_colours_and_labels_are_kept(most: int) -> None:
-    mesh = wavy_plane()
-    light = decimated(mesh, mesh.instance_ids, most)
+@pytest.mark.parametrize(("n", "most"), [(120, 8000), (120, 300), (420, 9000)])  # the last is clustered before
+def test_surface_colours_and_labels_are_kept(n: int, most: int) -> None:
+    mesh = wavy_plane(n)
+    light = with_finer_objects(mesh, most)
     assert 0.6 * most < len(light.triangles) <= most
     area = areas(mesh.vertices, mesh.triangles).sum()
     assert areas(light.vertices, light.triangles).sum() == pytest.approx(area, rel=0.08)
@@ -49,7 +50,7 @@ def test_surface_colours_and_labels_are_kept(most: int) -> None:
 
 def test_objects_stay_finer_than_what_is_around_them() -> None:
     mesh = wavy_plane()
-    light = decimated(mesh, mesh.instance_ids, 3000)
+    light = with_finer_objects(mesh, 3000)
     of_object = (light.instance_ids[light.triangles] == 7).all(axis=1)
     sizes = areas(light.vertices, light.triangles)
     assert np.median(sizes[of_object]) < 0.5 * np.median(sizes[~of_object])
@@ -57,7 +58,7 @@ def test_objects_stay_finer_than_what_is_around_them() -> None:
 
 def test_what_is_small_enough_stays_as_it_is() -> None:
     mesh = wavy_plane(20)
-    light = decimated(mesh, mesh.instance_ids, 1000)
+    light = with_finer_objects(mesh, 1000)
     assert len(light.triangles) == len(mesh.triangles)
     assert areas(light.vertices, light.triangles).sum() == areas(mesh.vertices, mesh.triangles).sum()
 
@@ -66,7 +67,14 @@ def test_triangles_that_share_no_vertex_become_few_enough_all_the_same() -> None
     mesh = wavy_plane()
     corners = mesh.triangles.ravel()
     triangles = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-    soup = LightMesh(mesh.vertices[corners], triangles, mesh.colors[corners], mesh.instance_ids[corners])
+    soup = InstanceMesh(
+        mesh.vertices[corners],
+        triangles,
+        mesh.colors[corners],
+        mesh.instance_ids[corners],
+        mesh.class_ids[corners],
+        (),
+    )
     light = clustered(soup, 100_000, 24, 12)
     assert 10_000 < 24 * len(light.vertices) + 12 * len(light.triangles) <= 100_000
     assert set(light.instance_ids.tolist()) == {0, 7}
@@ -83,7 +91,7 @@ def test_a_flat_picture_stays_one() -> None:
         vertices=mesh.vertices * np.float32([1, 1, 0]),
         colors=np.where(white[:, None], 240, 20).astype(np.uint8).repeat(3, axis=1),
     )
-    light = decimated(flat, np.zeros(len(x), np.int32), 5000)
+    light = decimated(flat, 5000)
     corners = light.vertices[light.triangles]
     centers, sizes = corners.mean(axis=1), areas(light.vertices, light.triangles)
     shown = light.colors[light.triangles][..., 0].mean(axis=1) > 128
@@ -91,3 +99,23 @@ def test_a_flat_picture_stays_one() -> None:
     true = (np.floor(u) + np.floor(v)) % 2 == 0
     assert sizes[shown == true].sum() > 0.93
     assert (light.vertices[:, 2] == 0).all(), "the relief is gone"
+
+
+@pytest.mark.parametrize("asked", [1, 4, 12])
+def test_something_is_left_of_an_object_that_is_to_have_a_few_triangles(asked: int) -> None:
+    """Clustered for so few, all of it would be in one cube."""
+    ball = trimesh.creation.icosphere(6, 0.1)
+    n = len(ball.vertices)
+    mesh = InstanceMesh(
+        np.float32(ball.vertices),
+        np.int32(ball.faces),
+        np.full((n, 3), 200, np.uint8),
+        np.full(n, 3, np.int32),
+        np.zeros(n, np.int32),
+        ("ball",),
+    )
+    few = decimated(mesh, asked)
+    assert 4 <= len(few.triangles) <= max(asked, 4)
+    assert (few.instance_ids == 3).all()
+    assert (few.class_ids == 0).all()
+    assert np.ptp(few.vertices, axis=0).min() > 0.05
