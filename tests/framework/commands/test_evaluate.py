@@ -20,23 +20,14 @@ from framework.commands.run import run
 from framework.files.directory_lock import locked
 from framework.records import reevaluation, run_record
 from framework.records.provenance import config_hash
+from tests import reported_run
 from tests.scenes.corner_room import CornerRoom
 
 pytestmark = pytest.mark.usefixtures("fakes_registered")
 CHECKOUT = Path(__file__).resolve().parents[3]
-FAKES = CHECKOUT / "tests" / "fake_conf"
-CONFIG = {
-    "seed": 0,
-    "device": "cpu",
-    "threads": 0,
-    "ahead": 0,
-    "detection_cache": "off",
-    "dataset": {"_target_": "tests.scenes.corner_room.CornerRoom", "frames": 4},
-    "detector": {"_target_": "tests.scenes.corner_room.SphereDetector"},
-    "tracker": {"_target_": "tests.scenes.corner_room.GivenPose"},
-    "refiner": {"_target_": "tests.scenes.corner_room.KeepAll"},
-    "fuser": {"_target_": "plugins.fusers.bayesian_tsdf.BayesianTsdf", "voxel_size": 0.04, "min_observations": 2},
-    "viewer": {"_target_": "plugins.viewers.none.NoViewer"},
+CONFIG = reported_run.CONFIG | {
+    "dataset": reported_run.CONFIG["dataset"] | {"frames": 4},
+    "fuser": reported_run.CONFIG["fuser"] | {"voxel_size": 0.04},
 }
 CODE = {"evaluation.git_commit": "abcdef0", "evaluation.git_dirty": False}
 
@@ -47,7 +38,7 @@ def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("runs") / "run"
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(run_record, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
-        patched.setattr(configs, "_added", [FAKES])
+        patched.setattr(configs, "_added", [reported_run.FAKES])
         run(OmegaConf.create(CONFIG), directory, {})
     return directory
 
@@ -268,7 +259,7 @@ def test_a_run_without_truth_stays_as_it_is(stored: Path, command) -> None:
 def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
     shutil.copytree(mapped, tmp_path / "run")
     done = subprocess.run(
-        [sys.executable, "-m", "framework", "evaluate", "--config-dir", str(FAKES), "run", "absent"],
+        [sys.executable, "-m", "framework", "evaluate", "--config-dir", str(reported_run.FAKES), "run", "absent"],
         cwd=tmp_path,
         env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
         capture_output=True,
