@@ -5,16 +5,12 @@ On disk a room is one file, written whole or not at all: room_000000.npz with cr
 
 from __future__ import annotations
 
-import multiprocessing
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import cv2
-import numba
 import numpy as np
-from tqdm import tqdm
 
 from framework.data import Float32, Int32, UInt8
 from framework.detection.crops import square_crops
@@ -24,7 +20,7 @@ from framework.label_spaces import COCO
 from framework.synthetic.depth_camera import noisy_color
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.true_colors import NO_NAME, color_counts, color_of_materials, one_color
-from framework.training.room_pictures import random_room, random_views
+from framework.training.room_pictures import each_in_a_process, random_room, random_views
 
 STREAM = 0x776F_7264  # apart from the streams of all datasets and of room_pictures
 SIDE = 64  # px
@@ -50,13 +46,7 @@ def render_crops(folder: Path, first: int, rooms: int, views: int, processes: in
     """Renders the objects of the rooms number `first` and following; those that are there already are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(first, first + rooms) if not crops_file(folder, number).is_file()]
-    if not missing:
-        return
-    # not forked: threads of numba and OpenCV do not survive that
-    workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), numba.set_num_threads, (1,))
-    with workers, tqdm(total=len(missing), desc="rendering objects", unit="room", disable=None) as bar:
-        for _ in workers.map(partial(render_room_crops, folder, views), missing):
-            bar.update()
+    each_in_a_process(partial(render_room_crops, folder, views), missing, processes, "rendering objects")
 
 
 def crops_file(folder: Path, number: int) -> Path:
