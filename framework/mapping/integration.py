@@ -7,9 +7,9 @@ Bytes moved a frame: every block that the frame sees is gone through once. Dista
 2 * 2 KiB; so are colours, 2 * 2 KiB, where a voxel lies within the truncation band; of each voxel near the measured
 surface, a sixth of them, 6 bytes are written for the labels. The images, 2.5 MB at 640x480, stay in the cache. At 1 cm
 that is (medians over 40 frames) about 25 MB in redkitchen (2809 blocks seen, 1608 near the surface) and 100 MB in the
-synthetic room (10435 and 7953), which two cores copy in 0.9 and 3.5 ms. The kernel takes three to four times as long:
-on one core 2.1 microseconds a block, of which 0.4 project, 0.1 and 0.3 gather depths and colours, 0.5 average distances
-and 0.5 colours; what is left waits for the memory although the next block is asked for in advance.
+synthetic room (10435 and 7953), which two cores copy in 0.9 and 3.5 ms. The kernel takes longer, as it is bound by its
+arithmetic: one core, with the caches warm, needs 0.8 microseconds a block in redkitchen and 1.3 in the room, where 0.25
+project and gather depths, 0.2 average distances and 0.4 colours; the next block is asked for in advance.
 """
 
 from __future__ import annotations
