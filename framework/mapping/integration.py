@@ -37,6 +37,7 @@ from framework.mapping.voxel_grid import (
     is_solid,
     one_more,
     pack_color,
+    reserved,
     unpack_color,
 )
 
@@ -233,6 +234,11 @@ class SeenBlocks(NamedTuple):
     near_pixel: Int32  # (A, 512) the number v * width + u of the pixel that sees each of these
 
 
+def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
+    """The near_voxel and near_pixel of so many blocks."""
+    return np.empty((blocks, BLOCK_VOXELS), np.uint16), np.empty((blocks, BLOCK_VOXELS), np.int32)
+
+
 class Integrator:
     """Integrates frames into a grid; remembers what it needs between frames."""
 
@@ -268,11 +274,11 @@ class Integrator:
         self.frames += 1
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
-        if len(self._near_pixel) < len(active):
-            # by an eighth more than is needed: nothing is copied, so that doubling would only take memory
-            shape = (len(active) * 9 // 8 + 1, BLOCK_VOXELS)
-            self._near_voxel, self._near_pixel = np.empty(shape, np.uint16), np.empty(shape, np.int32)
         count, n = np.empty(len(active), np.int32), len(active)
+        if len(self._near_pixel) < n:
+            self._near_voxel, self._near_pixel = reserved(self.voxels.max_blocks, _near_lists)
+        if len(self._near_pixel) < n:  # where reserving costs memory
+            self._near_voxel, self._near_pixel = _near_lists(n * 9 // 8 + 1)
         seen = SeenBlocks(active, count, self._near_voxel[:n], self._near_pixel[:n])
         _integrate(
             self.voxels.grid,

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 PAGE = 2**21  # bytes, of a huge page
-SMALL = 2 * PAGE  # bytes: what has no more in use, as the many maps of single objects, is given no page ahead
+SMALL = PAGE // 2
 
 
 class PagesAhead:

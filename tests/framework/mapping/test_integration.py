@@ -1,6 +1,7 @@
 """The TSDF against a slow reference and against exact surfaces."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,8 @@ import pytest
 from framework.data import Frame
 from framework.errors import FrameError, MapFullError
 from framework.geometry import inverse
-from framework.mapping.integration import GOLDEN, LEAST_BEHIND, Integrator
+from framework.mapping import integration
+from framework.mapping.integration import GOLDEN, LEAST_BEHIND, Integrator, SeenBlocks
 from framework.mapping.sensor import Sensor
 from framework.mapping.tsdf import VoxelHashing
 from framework.mapping.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
@@ -70,6 +72,28 @@ def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
     behind = np.clip((band + d - p[..., 2]) / (SENSOR.truncation - VOXEL), LEAST_BEHIND, 1)
     expected_weight = behind * np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
     assert np.abs(grid.weight[active] - np.maximum(expected_weight, 1))[both].max() < 1.001
+
+
+@pytest.mark.parametrize("promised", [100_000, 10], ids=["reserved", "memory is counted by what is asked for"])
+def test_a_frame_that_sees_more_blocks_takes_no_memory_that_was_reserved(
+    monkeypatch: pytest.MonkeyPatch, promised: int
+) -> None:
+    monkeypatch.setattr(integration, "reserved", lambda most, make: make(min(most, promised)))
+    integrator, T = new_integrator(), walk(1)[0]
+    frame = room().frame(T, 0)
+    left = replace(frame, depth=np.where(np.arange(CAMERA.width) < 20, frame.depth, np.float32(0.0)))
+    few = integrator.integrate(left, T, VOXEL)
+    more = integrator.integrate(frame, T, VOXEL)
+    assert len(more.blocks) > 2 * len(few.blocks) > 20
+    assert np.shares_memory(few.near_pixel, more.near_pixel) == (promised == 100_000)
+
+    alone = new_integrator().integrate(frame, T, VOXEL)
+    assert near_pixels(more) == near_pixels(alone)
+
+
+def near_pixels(seen: SeenBlocks) -> list[int]:
+    """The pixels that see voxels near the surface, as often as they see one."""
+    return sorted(int(p) for row, count in zip(seen.near_pixel, seen.near_count, strict=True) for p in row[:count])
 
 
 def test_every_voxel_near_the_surface_is_seen() -> None:
