@@ -2,8 +2,9 @@
 
     python -m tests.kernel_calls
 
-writes it anew, in two minutes. Runs every registered refiner, fuser and tracker over the demo's video and notes each
-kernel that Python calls for the first time with some types. A test compares the list with what the same runs call.
+writes it anew, in two minutes. Runs every registered refiner, fuser and tracker over the demo's video, and a made-up room,
+and notes each kernel that Python calls for the first time with some types. A test compares the list with what the same
+runs call.
 """
 
 from __future__ import annotations
@@ -101,6 +102,14 @@ def run_others() -> None:
             pipeline.fuser.scene.instances()
 
 
+def run_rendered(directory: Path) -> None:
+    """A made-up room: what renders it, and what compares a map with its true surface."""
+    config = composed(
+        "dataset=synthetic", "detector=simulated", "dataset.frames=8", "dataset.width=160", "dataset.height=120"
+    )
+    run(config, directory, {})
+
+
 def sections(whole: bool) -> dict[str, set[str]]:
     """The lines of the list, by section; without `whole` a shorter default run, which calls no others."""
     noted = calls()
@@ -108,6 +117,8 @@ def sections(whole: bool) -> dict[str, set[str]]:
         run_default(Path(directory), *(() if whole else ("dataset.stride=2", "dataset.stop=24")))
     default = set(noted)
     run_others()
+    with tempfile.TemporaryDirectory() as directory:
+        run_rendered(Path(directory))
     return {DEFAULT: default, OTHERS: set(noted) - default}
 
 
