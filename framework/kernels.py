@@ -102,9 +102,10 @@ def line_of(dispatcher: Any, signature: Iterable[Any]) -> str:
 
 
 def compile_for_run() -> None:
-    """Compiles what the modules that are loaded need, and says so; a run calls it when its stages are built.
+    """Compiles what the modules that are loaded need, and says so.
 
-    What cannot be compiled ahead is left to numba, and told.
+    A run calls it when its stages are built, and when its video is. What cannot be compiled ahead is left to numba, and
+    told.
     """
     loaded = [kernel for kernel in listed(DEFAULT, OTHERS) if kernel.module in sys.modules]
     missing = [kernel for kernel in loaded if not kernel.is_compiled()]

@@ -2,9 +2,9 @@
 
     python -m tests.kernel_calls
 
-writes it anew, in two minutes. Runs every registered refiner, fuser and tracker over the demo's video, and a made-up room,
-and notes each kernel that Python calls for the first time with some types. A test compares the list with what the same
-runs call.
+writes it anew, in a minute. Runs every registered refiner, fuser and tracker over the demo's video, and one over a
+made-up room, and notes each kernel that Python calls for the first time with some types. A test compares the list with
+what the same runs call.
 """
 
 from __future__ import annotations

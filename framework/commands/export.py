@@ -1,4 +1,4 @@
-"""`python -m framework export RUN --to glb usd ...`: what a run found, in the formats of other programs."""
+"""`python -m framework export RUN [--to glb usd ...]`: what a run found, in the formats of other programs."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def main() -> None:
     parser.add_argument(
         "--to",
         nargs="+",
-        required=True,
+        default=["glb"],
         choices=("glb", "ply", "usd", "obj", "floorplan", "graph"),
-        help="one or several",
+        help="one or several, default: glb",
     )
     parser.add_argument("--out", metavar="DIR", type=Path, help="where the files go, default: RUN/export")
     parser.add_argument(

@@ -6,6 +6,7 @@ What it writes stands in framework/templates: a folder for each stage, and what 
 from __future__ import annotations
 
 import argparse
+import inspect
 import keyword
 import os
 import re
@@ -20,6 +21,7 @@ from omegaconf import OmegaConf
 import framework
 from framework.commands.command_line import arguments, one_line_errors
 from framework.configs import config_directory
+from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
 from framework.errors import ConfigError, DataError
 from framework.registry import STAGES
 
@@ -47,6 +49,13 @@ SWEEPS = {  # by stage: how a new plugin is compared with ours
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
     "fuser": f"instancemap -m fuser=bayesian_tsdf,$name detector=simulated {SMALL} {FIRST}",
     "dataset": f"instancemap -m refiner=identity,gmm_em dataset=$name dataset.root=DIR {FIRST}",
+}
+DATA: dict[str, tuple[type, ...]] = {  # by stage: what its methods get and give
+    "detector": (Frame, Camera, Detections),
+    "tracker": (Frame, Camera, SurfaceView, Pose),
+    "refiner": (PointClusters, Frame, Camera),
+    "fuser": (Frame, Camera, Pose, PointClusters, Instance),
+    "dataset": (Frame, Camera),
 }
 VARIANTS = {  # by stage: a parameter for an option that inherits
     "detector": "tolerance: 30",
@@ -138,8 +147,15 @@ def names_of(stage: str, name: str) -> dict[str, str]:
         "distribution": f"instancemap-{name.replace('_', '-')}",
         "version": framework.__version__,
         "variant": VARIANTS[stage],
+        "data": "\n\n\n".join(map(fields_of, DATA[stage])),
     }
     return own | {"sweep": Template(SWEEPS[stage]).substitute(own)}
+
+
+def fields_of(data: type) -> str:
+    """The fields of a dataclass with their shapes, units and meanings, as its source has them."""
+    body = inspect.getsource(data).partition("\n    def ")[0]
+    return "\n".join([f"class {data.__name__}:", *re.findall(r"^    \w+: .*", body, re.MULTILINE)])
 
 
 def files_of(stage: str, name: str) -> dict[str, str]:

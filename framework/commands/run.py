@@ -63,6 +63,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.datasets.recording import Recording
     from framework.detection.cache import cache_metrics
     from framework.interfaces import RGBDSequence, RGBDVideo
+    from framework.kernels import compile_for_run
     from framework.records.run_record import RunRecord, reason
     from framework.registry import STAGES, build
     from framework.settings import Settings
@@ -70,6 +71,7 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     Settings.of(config).apply()
     pipeline = begin(config)
     video = build(RGBDVideo, config.get("dataset"))  # after the stages: making up a room takes longest
+    compile_for_run()  # what renders it
     record = RunRecord.begin(directory, config, choices)
     chosen = ", ".join(f"{stage} {choices.get(stage)}" for stage in STAGES if stage != "dataset")
     length = f"{len(video)} frames" if isinstance(video, RGBDSequence) else "live until Ctrl-C"

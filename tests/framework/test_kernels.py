@@ -46,7 +46,7 @@ def test_types_are_written_as_they_are_read() -> None:
 
 
 def test_runs_call_what_is_listed() -> None:
-    """The demo, and each other refiner, fuser and tracker: `python -m tests.kernel_calls` writes the list anew."""
+    """The demo, a room, each other refiner, fuser and tracker: `python -m tests.kernel_calls` writes it anew."""
     if missing := [kernel for kernel in listed(DEFAULT, OTHERS) if not kernel.is_compiled()]:
         compile_all(missing)  # as `make test` does
     line = [sys.executable, "-m", "tests.kernel_calls", "--check"]

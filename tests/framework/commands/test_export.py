@@ -47,11 +47,15 @@ def test_one_object_goes_into_the_runs_own_folder(run: Path, monkeypatch: pytest
     assert all(len(trimesh.load(path).faces) <= 100 for path in found)
 
 
+def test_without_a_format_it_is_glb(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exported(monkeypatch, run, "--object", "cube", "--out", tmp_path)
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["cube_2.glb"]
+
+
 @pytest.mark.parametrize(
     ("words", "said"),
     [
         (("--to", "stl"), "invalid choice: 'stl'"),
-        ((), "the following arguments are required: --to"),
         (("--to", "glb", "--triangles", "many"), "invalid int value: 'many'"),
         (("--to", "glb", "--up", "0", "1"), "expected 3 arguments"),
     ],
