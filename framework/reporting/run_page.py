@@ -28,7 +28,15 @@ from framework.reporting.recording import Recording, TruePath
 from framework.reporting.run_contents import RunContents
 from framework.reporting.sightings import NOT_CAMERA, spread_out
 from framework.reporting.time_charts import growth, stage_areas, stage_rows
-from framework.reporting.trajectory_chart import Footprint, Way, box_corners, error_over_time, top_view
+from framework.reporting.trajectory_chart import (
+    FLAT_HEIGHT,
+    HEIGHT,
+    Footprint,
+    Way,
+    box_corners,
+    error_over_time,
+    top_view,
+)
 from framework.reporting.truth_check import TruthCheck
 from framework.reporting.truth_section import truth_section
 
@@ -151,13 +159,17 @@ class RunReport:
         absent = {"truth"} if self.true_path is None else set()
         absent |= set() if contents.lost_frames else {"lost"}
         keys = tuple(key for key in TOP_VIEW_KEY if key[0] not in absent)
-        charts = [*self._top_views(up, _caption(self._way_words(), keys))]
+        whole, larger = self._top_views(up)
+        beside = [(larger, "The same, larger.")] if larger else []
         if self.true_path is not None:
             frames = [contents.tracked_frames[k] for k in self.true_path.chosen]
-            charts.append(tag("figure", error_over_time(frames, self.true_path.errors), _caption(self._error_words())))
+            height = FLAT_HEIGHT if larger else HEIGHT
+            beside += [(error_over_time(frames, self.true_path.errors, height), self._error_words())]
+        figures = [tag("figure", picture, _caption(said)) for picture, said in beside]
+        charts = tag("figure", whole, _caption(self._way_words(), keys)), tag("div", *figures, class_="column")
         return section("trajectory", "Trajectory", tag("div", *charts, class_="charts"))
 
-    def _top_views(self, up: Float64, caption: str) -> list[str]:
+    def _top_views(self, up: Float64) -> tuple[str, str]:
         """Among the objects, and larger where it is small among them."""
         contents = self.contents
         colors = colors_by_id(contents.objects)
@@ -170,11 +182,9 @@ class RunReport:
         way = Way(contents.poses[:, :3, 3], "mine", lost_after(contents))
         true_ways = [self.true_path.positions] if self.true_path is not None else []
         whole, share = top_view([way], true_ways, footprints, up)
-        views = [whole] if share > SMALL_WAY else [whole, top_view([way], true_ways, [], up)[0]]
-        return [
-            tag("figure", views[0], caption),
-            *(tag("figure", view, _caption("The same, larger.")) for view in views[1:]),
-        ]
+        if share > SMALL_WAY:
+            return whole, ""
+        return whole, top_view([way], true_ways, [], up, FLAT_HEIGHT if true_ways else HEIGHT)[0]
 
     def _way_words(self) -> str:
         steps = np.linalg.norm(np.diff(self.contents.poses[:, :3, 3], axis=0), axis=1)

@@ -13,7 +13,7 @@ from framework.records.timings_file import StageTimes
 from framework.reporting import svg
 from framework.reporting.trajectory_chart import BOTTOM, LEFT, RIGHT, TOP, frame_axis
 
-WIDTH, HEIGHT = 560.0, 240.0
+WIDTH, HEIGHT, GROWTH_HEIGHT = 560.0, 240.0, 390.0
 MOST_POINTS = 240  # of a line: twice as many as it has pixels would not be seen
 SHOWN = ("read", *STAGES)
 
@@ -79,7 +79,7 @@ def growth(frames: Sequence[int], share: Float64, first_frames: Sequence[int], l
         first_frames: of the objects.
         last_frame: of the video.
     """
-    right, bottom, height = WIDTH - LEFT, HEIGHT - BOTTOM, HEIGHT - BOTTOM - TOP
+    right, bottom, height = WIDTH - LEFT, GROWTH_HEIGHT - BOTTOM, GROWTH_HEIGHT - BOTTOM - TOP
     first, last = min([0, *frames]), max(last_frame, 1)
     highest = max(1, len(first_frames))
 
@@ -104,4 +104,4 @@ def growth(frames: Sequence[int], share: Float64, first_frames: Sequence[int], l
     corners = np.array(steps, np.float64)
     stairs = np.stack([across(corners[:, 0]), bottom - corners[:, 1] / highest * height], axis=1)
     parts += [svg.path(stairs, class_="way objects"), frame_axis(first, last, LEFT, right, bottom)]
-    return svg.diagram(WIDTH, HEIGHT, "Surface in sight and objects found over the frames", parts)
+    return svg.diagram(WIDTH, GROWTH_HEIGHT, "Surface in sight and objects found over the frames", parts)

@@ -12,12 +12,12 @@ from scipy.spatial import ConvexHull, QhullError
 from framework.data import Float64
 from framework.reporting import svg
 
-WIDTH, HEIGHT = 560.0, 380.0  # of the viewBox
+WIDTH, HEIGHT, FLAT_HEIGHT = 560.0, 380.0, 180.0  # of the viewBox
+FOOT = 36.0  # of a view from above, for its scale
 AROUND = 0.08  # of the size of what is shown, free around it
-SMALLEST_M = 0.1  # that the shorter side of the picture shows
+SMALLEST_M = 0.04  # that the shorter side of the picture shows
 NAMED_PX = 46.0  # the width of a footprint that has its name written on it
 CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
-ERROR_HEIGHT = 170.0
 LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 34.0
 
 
@@ -45,9 +45,14 @@ def box_corners(center: Float64, extent: Float64, rotation: Float64) -> Float64:
 
 
 def top_view(
-    ways: Sequence[Way], true_ways: Sequence[Float64], objects: Sequence[Footprint], up: Float64
+    ways: Sequence[Way],
+    true_ways: Sequence[Float64],
+    objects: Sequence[Footprint],
+    up: Float64,
+    height: float = HEIGHT,
 ) -> tuple[str, float]:
     """The ways from above, the true ones dashed, among objects; and how long the ways are, as a share of its width."""
+    room = height - FOOT
     plane = _horizontal(ways[0].positions, up)
     shown = np.concatenate([way.positions for way in ways] + list(true_ways)) @ plane.T
     low, high = shown.min(axis=0), shown.max(axis=0)
@@ -56,11 +61,11 @@ def top_view(
         corners = np.concatenate([one.corners_world for one in objects]) @ plane.T
         low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
     middle, size = (low + high) / 2, (high - low) * (1 + 2 * AROUND)
-    scale = min(WIDTH / max(size[0], SMALLEST_M * WIDTH / HEIGHT), HEIGHT / max(size[1], SMALLEST_M))
+    scale = min(WIDTH / max(size[0], SMALLEST_M * WIDTH / room), room / max(size[1], SMALLEST_M))
 
     def pixels(points_world: Float64) -> Float64:
         flat = (points_world @ plane.T - middle) * scale
-        return np.asarray(np.stack([WIDTH / 2 + flat[:, 0], HEIGHT / 2 - flat[:, 1]], axis=1))
+        return np.asarray(np.stack([WIDTH / 2 + flat[:, 0], room / 2 - flat[:, 1]], axis=1))
 
     parts = [_footprint(one, pixels(one.corners_world)) for one in objects]
     parts += [svg.path(pixels(positions), class_="way truth") for positions in true_ways]
@@ -72,19 +77,19 @@ def top_view(
         parts += [svg.element("circle", cx=start[0], cy=start[1], r=5, class_="start")]
         parts += [svg.element("circle", cx=end[0], cy=end[1], r=5, class_="end")]
     length = svg.round_step(0.12 * WIDTH / scale, 1)
-    bar = np.array([[16.0, HEIGHT - 16.0], [16.0 + length * scale, HEIGHT - 16.0]])
+    bar = np.array([[16.0, height - 8.0], [16.0 + length * scale, height - 8.0]])
     label = f"{svg.number(length)} m" if length >= 1 else f"{svg.number(100 * length)} cm"
-    parts += [svg.path(bar, class_="scale"), svg.text(16, HEIGHT - 24, label, class_="tick")]
-    return svg.diagram(WIDTH, HEIGHT, "The camera's way from above", parts), way_size * scale / WIDTH
+    parts += [svg.path(bar, class_="scale"), svg.text(16, height - 16, label, class_="tick")]
+    return svg.diagram(WIDTH, height, "The camera's way from above", parts), way_size * scale / WIDTH
 
 
-def error_over_time(frames: Sequence[int], errors: Float64) -> str:
+def error_over_time(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
     """How far from the true way each of the frames is, errors (n,) m."""
     highest = max(float(1e3 * errors.max(initial=0.0)), 1e-3)
     step = svg.ticks(0, highest * 1.05, 3)
     top = max(highest * 1.08, step[-1])
     first, last = frames[0], max(frames[-1], frames[0] + 1)
-    right, bottom = WIDTH - RIGHT, ERROR_HEIGHT - BOTTOM
+    right, bottom = WIDTH - RIGHT, height - BOTTOM
     u = LEFT + (np.array(frames) - first) / (last - first) * (right - LEFT)
     v = bottom - 1e3 * errors / top * (bottom - TOP)
     parts = []
@@ -95,7 +100,7 @@ def error_over_time(frames: Sequence[int], errors: Float64) -> str:
     parts += [frame_axis(first, last, LEFT, right, bottom)]
     parts += [svg.path(np.stack([u, v], axis=1), class_="way mine")]
     parts += [svg.text(LEFT, 12, "mm from the true position", class_="tick")]
-    return svg.diagram(WIDTH, ERROR_HEIGHT, "The distance from the true position over the frames", parts)
+    return svg.diagram(WIDTH, height, "The distance from the true position over the frames", parts)
 
 
 def frame_axis(first: float, last: float, left: float, right: float, bottom: float) -> str:
