@@ -119,6 +119,7 @@ class RerunDrawing:
         T_view_camera = T_world_camera.copy()
         T_view_camera[:3] = turned(up, self._ahead) @ T_world_camera[:3]
         self._recording.send_blueprint(at.layout(T_view_camera))
+        self._recording.log(at.LOG, self._rr.TextLog("mapping begins", level="INFO"))
 
     def _note(self, note: FrameNote) -> None:
         self._set_time(note.index, note.timestamp)
