@@ -5,21 +5,31 @@ threads that share all cores wait for each other: on two cores, beside a network
 have taken up to ten times as long with two threads as with one. Each gets cores of its own instead, in proportion to
 its work. No result depends on it, as no kernel's result depends on its number of threads.
 
-This is about numba's kernels. The threads of a network are its own: they are neither limited here nor counted.
+This is about numba's kernels. The threads of a network are its own: they are neither limited here nor counted. What no
+frame waits for stands back where cores are scarce.
 """
 
 from __future__ import annotations
 
+import os
+import sys
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from statistics import median
-from threading import Lock
 
 import numba
 
+STANDING_BACK = 10  # of nice(2): a tenth of the time of others who want the same core
 RECENT = 15  # frames; their median is a frame's work
+
+
+def stand_back() -> None:
+    """Has the calling thread leave cores to others that want them. Only Linux knows that of a single thread."""
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), STANDING_BACK)
 
 
 class CoreSharing:
@@ -30,7 +40,7 @@ class CoreSharing:
         self._alone = not with_a_thread_ahead
         self._ahead: deque[float] = deque(maxlen=RECENT)  # s of CPU time a frame, of the thread itself
         self._mapping: deque[float] = deque(maxlen=RECENT)  # likewise, times its threads: it is one loop after another
-        self._lock = Lock()
+        self._lock = threading.Lock()
 
     @contextmanager
     def ahead(self) -> Iterator[None]:

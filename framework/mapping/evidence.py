@@ -566,7 +566,8 @@ class EvidenceRows:
             slots = {name: grown(getattr(self.evidence, name), capacity) for name in SLOTS}
             self.evidence = self.evidence._replace(**slots)
         self.row_count, self.voxel_count = rows, voxels
-        self._pages.ask_for_one((getattr(self.evidence, name) for name in SLOTS), voxels)
+        self._pages.ask((getattr(self.evidence, name) for name in SLOTS), voxels)
+        self._pages.ask([self.evidence.labeled], rows)
 
     def _make_room_for_instances(self, new: int) -> None:
         """Doubles the slots until every voxel has `new` free ones."""

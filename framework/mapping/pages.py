@@ -1,41 +1,66 @@
 """Memory that is only reserved is given page by page when it is first written, and a huge page is worth a wait.
 
-Measured for 2 MiB: 0.1 ms, and 5 ms in a virtual machine whose host has to find them first. The arrays of a map grow at
-the same pace, and come to new pages in the same frame.
+Measured for 2 MiB: 0.1 ms, and 5 ms in a virtual machine whose host has to find them first. So a thread of its own has
+the system give the next pages of a map's growing arrays, while the map is at work on those that it has.
 """
 
 from __future__ import annotations
 
+import ctypes
+import os
+import queue
+import sys
+import threading
 from collections.abc import Iterable
+from functools import cache
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
+from framework.core_sharing import stand_back
+
 PAGE = 2**21  # bytes, of a huge page
-SMALL = PAGE // 2
+SMALL = PAGE // 2  # bytes: what has no more in use, as the many maps of single objects, is given no page ahead
+POPULATE_WRITE = 23  # of madvise(2), Linux 5.14 and later: gives pages as if they were written, and writes nothing
 
 
 class PagesAhead:
-    """Has some growing arrays come to their new pages one after the other, before they need them."""
+    """Has growing arrays come to their new pages before they need them, on Linux; elsewhere this does nothing."""
 
     def __init__(self) -> None:
         self._given: dict[int, int] = {}  # by the address of an array: the one up to which it has memory
 
-    def ask_for_one(self, arrays: Iterable[npt.NDArray[Any]], count: int) -> None:
-        """Writes to the next page of the array that comes to it soonest, if to any within a page.
-
-        The first `count` rows of each array are in use, and what the others hold must not matter. Without huge pages
-        this does nothing for anybody.
-        """
-        soonest, chosen, rows = 0, None, np.inf
+    def ask(self, arrays: Iterable[npt.NDArray[Any]], count: int) -> None:
+        """Asks for the next page of each array that comes to it within a page; the first `count` rows are in use."""
+        if sys.platform != "linux":
+            return
         for array in arrays:
             begin: int = array.__array_interface__["data"][0]
             used = begin + count * array.strides[0]
-            given = self._given[begin] = max(self._given.get(begin, 0), -(-used // PAGE) * PAGE)
-            left = (given - used) / array.strides[0]
-            if used - begin > SMALL and given < used + PAGE and given < begin + array.nbytes and left < rows:
-                soonest, chosen, rows = begin, array, left
-        if chosen is not None:
-            chosen.reshape(-1).view(np.uint8)[self._given[soonest] - soonest] = 0
-            self._given[soonest] += PAGE
+            given = max(self._given.get(begin, 0), -(-used // PAGE) * PAGE)
+            if used - begin > SMALL and given < used + PAGE and given + PAGE <= begin + array.nbytes:
+                _asked().put((array, given))
+                given += PAGE
+            self._given[begin] = given
+
+
+@cache
+def _asked() -> queue.SimpleQueue[tuple[npt.NDArray[Any], int]]:
+    """Where pages are asked for, by an array, which lives until it has the page, and an address in it."""
+    asked: queue.SimpleQueue[tuple[npt.NDArray[Any], int]] = queue.SimpleQueue()
+    threading.Thread(target=_give, args=(asked,), name="pages", daemon=True).start()
+    return asked
+
+
+def _give(asked: queue.SimpleQueue[tuple[npt.NDArray[Any], int]]) -> None:
+    """What the thread does. A system that cannot give pages ahead gives them when they are written."""
+    stand_back()
+    madvise = ctypes.CDLL(None).madvise
+    while True:
+        array, address = asked.get()
+        madvise(ctypes.c_void_p(address), ctypes.c_size_t(PAGE), POPULATE_WRITE)
+        del array
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_asked.cache_clear)  # a child has no such thread

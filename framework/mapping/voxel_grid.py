@@ -336,7 +336,7 @@ class VoxelGrid:
                 self.grid, coords, done, self.region_count, self.block_count, blocks
             )
             if done == len(coords):
-                self._pages.ask_for_one((getattr(self.grid, name) for name in OF_BLOCKS), self.block_count)
+                self._pages.ask((getattr(self.grid, name) for name in OF_BLOCKS), self.block_count)
                 return blocks
             if self.block_count == self.max_blocks:
                 raise MapFullError(

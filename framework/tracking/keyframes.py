@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from framework.core_sharing import stand_back
 from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, check_rigid
 from framework.errors import ConfigError, DataError
 from framework.geometry import back_project, transform
@@ -158,7 +159,7 @@ class Keyframes:
             return  # whether that one becomes a keyframe or has too few features, this one is too near to it
         if not self.is_new(T_world_camera) or self._near_barren(T_world_camera):
             return
-        worker = ThreadPoolExecutor(1, "keyframe")
+        worker = ThreadPoolExecutor(1, "keyframe", stand_back)
         self._offered = T_world_camera.copy(), worker.submit(self._extracted, frame, T_world_camera.copy())
         worker.shutdown(wait=False)  # it ends with this frame
 
