@@ -70,9 +70,15 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     edges = EdgeComparison(sequence, _with_neighbours(chosen, count))
     by_delay = edges.by_delay()
     best = max(by_delay, key=lambda agreement: agreement.strength).delay if by_delay else 0
-    of_registration, late = registration.judge(by_delay, edges.by_zoom(best), delay)
-    matcher = Matcher(DelayedDepth(sequence, late) if late else sequence)
+    matcher = Matcher(sequence)
     starts = sorted({min(k, max(count - 2, 0)) for k in chosen})
+    neighbours = [matcher.pair(k, 1) for k in starts if k + 1 < count]
+    steps = np.array([pair.motion for pair in neighbours if pair is not None]) / sequence.camera.width
+    of_registration, late = registration.judge(
+        by_delay, edges.by_zoom(best), delay, float(np.median(steps)) if len(steps) else 0.0
+    )
+    if late:
+        matcher = Matcher(DelayedDepth(sequence, late))
     pairs = list(matcher.pairs(starts))
     posed = [pair for pair in pairs if _posed(pair)]
     if any(frame.T_world_camera is not None for frame in frames):
@@ -84,7 +90,8 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
         pose_delay = 0
     if not any(finding.subject == "depth" for finding in judgement.findings):  # poses know it better
         findings.append(of_depth)
-    findings += [*judgement.findings, of_registration, _steps(matcher, starts), _sharpness(frames), *_times(sequence)]
+    of_motion = _motion(steps, len(neighbours), sequence.camera.width)
+    findings += [*judgement.findings, of_registration, of_motion, _sharpness(frames), *_times(sequence)]
     shown = min(
         posed or pairs, key=lambda pair: abs(pair.motion - SHOWN_MOTION * pair.first.camera.width), default=None
     )
@@ -214,23 +221,19 @@ def _depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Find
     return Finding(Verdict.FINE, "depth", told), median
 
 
-def _steps(matcher: Matcher, starts: Sequence[int]) -> Finding:
-    """How far the images move from frame to frame."""
+def _motion(steps: Float64, neighbours: int, width: int) -> Finding:
+    """How far the images move from frame to frame: `steps`, shares of the width, of those neighbours that tell."""
     subject = "motion"
-    neighbours = [matcher.pair(k, 1) for k in starts if k + 1 < len(matcher.sequence)]
-    found = [pair for pair in neighbours if pair is not None]
     if not neighbours:
         return Finding(Verdict.UNKNOWN, subject, "there is but one frame")
-    lost = len(neighbours) - len(found)
-    if not found:
-        text = f"none of {len(neighbours)} pairs of neighbouring frames shows enough in common, or has enough texture"
+    lost = neighbours - len(steps)
+    if not len(steps):
+        text = f"none of {neighbours} pairs of neighbouring frames shows enough in common, or has enough texture"
         return Finding(Verdict.NOTE, subject, f"{text}: trackers will lose the camera")
-    width = matcher.sequence.camera.width
-    motions = np.array([pair.motion for pair in found])
-    text = f"{np.median(motions):.0f} px from frame to frame, {motions.max():.0f} px at most"
+    text = f"{width * np.median(steps):.0f} px from frame to frame, {width * steps.max():.0f} px at most"
     if lost:
-        text += f"; {lost} of {len(neighbours)} neighbours have too little in common to say"
-    fast = float(np.median(motions)) > FASTEST * width or lost > len(neighbours) // 2
+        text += f"; {lost} of {neighbours} neighbours have too little in common to say"
+    fast = float(np.median(steps)) > FASTEST or lost > neighbours // 2
     return Finding(Verdict.NOTE if fast else Verdict.FINE, subject, text)
 
 

@@ -121,10 +121,13 @@ def depth_edges(depth: Float32) -> Bool:
     return edges
 
 
-def judge(by_delay: Sequence[Agreement], by_zoom: Sequence[Agreement], applied_delay: int) -> tuple[Finding, int]:
+def judge(
+    by_delay: Sequence[Agreement], by_zoom: Sequence[Agreement], applied_delay: int, step: float
+) -> tuple[Finding, int]:
     """What the agreements say, and by how many frames the depth images must be taken later.
 
-    `by_zoom` is of the best delay; `applied_delay` is the one that the recording is read with.
+    `by_zoom` is of the best delay; `applied_delay` is the one that the recording is read with; `step` is how far the
+    image moves from frame to frame, in shares of its width: a shift of less than half of it may be of another moment.
     """
     subject = "colour and depth"
     here = next((agreement for agreement in by_delay if agreement.delay == 0), None)
@@ -142,6 +145,13 @@ def judge(by_delay: Sequence[Agreement], by_zoom: Sequence[Agreement], applied_d
         return Finding(Verdict.UNKNOWN, subject, "their edges agree nowhere, which may be for want of contrast"), 0
     if zoomed.strength < CLEARLY * here.strength:
         zoomed = here
+    apart = max(map(abs, zoomed.shift))
+    if zoomed.zoom == 1.0 and zoomed.moved and apart <= step / 2:
+        text = (
+            f"their edges lie {100 * apart:.1f} % of the width apart, and the image moves {100 * step:.1f} % a "
+            "frame: they are not of the same moment, or not registered; look where the camera is slower"
+        )
+        return Finding(Verdict.NOTE, subject, text), 0
     if zoomed.zoom != 1.0 or zoomed.moved:
         x, y = (100 * share for share in zoomed.shift)
         text = (
