@@ -7,16 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from omegaconf import DictConfig, OmegaConf
 
 from framework.color_names import COLOR_NAMES, fits, nearest_names
 from framework.data import Float32, Float64, Instance, InstanceMesh
 from framework.errors import ConfigError, DataError
 from framework.files.whole_files import is_there
-from framework.files.yaml_file import load_yaml
 from framework.object_queries import Map
 from framework.object_words import object_words
-from framework.records.stored_runs import CONFIG
+from framework.records.stored_runs import CONFIG, read_yaml
 
 BY = ("embeddings", "names")
 LEAST_MATCH = 0.1  # of names: below, an object is hardly what was asked for
@@ -95,8 +93,7 @@ def _model_of(run: Path | None) -> tuple[str, str]:
     """The model and the revision that a run's detector was made with. Raises DataError where its config has none."""
     if run is None:
         raise DataError(f"a map does not say of which model its embeddings are: {NAME_IT}, or ask by its run")
-    config = load_yaml(run / CONFIG) if is_there(run / CONFIG) else None
-    node = OmegaConf.to_container(config.detector) if isinstance(config, DictConfig) and "detector" in config else None
+    node = read_yaml(run / CONFIG).get("detector") if is_there(run / CONFIG) else None
     if isinstance(node, dict) and isinstance(node.get("model"), str):
         return node["model"], str(node.get("revision", "main"))
     raise DataError(f"{run / CONFIG} does not say of which model the embeddings are: {NAME_IT}")

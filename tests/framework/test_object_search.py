@@ -171,6 +171,14 @@ def test_a_map_is_asked_as_its_run_is(embedded: Map, run: Path, run_without: Pat
     assert query(run, f"a {absent} bed", by="names").objects == ()
 
 
+def test_a_run_that_does_not_say_its_model_is_told(embedded: Map, tmp_path: Path) -> None:
+    embedded.save(tmp_path / "map.npz")
+    for config in ("detector: null", "detector: 3", "detector: ${hydra:x}", "detector: {model: 4}", "seed: 0"):
+        (tmp_path / "config.yaml").write_text(f"{config}\n")
+        with pytest.raises(DataError, match=r"config.yaml does not say of which model the embeddings are: name it by"):
+            query(tmp_path, "bed")
+
+
 @pytest.mark.parametrize(
     ("question", "fault"),
     [
