@@ -321,7 +321,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 
 def load_scene(path: Path | str) -> SceneMap:
-    """The map that a run left behind, or that was saved, for who goes on with it. Raises likewise."""
+    """The same as `load_map`, for who goes on with the map itself."""
     from framework.mapping import instance_map
     from framework.mapping.map_file import read_format
     from framework.rivals import object_map, open3d_map, semantic_map
