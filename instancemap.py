@@ -21,7 +21,8 @@
     mesh = scene.mesh()  # vertices, triangles, colour, instance and class of each vertex; scene.mesh(it) of one object
     view = scene.view(camera, T_world_camera)  # depth, normals, colour and instances, as the camera would see them
 
-`export("outputs/demo", "glb", "usd")` writes a run for other programs.
+`export("outputs/demo", "glb", "usd")` writes a run for other programs; `query("outputs/demo", "a red chair").objects`
+are what these words mean, best first.
 
 Several threads may ask one Mapper, while it maps, too: questions wait for the frame in work.
 

@@ -42,6 +42,7 @@ from framework.interfaces import (
 from framework.journal import Journal
 from framework.kernels import compile_for_run
 from framework.object_queries import Map
+from framework.object_search import Answer, Found, Question, search
 from framework.parameters import checked_path
 from framework.pipeline import Pipeline
 from framework.records.stored_runs import MAP, PLACES
@@ -51,12 +52,14 @@ from framework.tracking.places_file import read_places
 
 __all__ = [
     "Added",
+    "Answer",
     "Camera",
     "ClusterRefiner",
     "ConfigError",
     "DataError",
     "Detections",
     "Detector",
+    "Found",
     "Frame",
     "FrameError",
     "Instance",
@@ -78,6 +81,7 @@ __all__ = [
     "export",
     "load_map",
     "open_dataset",
+    "query",
 ]
 
 
@@ -300,8 +304,24 @@ def export(
     return exports.export(Path(run), kinds, None if out is None else Path(out), chosen, up, floor)
 
 
+def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> Answer:
+    """The objects of a run, or of a map, that words mean, best first: `query("outputs/demo", "a red chair").objects`.
+
+    `by` "embeddings" compares the words with the objects' pictures, through `model`, a folder, a file or an id on
+    huggingface.co, None = that of the run's detector; "names" with class names and measured colours; None is
+    embeddings where there are any, else names. Of a map that is no run's, `model` is to be named.
+
+    Raises ConfigError for a question that is none, DataError for a run without a map, for words that nothing in it is
+    called, and for embeddings that are not there or of another model.
+    """
+    question = Question(words, by, None if model is None else str(model))
+    if isinstance(run, Map):
+        return search(run, question)
+    return search(Map(scene_of("query", Path(run))), question, Path(run))
+
+
 def load_scene(path: Path | str) -> SceneMap:
-    """The same for who goes on with it."""
+    """The same as `load_map`, for who goes on with the map itself."""
     from framework.mapping import instance_map
     from framework.mapping.map_file import read_format
     from framework.rivals import object_map, open3d_map, semantic_map

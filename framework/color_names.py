@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 
@@ -38,7 +40,7 @@ def lab(srgb: Float32) -> Float32:
 
 def nearest_names(srgb: Float32) -> Int32:
     """For each sRGB colour (N, 3) in [0, 1], the index in COLOR_NAMES of the name whose sample is nearest."""
-    away = np.linalg.norm(lab(srgb)[:, None] - _SAMPLES_LAB[None], axis=2)
+    away = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     return np.asarray(_NAME_OF_SAMPLE[away.argmin(axis=1)], np.int32)
 
 
@@ -47,12 +49,16 @@ def fits(srgb: Float32, name: str) -> Float32:
 
     1 where it is the nearest one; from there it falls, as a Gaussian, with how much farther away it is than that.
     """
-    away = np.linalg.norm(lab(srgb)[:, None] - _SAMPLES_LAB[None], axis=2)
+    away = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
     farther = away[:, COLOR_NAMES.index(name) == _NAME_OF_SAMPLE].min(axis=1) - away.min(axis=1)
     return np.asarray(np.exp(-0.5 * (farther / CONFUSED) ** 2), np.float32)
 
 
+@cache
+def _samples_lab() -> Float32:
+    """CIELAB (S, 3) of all samples; not made where this is imported, as OpenCV takes its time for the first picture."""
+    samples = [sample for samples in _SAMPLES.values() for sample in samples]
+    return lab(np.array(samples, np.float32) / np.float32(255))
+
+
 _NAME_OF_SAMPLE = np.array([k for k, samples in enumerate(_SAMPLES.values()) for _ in samples], np.int32)
-_SAMPLES_LAB = lab(
-    np.array([sample for samples in _SAMPLES.values() for sample in samples], np.float32) / np.float32(255)
-)

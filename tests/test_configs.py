@@ -11,8 +11,10 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import ConfigError, DataError
+from framework.figures.figure_choice import FigureChoice
 from framework.files.search_paths import CONF
 from framework.interfaces import RGBDSequence
+from framework.records.provenance import WITHOUT_EFFECT
 from framework.registry import (
     GROUPS,
     STAGES,
@@ -127,11 +129,16 @@ def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_w
     assert defaults[-1] == {"experiment": None}
 
 
-def test_what_shows_a_run_is_not_in_the_name_of_an_experiments_run() -> None:
-    """Else a run that was watched would not be found again."""
-    part = OmegaConf.load(CONF / "parts" / "experiment.yaml")
-    left_out = set(OmegaConf.select(part, "hydra.job.config.override_dirname.exclude_keys"))
+def test_what_changes_no_result_is_not_in_the_name_of_a_sweeps_run() -> None:
+    """Else a run that was watched, or asked for with resume=true, would not be found again."""
+    main = OmegaConf.load(CONF / "config.yaml")
+    left_out = set(OmegaConf.select(main, "hydra.job.config.override_dirname.exclude_keys"))
     shown = {
         f"viewer.{key}" for name in registered.names("viewer") for key in registered.composed("viewer", name).viewer
     }
-    assert shown - {"viewer._target_"} | {"viewer"} <= left_out
+    for name, choice in (("table", TableChoice), ("figure", FigureChoice)):
+        shown |= {f"{name}.{field.name}" for field in dataclasses.fields(choice)}
+    assert shown - {"viewer._target_"} == {key for key in left_out if "." in key}
+    tells_runs_apart, no_key_of_the_config = {"hydra", "row", "rows"}, {"experiment", "launcher"}
+    whole = {key for key in left_out if "." not in key}
+    assert set(WITHOUT_EFFECT) - tells_runs_apart == whole - no_key_of_the_config

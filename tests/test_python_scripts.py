@@ -49,7 +49,7 @@ def test_the_first_one_maps(place: Path) -> None:
     [
         ("Map what a camera gives", r"\[0\. 0\. 0\.\]"),
         ("Give the poses of another system", r"\(\d+, 3\)"),
-        ("Ask for objects", r"\d+ \w+( \w+)? 0\.\d\d \["),
+        ("Ask for objects", r"\d+ \w+( \w+)? 0\.\d\d \[(.|\n)*\d\.\d\d by names: \d+ tv \w+ \["),
         ("Which is nearest", r"\w"),
         ("What is at this pixel", r"\w"),
         ("Look at the map from elsewhere", r"\[\d+"),

@@ -34,6 +34,12 @@ def checked_sweep(overrides: Sequence[str], rows: Collection[str]) -> int:
     return prod(runs.values())
 
 
+def swept_keys(overrides: Sequence[str]) -> set[str]:
+    """The keys and groups that get several values, one after the other; the last override of a key counts."""
+    last = {override.key_or_group: override for override in OverridesParser.create().parse_overrides([*overrides])}
+    return {key for key, override in last.items() if override.is_sweep_override()}
+
+
 def check_row(asked: Sequence[str], rows: Collection[str]) -> None:
     """Raises ConfigError for the first of the rows asked for that an experiment does not have."""
     for row in asked:

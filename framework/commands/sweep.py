@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext, suppress
 from dataclasses import dataclass
 from multiprocessing import active_children
@@ -19,7 +19,7 @@ from hydra.experimental.callback import Callback
 from omegaconf import DictConfig, OmegaConf, flag_override
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.commands.choices import checked_sweep
+from framework.commands.choices import checked_sweep, swept_keys
 from framework.configs import one_line
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.directory_lock import holder, holder_name, is_locked, locked, new_directory
@@ -96,7 +96,9 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
     """
     own = config.hydra
     swept = [f"{key}={values}" for key, values in (own.sweeper.get("params") or {}).items()]
-    runs = checked_sweep([*swept, *own.overrides.task], checked_rows(config.get("rows")))
+    asked = [*swept, *own.overrides.task]
+    runs = checked_sweep(asked, checked_rows(config.get("rows")))
+    _name_by(own, swept_keys(asked))
     workers = 0
     if by_joblib(own):
         workers = min(joblib_workers(own.launcher.n_jobs), runs)
@@ -104,6 +106,17 @@ def sweep_of(config: DictConfig, with_table: bool) -> AbstractContextManager[Non
             own.launcher.n_jobs = workers
     directory = place_of("hydra.sweep.dir", own.sweep.dir)
     return sweep_in(directory, with_table, config.get("figure") is not None, workers > 1)
+
+
+def _name_by(own: DictConfig, keys: Collection[str]) -> None:
+    """Has a job's directory be named by these keys, too, of those that change no result: jobs that differ in nothing
+    else would share one. Every job is composed anew, by workers, too, from the overrides that this adds to.
+    """
+    left_out = [*own.job.config.override_dirname.exclude_keys]
+    still = [key for key in left_out if key not in keys]
+    if still != left_out:
+        with flag_override(own, ["readonly", "struct"], [False, False]):
+            own.overrides.hydra.append(f"hydra.job.config.override_dirname.exclude_keys=[{','.join(still)}]")
 
 
 def by_joblib(own: DictConfig | HydraConf) -> bool:

@@ -12,12 +12,13 @@ import numpy as np
 
 from framework.data import Camera, Float64, InstanceMesh, Int32, UInt8
 from framework.exporting.decimation import with_finer_objects
+from framework.records.instances_file import StoredInstance
 from framework.records.run_record import LIKELY
 from framework.rendering.palette import class_colors, object_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
 from framework.reporting.footage import Footage
-from framework.reporting.run_contents import MappedObject, RunContents
+from framework.reporting.run_contents import RunContents
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
 from framework.reporting.sightings import Sightings, sightings, spread_out
 
@@ -104,7 +105,7 @@ def likely_ids(contents: RunContents) -> list[int]:
     return [one.id for one in contents.objects if one.confidence >= LIKELY]
 
 
-def colors_by_id(objects: tuple[MappedObject, ...]) -> dict[int, UInt8]:
+def colors_by_id(objects: tuple[StoredInstance, ...]) -> dict[int, UInt8]:
     """RGB (3,) by id; grey for what has no place."""
     places = {one.id: one.centroid for one in objects if one.centroid is not None}
     colors = object_colors(places, {one.id for one in objects if one.confidence >= LIKELY})

@@ -9,34 +9,42 @@ import numpy as np
 
 from framework.data import Float64
 from framework.evaluation.instances import Judgement, Outcome
+from framework.records.instances_file import StoredInstance
 from framework.reporting.markup import tag, words
 from framework.reporting.pictures import Picture
-from framework.reporting.run_contents import MappedObject, RunContents
+from framework.reporting.run_contents import RunContents
+
+LIKELY_CLASSES = 6  # of an object's class distribution, that a page shows
 
 
-def sides_cm(one: MappedObject, up: Float64 | None) -> tuple[float, float, float]:
+def sides_cm(one: StoredInstance, up: Float64 | None) -> tuple[float, float, float]:
     """The sides of an object's box: the longer and the shorter level one, and its height; without `up`, by length."""
-    extent = 100 * one.extent
+    extent = 100 * one.obb.extent
     if up is None:
         a, b, c = sorted(extent.tolist(), reverse=True)
         return a, b, c
-    upright = int(np.abs(one.rotation.T @ up).argmax())
+    upright = int(np.abs(one.obb.rotation.T @ up).argmax())
     level = sorted(np.delete(extent, upright).tolist(), reverse=True)
     return level[0], level[1], float(extent[upright])
 
 
-def size_words(one: MappedObject, up: Float64 | None) -> str:
+def size_words(one: StoredInstance, up: Float64 | None) -> str:
     """The sides in cm."""
     return " × ".join(f"{side:.0f}" for side in sides_cm(one, up))
 
 
-def above_floor(one: MappedObject, contents: RunContents) -> float | None:
+def above_floor(one: StoredInstance, contents: RunContents) -> float | None:
     """How high an object's box ends below, m above the floor; None where that is not known."""
     floor, up = contents.record.metrics.get("map.floor_m"), contents.up
     if not isinstance(floor, float) or up is None:
         return None
-    half = float(0.5 * np.abs(one.rotation.T @ up) @ one.extent)
-    return float(one.center @ up) - half - floor
+    half = float(0.5 * np.abs(one.obb.rotation.T @ up) @ one.obb.extent)
+    return float(one.obb.center @ up) - half - floor
+
+
+def likeliest(one: StoredInstance) -> list[tuple[str, float]]:
+    """The classes that a page shows of an object's distribution, the most probable first."""
+    return sorted(one.class_probabilities.items(), key=lambda share: (-share[1], share[0]))[:LIKELY_CLASSES]
 
 
 def object_table(
@@ -60,7 +68,7 @@ def object_table(
 
 
 def _row(
-    one: MappedObject,
+    one: StoredInstance,
     contents: RunContents,
     color: str,
     picture: Picture | None,
@@ -98,7 +106,7 @@ def _row(
 
 
 def object_data(
-    one: MappedObject, contents: RunContents, picture: Picture | None, judgement: Judgement | None
+    one: StoredInstance, contents: RunContents, picture: Picture | None, judgement: Judgement | None
 ) -> dict[str, Any]:
     """What the panel shows of an object."""
     height = above_floor(one, contents)
@@ -106,7 +114,7 @@ def object_data(
         "id": one.id,
         "class": one.class_name,
         "confidence": one.confidence,
-        "probabilities": [[name, round(share, 4)] for name, share in one.class_probabilities],
+        "probabilities": [[name, round(share, 4)] for name, share in likeliest(one)],
         "size": f"{size_words(one, contents.up)} cm",
         "place": ", ".join(_position(one).split()) + " m",
         "height": None if height is None else f"{max(height, 0.0):.2f} m above the floor",
@@ -148,5 +156,5 @@ def meter(share: float) -> str:
     )
 
 
-def _position(one: MappedObject) -> str:
-    return "  ".join(f"{value:.2f}" for value in one.center)
+def _position(one: StoredInstance) -> str:
+    return "  ".join(f"{value:.2f}" for value in one.obb.center)

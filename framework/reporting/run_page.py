@@ -175,7 +175,7 @@ class RunReport:
         colors = colors_by_id(contents.objects)
         likely = set(likely_ids(contents))
         footprints = [
-            Footprint(box_corners(one.center, one.extent, one.rotation), one.class_name, hex_color(colors[one.id]))
+            Footprint(box_corners(one.obb), one.class_name, hex_color(colors[one.id]))
             for one in contents.objects
             if one.id in likely
         ]

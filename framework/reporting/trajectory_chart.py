@@ -9,7 +9,7 @@ from html import escape
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from framework.data import Float64
+from framework.data import Box, Float64
 from framework.reporting import svg
 
 WIDTH, HEIGHT, FLAT_HEIGHT = 560.0, 380.0, 180.0  # of the viewBox
@@ -39,9 +39,9 @@ class Way:
     lost_after: Sequence[int] = ()  # positions after which the pose was not known for a while
 
 
-def box_corners(center: Float64, extent: Float64, rotation: Float64) -> Float64:
+def box_corners(box: Box) -> Float64:
     """(8, 3) m."""
-    return np.asarray(center + (CORNERS * extent) @ rotation.T)
+    return np.asarray(box.center + (CORNERS * box.extent) @ box.rotation.T)
 
 
 def top_view(

@@ -6,11 +6,12 @@ from collections.abc import Mapping
 from typing import Any
 
 from framework.evaluation.instances import Judgement, Outcome
+from framework.records.instances_file import StoredInstance
 from framework.records.stored_runs import is_number
 from framework.reporting.markup import section, table, tag, words
 from framework.reporting.object_table import image, meter
 from framework.reporting.pictures import Picture
-from framework.reporting.run_contents import MappedObject, RunContents
+from framework.reporting.run_contents import RunContents
 from framework.reporting.truth_check import Missed, TruthCheck
 
 MAIN = {
@@ -89,7 +90,7 @@ def _gallery(css: str, name: str, says: str, cards: list[str]) -> str:
     return tag("details", head, body, open=css not in ("right", "ignored") and bool(cards))
 
 
-def _card(one: MappedObject, judgement: Judgement, picture: Picture | None) -> str:
+def _card(one: StoredInstance, judgement: Judgement, picture: Picture | None) -> str:
     near = judgement.truth_class or "something unknown"
     lines = {
         Outcome.RIGHT: f"IoU {judgement.iou:.2f}",

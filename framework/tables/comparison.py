@@ -5,13 +5,12 @@ table shows of them.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from framework.errors import ConfigError, DataError
-from framework.files.search_paths import CONF
 from framework.parameters import checked_block
 from framework.records.metrics import is_evaluation
 from framework.records.rows import CHOICE, Row, Run, natural, rows_of
@@ -27,7 +26,12 @@ from framework.tables.published import (
     read_published,
 )
 
-DEFAULT_CHOICE = CONF / "parts" / "experiment.yaml"
+PLAIN = (
+    *("instances.ap50", "instances.ap50_agnostic", "instances.ap25", "instances.ap", "instances.mean_iou"),
+    *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
+    *("stage_ms.refine.median", "stage_ms.fuse.median"),
+)
+"""The columns of a table that no experiment describes, as far as its runs have such figures: keys of metrics.json."""
 
 
 @dataclass(frozen=True)
@@ -98,17 +102,19 @@ class Comparison:
     incomplete: list[Incomplete]
     superseded: int  # records of runs that have a later one
     root: Path  # what the names of runs are relative to
+    left_out: Sequence[str] = ()  # of PLAIN, what no run has a figure of; without an experiment only
 
     @classmethod
     def below(cls, directory: Path) -> Comparison:
-        """From the records at and below `directory`, as the experiment that ran there says, else as all do.
+        """From the records at and below `directory`, as the experiment that ran there says, else with the figures of
+        PLAIN that there are.
 
         Raises DataError when there is no complete record, or when the experiment's config cannot be read.
         """
         if not directory.is_dir():
             raise DataError(f"{directory} is not a folder with records of runs")
         sweep = read_yaml(directory / SWEEP) if (directory / SWEEP).exists() else {}
-        choice = TableChoice.of(sweep.get("table") or read_yaml(DEFAULT_CHOICE)["table"])
+        choice = TableChoice.of(sweep.get("table") or {"columns": list(PLAIN)})
         overrides = sweep_rows(sweep)
         records, incomplete = find_records(directory)
         if not records:
@@ -118,7 +124,12 @@ class Comparison:
         rows = rows_of(records, keys, overrides)
         asked = asked_runs(sweep, keys)
         superseded = len(records) - sum(len(row.records) for row in rows)
-        return cls(directory.resolve().name, choice, rows, overrides, asked, incomplete, superseded, directory)
+        left_out = () if sweep.get("table") else _without_figure(choice.columns, rows)
+        if left_out:
+            choice = replace(choice, columns=[key for key in choice.columns if key not in left_out])
+        return cls(
+            directory.resolve().name, choice, rows, overrides, asked, incomplete, superseded, directory, left_out
+        )
 
     @property
     def judged(self) -> bool:
@@ -217,3 +228,9 @@ class Comparison:
     def _runs(self) -> list[Run]:
         """All that a row has or that were asked for."""
         return [*(run for row in self.rows for run in row.records), *self.asked]
+
+
+def _without_figure(columns: Sequence[str], rows: Sequence[Row]) -> list[str]:
+    """The columns that would be empty; none of them where all would, as a table without a column says nothing."""
+    empty = [key for key in columns if not any(row.values(key) for row in rows)]
+    return empty if len(empty) < len(columns) else []

@@ -7,10 +7,12 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from framework.evaluation.instances import MAX_DISTANCE
+from framework.records.metrics import is_evaluation
 from framework.records.rows import CHOICE, CONFIDENCE, Run, following
 from framework.records.stored_runs import Record
 from framework.registry import STAGES
 from framework.tables.comparison import Comparison
+from framework.tables.layouts import head
 from framework.tables.sequences import mean_by_sequence
 
 
@@ -23,6 +25,8 @@ def notes(comparison: Comparison) -> Iterator[str]:
 def _notes(comparison: Comparison) -> Iterator[str]:
     yield from _averaging(comparison)
     yield from _winners(comparison)
+    if comparison.left_out:
+        yield f"Left out, as no run has them: {_with_needs(comparison.left_out)}."
     if comparison.overrides:
         changes = (f"{name}: {' '.join(changes) or 'nothing'}" for name, changes in comparison.overrides.items())
         yield f"What each row changes: {'; '.join(changes)}."
@@ -66,6 +70,15 @@ def _averaging(comparison: Comparison) -> Iterator[str]:
             yield f"Without a row of {comparison.base_name} that they could be compared with: {'; '.join(alone)}."
 
 
+def _with_needs(columns: Sequence[str]) -> str:
+    """The heads of figures, with what a recording must have for them to be known."""
+    heads: dict[str, list[str]] = {}
+    for key in columns:
+        what = "true instances" if is_evaluation(key) else "true poses" if key.startswith("trajectory.") else ""
+        heads.setdefault(f" (only with {what})" if what else "", []).append(head(key))
+    return "; ".join(f"{', '.join(names)}{needs}" for needs, names in heads.items())
+
+
 def _winners(comparison: Comparison) -> Iterator[str]:
     """In which sequences the base is better than each of the others, and in which it loses."""
     if not comparison.choice.across:
@@ -83,7 +96,7 @@ def _winners(comparison: Comparison) -> Iterator[str]:
 
 def _protocol(comparison: Comparison) -> Iterator[str]:
     """What the instances were compared with, and how."""
-    kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if key.startswith("instances.")}
+    kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if is_evaluation(key)}
     if not kinds:
         return
     near = f"within {MAX_DISTANCE * 100:.0f} cm"

@@ -6,13 +6,16 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import instancemap
+from framework.api import query
 from framework.color_names import COLOR_NAMES
 from framework.commands.query import main
-from framework.errors import DataError
+from framework.errors import ConfigError, DataError
 from framework.interfaces import MapFuser
 from framework.object_queries import Map
 from framework.object_search import by_embedding, by_names, color_fit
@@ -153,5 +156,52 @@ def test_embeddings_need_the_model_that_they_are_of(
     status, _, err = asked(monkeypatch, capsys, "nowhere", "a bed")
     assert status == 1
     assert "expected the directory of a run" in err
-    for refused in (["a bed", "--top", "0"], [" "]):
-        assert asked(monkeypatch, capsys, str(run), *refused)[0] == 2
+    assert asked(monkeypatch, capsys, str(run), "a bed", "--top", "0")[0] == 2
+
+
+def test_a_map_is_asked_as_its_run_is(embedded: Map, run: Path, run_without: Path) -> None:
+    """A directory, its name, or a map; by names where there are no embeddings, and that is told."""
+    assert query is instancemap.query
+    answers = [query(run_without, "chairs"), query(str(run_without), "chairs"), query(embedded, "chairs", by="names")]
+    assert [answer.by for answer in answers] == ["names"] * 3
+    for answer in answers:
+        assert [(one.instance.id, one.name) for one in answer.objects] == [(1, "chair"), (3, "chair")]
+    assert (answers[0].space, answers[2].space) == ("", embedded.scene.embedding_space)
+    absent = next(color for color in COLOR_NAMES if not by_names(embedded, f"a {color} bed"))
+    assert query(run, f"a {absent} bed", by="names").objects == ()
+
+
+def test_a_run_that_does_not_say_its_model_is_told(embedded: Map, tmp_path: Path) -> None:
+    embedded.save(tmp_path / "map.npz")
+    for config in ("detector: null", "detector: 3", "detector: ${hydra:x}", "detector: {model: 4}", "seed: 0"):
+        (tmp_path / "config.yaml").write_text(f"{config}\n")
+        with pytest.raises(DataError, match=r"config.yaml does not say of which model the embeddings are: name it by"):
+            query(tmp_path, "bed")
+
+
+@pytest.mark.parametrize(
+    ("question", "fault"),
+    [
+        ({"words": " "}, r"the words to look for must be 1 to 1000 characters, found ' '"),
+        ({"words": "chair " * 200}, r"the words to look for must be 1 to 1000 characters, found 'chair chair"),
+        ({"words": 7}, r"must be 1 to 1000 characters, found 7$"),
+        ({"words": "bed", "by": "name"}, r"by must be one of embeddings, names, found 'name'"),
+        ({"words": "bed", "by": "names", "model": "clip"}, r"a model is of embeddings, and by names none is asked"),
+    ],
+)
+def test_what_is_no_question_is_said_before_anything_is_read(question: dict[str, Any], fault: str) -> None:
+    with pytest.raises(ConfigError, match=fault):
+        query("nowhere", **question)
+
+
+def test_a_question_that_cannot_be_answered_is_refused(embedded: Map, run_without: Path) -> None:
+    with pytest.raises(DataError, match=r"query: there is no nowhere/map.npz: expected the directory of a run"):
+        query("nowhere", "bed")
+    with pytest.raises(DataError, match="has no embeddings: run with detector=with_embeddings"):
+        query(run_without, "bed", model="clip")
+    with pytest.raises(DataError, match=r"this map has no embeddings: .* or ask by names"):
+        query(instancemap.load_map(run_without / "map.npz"), "bed", by="embeddings")
+    with pytest.raises(DataError, match=r"a map does not say of which model its embeddings are: name it by --model"):
+        query(embedded, "bed")
+    with pytest.raises(DataError, match="no class of this map and no colour is called 'saucer'"):
+        query(embedded, "saucer", by="names")

@@ -108,6 +108,15 @@ def test_names_that_are_no_text_are_written_as_their_codes(stored: Path, command
     assert "cup \\ud800" in texts((stored / "report.html").read_text())
 
 
+def test_an_object_of_no_class_is_an_object(stored: Path, command) -> None:
+    """As in the map of a fuser that knows no classes."""
+    entries = json.loads((stored / "instances.json").read_text())
+    entries[0] |= {"class": None, "class_probabilities": {}}
+    (stored / "instances.json").write_text(json.dumps(entries))
+    assert command(stored)[0] == 0
+    assert f"object {entries[0]['id']}" in texts((stored / "report.html").read_text())
+
+
 def test_another_run_into_the_folder_takes_the_report_with_it(stored: Path, command) -> None:
     assert command(stored)[0] == 0
     write_run(stored, frames=3)

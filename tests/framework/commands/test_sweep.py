@@ -28,6 +28,7 @@ CHECKOUT = Path(__file__).resolve().parents[3]
 FAILED = "error: a run failed: dataset tests.scenes.corner_room.CornerRoom: frames"
 PLACE = Path("outputs") / "fake_ablation"
 BY_JOBLIB = ("launcher=joblib", "hydra.launcher.n_jobs=2")
+FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
 SLOW = "dataset.slow_s=0.1"  # so that a worker that is killed is in the middle of a run, not of handing in its result
 SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # the broken ones fail
 RUNS = {f"{SLOW},row=half,seed={seed}" for seed in (1, 2, 3)}
@@ -151,8 +152,7 @@ def test_a_killed_sweep_goes_on_to_the_same_table(
 def test_a_sweep_without_an_experiment_has_one_place_and_tells_what_failed(tmp_path: Path) -> None:
     """Its place is named after the time, which workers must not read anew."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    fakes = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
-    done = end(begin(tmp_path, *fakes, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
+    done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith(
         "error: a run failed: dataset tests.scenes.corner_room.CornerRoom: frames"
@@ -160,6 +160,35 @@ def test_a_sweep_without_an_experiment_has_one_place_and_tells_what_failed(tmp_p
     [place] = (tmp_path / "multirun").iterdir()
     assert len(list(place.glob("*dataset.frames=*/instancemap.log"))) == 2
     assert not list(place.glob("*launcher*"))
+
+
+def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
+    """A sweep without an experiment, in one place; and when its runs were completed, by what their names end with."""
+    done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
+    assert done.returncode == 0, done.stderr
+    runs = (directory / "s").glob("*/metrics.json")
+    return done, {path.parent.name.partition("refiner=fake,")[2]: path.stat().st_mtime_ns for path in runs}
+
+
+def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
+    """With whatever else that changes no result: it is not in the name of a run's directory."""
+    _, first = swept(tmp_path, "seed=1,2")
+    assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
+    harmless = ("threads=1", "ahead=0", "detection_cache=read_write", f"detection_cache_dir={tmp_path}", "viewer=none")
+    done, second = swept(tmp_path, "seed=1,2,3", "resume=true", "debug=false", *harmless)
+    assert done.stderr.count("kept: the complete record in") == 2
+    assert set(second) == {*first, "seed=3,tracker=fake"}
+    assert {name: second[name] for name in first} == first
+
+
+def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp_path: Path) -> None:
+    """As those of a sweep that times them; workers name them alike."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    _, first = swept(tmp_path, "threads=1,2", "ahead=0")
+    assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
+    done, second = swept(tmp_path, "threads=1,2", "resume=true", *BY_JOBLIB)
+    assert second == first
+    assert done.stderr.count("kept: the complete record in") == 2
 
 
 @pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])

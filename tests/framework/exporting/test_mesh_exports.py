@@ -108,7 +108,8 @@ def test_the_scene_has_everything_and_each_object_where_it_stands(run: Path, tmp
 def test_triangles_between_objects_are_of_the_room(room: Room) -> None:
     ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
     mesh = replace(room.mesh, instance_ids=ids)
-    two = [StoredInstance(key, "half", 0.5, int((ids == key).sum())) for key in (1, 2)]
+    box = room.objects[0].box
+    two = [StoredInstance(key, "half", 0.5, {}, 1, 0, 0, int((ids == key).sum()), None, box) for key in (1, 2)]
     halves = replace(room, mesh=mesh, objects=objects_of(mesh, two))
     found = parts(halves)
     seams = len(found[0].mesh.triangles)

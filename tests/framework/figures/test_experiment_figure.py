@@ -35,6 +35,15 @@ def coarse(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(map_figure, "PDF_DPI", 40)
 
 
+def list_objects(directory: Path, class_name: str, vertices: list[int]) -> None:
+    """An instances.json with an object for each number of vertices."""
+    told = {"class": class_name, "confidence": 0.9, "class_probabilities": {class_name: 1.0}, "observations": 5}
+    box = {"center": [0, 0, 0], "extent": [1, 1, 1], "rotation": np.eye(3).tolist()}
+    told |= {"first_frame": 0, "last_frame": 9, "centroid": [0, 0, 0], "obb": box}
+    entries = [{"id": k, **told, "vertices": number} for k, number in enumerate(vertices, start=1)]
+    (directory / "instances.json").write_text(json.dumps(entries))
+
+
 def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
     """The record of a run that found both boxes."""
     directory = root / f"dataset.scene={scene},row={row},seed=0"
@@ -44,8 +53,7 @@ def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     mesh, poses = furnished(), walk()[:frames]
     write_mesh(directory / "mesh.ply", mesh)
-    entries = [{"id": k, "class": "chair", "confidence": 0.9, "vertices": 1538} for k in (1, 2)]
-    (directory / "instances.json").write_text(json.dumps(entries))
+    list_objects(directory, "chair", [1538, 1538])
     write_tum(directory / "trajectory.txt", np.arange(len(poses)) / 30, poses)
     times = [f"{k},{stage},{ms}" for k in range(frames) for stage, ms in (("track", 20), ("refine", 10), ("fuse", 30))]
     (directory / "timings.csv").write_text("\n".join(["frame,stage,milliseconds", *times]) + "\n")
@@ -135,8 +143,7 @@ def test_a_map_that_is_damaged_or_without_truth_is_left_out(maps: Path, caplog: 
 def test_objects_of_another_run_are_not_drawn(
     maps: Path, caplog: pytest.LogCaptureFixture, vertices: list[int]
 ) -> None:
-    entries = [{"id": k, "class": "bed", "confidence": 0.9, "vertices": n} for k, n in enumerate(vertices, start=1)]
-    (maps / "dataset.scene=011,row=part,seed=0" / "instances.json").write_text(json.dumps(entries))
+    list_objects(maps / "dataset.scene=011,row=part,seed=0", "bed", vertices)
     texts(maps)
     assert "they are not of one run; run it again" in caplog.text
 
@@ -161,7 +168,7 @@ def test_several_seeds_are_lines_of_their_own(tmp_path: Path) -> None:
 def test_the_zoomed_line_is_below(tmp_path: Path) -> None:
     root = experiment(tmp_path / "figure5", kind="maps", zoom=True)
     directory = run(root, "part", "011")
-    (directory / "instances.json").write_text('[{"id": 1, "class": "chair", "confidence": 0.9, "vertices": 1538}]')
+    list_objects(directory, "chair", [1538])
     metrics = json.loads((directory / "metrics.json").read_text())
     (directory / "metrics.json").write_text(json.dumps(metrics | {"instances.count": 1}))
     run(root, "whole", "011")

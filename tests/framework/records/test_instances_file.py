@@ -16,10 +16,14 @@ from framework.errors import DataError
 from framework.evaluation.instances import PredictedInstances
 from framework.pipeline import Pipeline
 from framework.records import instances_file
-from framework.records.instances_file import StoredInstance, read_instances, write_instances
+from framework.records.instances_file import read_instances, write_instances
 from tests.scenes.corner_room import CLASSES, CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
 
-ENTRY = {"id": 3, "class": "chair", "confidence": 0.5, "vertices": 12}
+BOX = {"center": [1, 2, 3], "extent": [0.5, 0.5, 1], "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, 1]]}
+ENTRY = {
+    **{"id": 3, "class": "chair", "confidence": 0.5, "class_probabilities": {"chair": 0.75, "couch": 0.25}},
+    **{"observations": 4, "first_frame": 2, "last_frame": 9, "centroid": [1, 2, 3], "obb": BOX, "vertices": 12},
+}
 
 
 def mapped() -> GridMap:
@@ -39,16 +43,22 @@ def nearly_equal(found: dict[int, Instance]) -> dict[int, Instance]:
     }
 
 
-def test_what_is_evaluated_reads_back_exactly(tmp_path: Path) -> None:
+def test_what_is_written_reads_back_exactly(tmp_path: Path) -> None:
     scene = mapped()
     mesh, found = scene.mesh(), nearly_equal(dict(scene.instances()))
     write_instances(tmp_path / "instances.json", mesh, found, CLASSES)
     stored = read_instances(tmp_path / "instances.json")
-    assert stored == [
-        StoredInstance(key, "couch", instance.confidence, len(instance.vertices), float(str(likely)))
-        for key, instance in found.items()
-        if (likely := instance.class_probabilities[CLASSES.index("couch")])
-    ]
+    for one, (key, instance) in zip(stored, found.items(), strict=True):
+        assert (one.id, one.class_name, one.confidence) == (key, "couch", instance.confidence)
+        np.testing.assert_array_equal(
+            np.array(list(one.class_probabilities.values()), np.float32), instance.class_probabilities
+        )
+        assert one.probability == one.class_probabilities["couch"]
+        assert (one.observations, one.vertices) == (instance.observations, len(instance.vertices))
+        assert (one.first_frame, one.last_frame) == (instance.first_frame, instance.last_frame)
+        np.testing.assert_array_equal(one.centroid, mesh.vertices[instance.vertices].mean(axis=0))
+        for name in ("center", "extent", "rotation"):
+            np.testing.assert_array_equal(getattr(one.obb, name), getattr(instance.obb, name))
     again = PredictedInstances.on_mesh(
         mesh, [one.id for one in stored], [one.confidence for one in stored], [one.class_name for one in stored]
     )
@@ -80,12 +90,29 @@ def test_probabilities_are_written_with_the_digits_of_float32(tmp_path: Path) ->
         ([ENTRY | {"id": True}], "entry 1: id"),
         ([ENTRY | {"id": 3.0}], "entry 1: id"),
         ([ENTRY | {"vertices": -1}], "entry 1: vertices"),
-        ([ENTRY | {"class": None}], "entry 1: class must be a name, found None"),
+        ([ENTRY | {"class": 7}], "entry 1: class must be a name, or null, found 7"),
+        (
+            [{key: ENTRY[key] for key in ENTRY if key != "class"}],
+            "entry 1: class must be a name, or null, found 'no cla",
+        ),
         ([ENTRY | {"confidence": 1.5}], r"entry 1: confidence must be a number in \[0, 1\], found 1.5"),
         ([ENTRY | {"confidence": float("nan")}], "entry 1: confidence"),
         ([ENTRY | {"confidence": 10**400}], "a whole number of 401 digits"),
         ([ENTRY | {"confidence": "high"}], "entry 1: confidence"),
-        ([{"id": 3}], "entry 1: class must be a name, found None"),
+        ([{"id": 3}], "entry 1: expected obb and class_probabilities with keys and values"),
+        ([ENTRY | {"obb": [1, 2, 3]}], "entry 1: expected obb and class_probabilities"),
+        ([ENTRY | {"class_probabilities": {"chair": 0.5, "couch": -1}}], "entry 1, class_probabilities: couch must be"),
+        ([ENTRY | {"observations": 1.5}], "entry 1: observations must be a whole number from 0"),
+        ([ENTRY | {"first_frame": None}], "entry 1: first_frame must be a whole number, found None"),
+        ([ENTRY | {"last_frame": True}], "entry 1: last_frame must be a whole number, found True"),
+        ([ENTRY | {"centroid": [1, 2]}], r"entry 1: centroid must hold numbers of shape \(3,\), up to 1e\+06"),
+        (
+            [ENTRY, ENTRY | {"id": 4, "obb": BOX | {"center": [1, 2, float("nan")]}}],
+            "entry 2: center must hold",
+        ),
+        ([ENTRY | {"obb": BOX | {"extent": [1e300, 1, 1]}}], "entry 1: extent must hold numbers"),
+        ([ENTRY | {"obb": BOX | {"rotation": [1, 0, 0]}}], r"entry 1: rotation must hold numbers of shape \(3, 3\)"),
+        ([ENTRY | {"obb": {}}], "entry 1: center must hold numbers"),
         ([ENTRY, ENTRY], "lists 2 instances with 1 different ids"),
     ],
 )
@@ -96,6 +123,16 @@ def test_anything_else_is_refused_in_one_line(tmp_path: Path, content: object, s
         read_instances(path)
     assert str(path) in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_an_object_without_a_class_is_an_object(tmp_path: Path) -> None:
+    """That of a map that knows no classes; the number of a frame may be a time."""
+    path = tmp_path / "instances.json"
+    last = 1_700_000_000_000
+    entry = ENTRY | {"class": None, "class_probabilities": {}, "last_frame": last, "centroid": None}
+    path.write_text(json.dumps([entry]))
+    [one] = read_instances(path)
+    assert (one.class_name, one.probability, one.last_frame, one.centroid) == ("object", None, last, None)
 
 
 def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ import xml.etree.ElementTree as ElementTree
 import numpy as np
 import pytest
 
+from framework.data import Box
 from framework.records.timings_file import StageTimes
 from framework.reporting.time_charts import growth, stage_areas, stage_rows
 from framework.reporting.trajectory_chart import (
@@ -53,7 +54,7 @@ def test_the_view_from_above_keeps_shapes_and_marks_where_the_camera_was_lost() 
 
 
 def test_objects_are_in_the_view_with_their_names_escaped() -> None:
-    corners = box_corners(np.array([4.0, 0, 0]), np.array([2.0, 1.0, 0.5]), np.eye(3))
+    corners = box_corners(Box(np.array([4.0, 0, 0]), np.array([2.0, 1.0, 0.5]), np.eye(3)))
     picture, share = top_view([Way(circle(0.1), "mine")], [], [Footprint(corners, "<cup>", "#ff0000")], UP)
     [shape] = paths(picture, "footprint")
     sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # turned, so that the way is level

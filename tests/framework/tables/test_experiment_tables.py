@@ -251,12 +251,46 @@ def test_a_figure_that_nobody_knows_is_a_dash(sweep: Path) -> None:
 
 
 def test_records_without_an_experiment_make_a_table_too(tmp_path: Path) -> None:
+    """With the columns that there are figures for: recordings of one's own have no true instances."""
+    poses = {"trajectory.ate_rmse_m": 0.012, "frames_lost": 2, "fps": 21.5}
     for name in ("a", "b"):
-        run(tmp_path, name, 0, 0.5, 1.0)
+        run(tmp_path, name, 0, None, 1.0, **poses)
     text = write_tables(tmp_path)
-    assert "| row | runs | AP50 | AP50 agnostic |" in " ".join(text.split())
-    assert "| a   |    1 | 0.500 |" in text
-    assert "less a" in text
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[2] == "| row | runs | ATE (m) | frames lost | Hz | refine (ms) | poses |"
+    assert "| a | 1 | 0.012 | 2.00 | 21.5 | 1.000 | ground_truth |" in lines
+    assert "| less a | pairs | ATE (m) | frames lost | Hz | refine (ms) |" in lines
+    told = "- Left out, as no run has them: AP50, AP50 agnostic, AP25, AP, mean IoU (only with true instances); "
+    assert [line for line in lines if "Left out" in line] == [told + "instances, fuse (ms)."]
+    assert "Transfer" not in text, "nothing was compared with true instances"
+    assert "ap50" not in (tmp_path / "table.csv").read_text()
+
+
+def test_a_figure_of_a_single_run_has_its_column(tmp_path: Path) -> None:
+    run(tmp_path, "a", 0, None, 1.0, **{"instances.mean_iou": 0.0})
+    run(tmp_path, "b", 0, 0.5, 1.0)
+    lines = [" ".join(line.split()) for line in write_tables(tmp_path).splitlines()]
+    assert lines[2] == "| row | runs | AP50 | mean IoU | refine (ms) | poses |"
+    assert "| a | 1 | – | 0.000 | 1.000 | ground_truth |" in lines
+    assert [line for line in lines if "Left out" in line] == [
+        "- Left out, as no run has them: AP50 agnostic, AP25, AP (only with true instances); "
+        "instances, frames lost, Hz, fuse (ms); ATE (m) (only with true poses)."
+    ]
+
+
+def test_records_without_any_figure_make_a_table_of_dashes(tmp_path: Path) -> None:
+    run(tmp_path, "a", 0, None, 1.0, **{"stage_ms.refine.median": None})
+    text = write_tables(tmp_path)
+    assert text.splitlines()[2].count("|") == 15  # row, runs, poses, and all eleven figures
+    assert "Left out" not in text
+
+
+def test_the_columns_of_an_experiment_stay_without_a_figure(sweep: Path) -> None:
+    for path in sweep.glob("*/metrics.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"instances.ap50": None}))
+    text = write_tables(sweep)
+    assert "| row      | runs | AP50 |" in text
+    assert "Left out" not in text
 
 
 def test_an_older_record_of_the_same_run_is_counted(sweep: Path) -> None:

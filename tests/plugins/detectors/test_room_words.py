@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from framework.api import query as query_run
 from framework.color_names import COLOR_NAMES
 from framework.commands.query import main
 from framework.detection.image_text import open_image_text
@@ -56,6 +57,11 @@ def test_the_command_finds_the_model_by_the_run(
     assert lines[0].startswith("by embeddings of room_words.safetensors@")
     assert query.split()[1] in lines[2]
     assert len(lines) <= 2 + 5
+    answer = query_run(tmp_path, query)
+    assert (answer.by, answer.space) == ("embeddings", room.scene.scene.embedding_space)
+    assert [str(one.instance.id) for one in answer.objects[:5]] == [line.split()[0] for line in lines[2:]]
+    of_the_map = query_run(room.scene, query, model=WEIGHTS)
+    assert [one.similarity for one in of_the_map.objects] == [one.similarity for one in answer.objects]
     monkeypatch.setattr("sys.argv", ["instancemap query", str(tmp_path), "a wooden chair"])
     with pytest.raises(SystemExit):
         main()
