@@ -51,9 +51,11 @@ TRIES = {  # by stage: how a new plugin is compared with ours; a viewer changes 
     "dataset": f"instancemap -m refiner=identity,gmm_em dataset=$name dataset.root=DIR {FIRST}",
     "viewer": f"instancemap viewer=$name detector=simulated {SMALL} hydra.run.dir=outputs/first_run",
 }
-SWEPT = """sweeps, and ends with a table, which is also in `outputs/first_sweep/table.md`; each run's `overview.png` is its map.
+SWEPT = """\
+sweeps, and ends with a table, which is also in `outputs/first_sweep/table.md`; each run's `overview.png` is its map.
 Without `dataset.frames` and the like it takes longer, and is enough to compare."""
-WATCHED = """maps thirty frames of a made-up room with it: `outputs/first_run/frames.jsonl` has a line for each of them.
+WATCHED = """\
+maps thirty frames of a made-up room with it: `outputs/first_run/frames.jsonl` has a line for each of them.
 `instancemap dataset=desk viewer=$name` maps a real video."""
 DATA: dict[str, tuple[type, ...]] = {  # by stage: what its methods get and give
     "detector": (Frame, Camera, Detections),

@@ -98,7 +98,7 @@ def test_nothing_is_written_over_and_nothing_half(tmp_path: Path, monkeypatch: p
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a plugin's repository for each stage and for viewers, and `env`, where all of them are installed from wheels.
+    """A folder with a plugin's repository for each group, and `env`, where all of them are installed from wheels.
 
     The libraries are those of this environment; InstanceMap itself is in its own, and nothing of the checkout.
     """
@@ -155,10 +155,9 @@ def test_each_plugins_own_tests_pass_where_it_is_installed(place: Path) -> None:
 def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
-    chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1 viewer=my_viewer"
-    said = run(
-        place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), "hydra.sweep.dir=outputs/first_sweep"
-    )
+    chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
+    more = ("viewer=my_viewer", "hydra.sweep.dir=outputs/first_sweep")
+    said = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
     records = [json.loads(path.read_text()) for path in (place / "outputs" / "first_sweep").glob("*/metrics.json")]
     assert [record["frames"] for record in records] == [3, 3]
     assert all(record["instances.count"] > 0 for record in records)
