@@ -160,9 +160,7 @@ def composition(files: Any, stage: str, name: str) -> dict[str, str]:
     and its own configs with it. Raises HydraException for an option that cannot be used.
     """
     own = files.load_config(f"{stage}/{name}")
-    if (
-        not own.defaults_list and own.header.get("package") is None
-    ):  # made of itself, which Hydra would take a while to find
+    if not own.defaults_list and own.header.get("package") is None:  # it is itself, and Hydra would take 10 ms for that
         return {f"{stage}/{name}": stage}
     chosen = OverridesParser.create().parse_overrides([f"{stage}={name}"])
     entries: Any = create_defaults_list(files, "config", chosen, prepend_hydra=False, skip_missing=False).defaults
