@@ -14,13 +14,12 @@ import tempfile
 from pathlib import Path
 from string import Template
 
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import framework
 from framework.commands.command_line import arguments, one_line_errors
-from framework.configs import config_directory
+from framework.commands.plugins import options_of
 from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
 from framework.errors import ConfigError, DataError
 from framework.registry import GROUPS
@@ -138,12 +137,6 @@ def is_value(name: str) -> bool:
     """Whether Hydra, or a YAML file, takes the word for null, a truth value or a number."""
     on_a_line = OverridesParser.create().parse_override(f"option={name}").value()
     return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
-
-
-def options_of(stage: str) -> list[str]:
-    """The names of the stage's options, whether they can be used or not."""
-    with config_directory():
-        return list(GlobalHydra.instance().config_loader().get_group_options(stage))
 
 
 def names_of(stage: str, name: str) -> dict[str, str]:
