@@ -66,7 +66,7 @@ def from_hugging_face() -> Iterator[Finding]:
         if model.startswith(SHIPPED) or not MODEL_ID.fullmatch(model):
             continue
         kept = folder / f"models--{model.replace('/', '--')}"
-        if size := max(map(_whole_size, kept.glob("snapshots/*")), default=0):
+        if size := max(map(_whole_size, kept.glob("snapshots/*/")), default=0):
             yield Finding(name, State.THERE, f"{model}, {size / 1e6:.0f} MB in {anonymous(str(folder))}")
         else:
             size_of_it = f", {MEGABYTES[model]} MB" if model in MEGABYTES else ""

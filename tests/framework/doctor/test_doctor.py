@@ -192,6 +192,7 @@ def test_models_in_the_cache_of_hugging_face_are_found_when_they_are_whole(
     blobs = snapshot.parents[1] / "blobs"
     snapshot.mkdir(parents=True)
     blobs.mkdir()
+    (snapshot.parent / ".DS_Store").touch()
     (blobs / "abc").write_bytes(b"{}")
     (blobs / "def.incomplete").write_bytes(bytes(1_000_000))
     (snapshot / "config.json").symlink_to(blobs / "abc")
