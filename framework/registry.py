@@ -159,6 +159,9 @@ def composition(files: Any, stage: str, name: str) -> dict[str, str]:
     dataset may, composes nowhere else. `files` is a loader's repository, which Hydra would read anew for every option,
     and its own configs with it. Raises HydraException for an option that cannot be used.
     """
+    own = files.load_config(f"{stage}/{name}")
+    if not own.defaults_list and own.header.get("package") is None:  # it is itself, and Hydra would take 10 ms for that
+        return {f"{stage}/{name}": stage}
     chosen = OverridesParser.create().parse_overrides([f"{stage}={name}"])
     entries: Any = create_defaults_list(files, "config", chosen, prepend_hydra=False, skip_missing=False).defaults
     return {entry.config_path: entry.package for entry in entries if entry.package.partition(".")[0] == stage}

@@ -1,6 +1,6 @@
 """`python -m framework new-plugin STAGE NAME`: a repository of one's own with a plugin that works, to begin from.
 
-What it writes stands in framework/templates: a folder for each stage, and what all stages have in common.
+What it writes stands in framework/templates: a folder for each stage and for viewers, and what all have in common.
 """
 
 from __future__ import annotations
@@ -14,16 +14,15 @@ import tempfile
 from pathlib import Path
 from string import Template
 
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import OmegaConf
 
 import framework
 from framework.commands.command_line import arguments, one_line_errors
-from framework.configs import config_directory
+from framework.commands.plugins import options_of
 from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
 from framework.errors import ConfigError, DataError
-from framework.registry import STAGES
+from framework.registry import GROUPS
 
 TEMPLATES = Path(framework.__file__).with_name("templates")
 PLACES = {  # of each template in the new repository; the first ones are those of the stage
@@ -43,19 +42,27 @@ LONGEST_NAME = 30  # characters; lines of the templates stay within 120
 FOLDERS = ("conf", "tests")  # of the repository and the package, that a module would stand in the way of
 SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
 FIRST = "hydra.sweep.dir=outputs/first_sweep"
-SWEEPS = {  # by stage: how a new plugin is compared with ours
+TRIES = {  # by stage: how a new plugin is compared with ours; a viewer changes no result, and is looked at
     "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
     "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
     "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
     "fuser": f"instancemap -m fuser=bayesian_tsdf,$name detector=simulated {SMALL} {FIRST}",
     "dataset": f"instancemap -m refiner=identity,gmm_em dataset=$name dataset.root=DIR {FIRST}",
+    "viewer": f"instancemap viewer=$name detector=simulated {SMALL} hydra.run.dir=outputs/first_run",
 }
+SWEPT = """\
+sweeps, and ends with a table, which is also in `outputs/first_sweep/table.md`; each run's `overview.png` is its map.
+Without `dataset.frames` and the like it takes longer, and is enough to compare."""
+WATCHED = """\
+maps thirty frames of a made-up room with it: `outputs/first_run/frames.jsonl` has a line for each of them.
+`instancemap dataset=desk viewer=$name` maps a real video."""
 DATA: dict[str, tuple[type, ...]] = {  # by stage: what its methods get and give
     "detector": (Frame, Camera, Detections),
     "tracker": (Frame, Camera, SurfaceView, Pose),
     "refiner": (PointClusters, Frame, Camera),
     "fuser": (Frame, Camera, Pose, PointClusters, Instance),
     "dataset": (Frame, Camera),
+    "viewer": (Frame, Camera, Detections, Pose, Instance),
 }
 VARIANTS = {  # by stage: a parameter for an option that inherits
     "detector": "tolerance: 30",
@@ -63,6 +70,7 @@ VARIANTS = {  # by stage: a parameter for an option that inherits
     "refiner": "reach: 0.6",
     "fuser": "least: 0.3",
     "dataset": "stride: 2",
+    "viewer": "min_score: 0.6",
 }
 
 
@@ -70,7 +78,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(
         description="Writes a repository with a plugin of your own, which works at once: package, option, tests, CI.",
     )
-    parser.add_argument("stage", metavar="STAGE", choices=STAGES, help=", ".join(STAGES))
+    parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=", ".join(GROUPS))
     parser.add_argument("name", metavar="NAME", help="of the option, such as my_refiner: refiner=my_refiner")
     parser.add_argument(
         "--in", dest="folder", metavar="DIR", type=Path, default=Path(), help="where to write it; else here"
@@ -81,7 +89,7 @@ def main() -> None:
         names = names_of(asked.stage, asked.name)
         print(f"written: {made}; the method is in {names['package']}/{asked.name}.py")
         print(f"  cd {made} && pip install -e '.[test]' && pytest")
-        print(f"  {names['sweep']}")
+        print(f"  {names['try']}")
 
 
 def write_repository(stage: str, name: str, folder: Path) -> Path:
@@ -131,12 +139,6 @@ def is_value(name: str) -> bool:
     return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
 
 
-def options_of(stage: str) -> list[str]:
-    """The names of the stage's options, whether they can be used or not."""
-    with config_directory():
-        return list(GlobalHydra.instance().config_loader().get_group_options(stage))
-
-
 def names_of(stage: str, name: str) -> dict[str, str]:
     """What the templates' placeholders stand for."""
     own = {
@@ -149,7 +151,9 @@ def names_of(stage: str, name: str) -> dict[str, str]:
         "variant": VARIANTS[stage],
         "data": "\n\n\n".join(map(fields_of, DATA[stage])),
     }
-    return own | {"sweep": Template(SWEEPS[stage]).substitute(own)}
+    aim, outcome = ("run", WATCHED) if stage == "viewer" else ("swept plugin", SWEPT)
+    texts = {"try": TRIES[stage], "outcome": outcome}
+    return own | {"aim": aim} | {key: Template(text).substitute(own) for key, text in texts.items()}
 
 
 def fields_of(data: type) -> str:

@@ -76,6 +76,12 @@ def registered(*stages: str, only: str | None = None) -> list[Option]:
         ]
 
 
+def options_of(stage: str) -> list[str]:
+    """The names of the stage's options, whether they can be used or not."""
+    with config_directory():
+        return list(GlobalHydra.instance().config_loader().get_group_options(stage))
+
+
 def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
     source = next(source for source in files.get_sources() if source.is_config(f"{stage}/{name}"))
     target = ""
@@ -158,11 +164,13 @@ def main() -> None:
     asked = arguments(parser)
     with one_line_errors():
         stages = [asked.stage] if asked.stage else list(GROUPS)
-        gc.disable()  # going through all that torch and Open3D leave in memory takes a fifth of the time
+        gc.disable()  # going through all that torch leaves in memory takes a fifth of the time ...
         options = registered(*stages, only=asked.name)
+        gc.freeze()  # ... and as much again when the process ends
         gc.enable()
         if asked.name and not options:
-            raise ConfigError(f"there is no {asked.stage}={asked.name}")
+            there = ", ".join(options_of(asked.stage))
+            raise ConfigError(f"there is no {asked.stage}={asked.name}; the options are: {there}")
         for stage in stages:
             print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
             described = [describe(option) for option in options if option.stage == stage]

@@ -12,14 +12,13 @@ import torch
 from torch import Tensor
 
 from framework.data import Float32, UInt8
-from framework.detection.hub_model import CONFIG, PREPROCESSING, find_model
+from framework.detection.hub_model import CONFIG, PREPROCESSING, TOKENIZER, find_model
 from framework.detection.image_text import ImageTextModel, unit_rows
 from framework.detection.transformers_parts import imported_transformers, read_part
 from framework.errors import ConfigError, DataError
 from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
-TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # where a file has none
 LONGEST_SIDE = 1024  # px of a model's pictures
 HASH_DIGITS = 16  # of a local folder's content in the name of its space

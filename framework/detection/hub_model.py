@@ -21,6 +21,8 @@ HUB_OFFLINE = ("HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE")
 
 CONFIG, PREPROCESSING = "config.json", "preprocessor_config.json"
 WHOLE, INDEX, PICKLED = "model.safetensors", "model.safetensors.index.json", "pytorch_model.bin"
+TOKENIZER = ("tokenizer.json", "tokenizer_config.json")
+OLDER_TOKENIZER = ("vocab.json", "merges.txt", "tokenizer_config.json")  # OWLv2's, as published
 
 log = logging.getLogger(__name__)
 
@@ -62,7 +64,7 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
     weights = _weights(names)
     if INDEX in weights:
         weights = _listed(folder / INDEX)
-    return folder if weights and {PREPROCESSING, *more, *weights} <= names else None
+    return folder if weights and {PREPROCESSING, *_published(more, names), *weights} <= names else None
 
 
 def _listed(index: Path) -> list[str]:
@@ -82,9 +84,15 @@ def _weights(names: Collection[str]) -> list[str]:
     return [PICKLED] if PICKLED in names else []
 
 
+def _published(more: Sequence[str], names: Collection[str]) -> Sequence[str]:
+    """`more`, with a tokenizer of the older form where a model's files are those."""
+    older = more == TOKENIZER and TOKENIZER[0] not in names and {*OLDER_TOKENIZER} <= {*names}
+    return OLDER_TOKENIZER if older else more
+
+
 def _download(model: str, revision: str, more: Sequence[str]) -> None:
     """Fetches what is needed, with progress bars of huggingface_hub, each file whole or not at all."""
-    if variable := _forbidden_by():
+    if variable := forbidden_by():
         raise DataError(
             f"detector.model: {model} is no folder, and {variable} forbids to download it: unset that, or give a local"
             " folder"
@@ -95,7 +103,7 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
     try:
         info = hub.model_info(model, revision=revision, files_metadata=True)
         files = {file.rfilename: file for file in info.siblings or ()}
-        wanted = [CONFIG, PREPROCESSING, *more, *(_weights(files) or [WHOLE])]
+        wanted = [CONFIG, PREPROCESSING, *_published(more, files), *(_weights(files) or [WHOLE])]
         if missing := [name for name in wanted if name not in files]:
             raise DataError(f"detector.model: {model} on {constants.ENDPOINT} has no {' and no '.join(missing)}")
         size = sum(files[name].size or 0 for name in wanted)
@@ -113,7 +121,7 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         _check(path, files[name])
 
 
-def _forbidden_by() -> str:
+def forbidden_by() -> str:
     """The environment variable that forbids downloads; empty where none does."""
     forbidding = [name for name in HUB_OFFLINE if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
     return (forbidding + [OFFLINE] * bool(os.environ.get(OFFLINE)) + [""])[0]

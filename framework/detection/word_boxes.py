@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from framework.data import Float32, UInt8
-from framework.detection.hub_image_text import CLIP_MEAN, CLIP_STD, TOKENIZER
-from framework.detection.hub_model import find_model
+from framework.detection.hub_image_text import CLIP_MEAN, CLIP_STD
+from framework.detection.hub_model import TOKENIZER, find_model
 from framework.detection.transformers_parts import imported_transformers, network_pixels, read_part
 from framework.errors import ConfigError, DataError
 

@@ -1,28 +1,44 @@
-"""The networks: which come with the project, and which are downloaded when they are first used."""
+"""The networks that the detectors' options name: which come with the project, and which are downloaded when first used.
+
+Whatever an option of conf/detector gives as a path of the project, a published network or a model id is listed: a new
+option needs no line here.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from framework.doctor.finding import Finding, State, anonymous
 from framework.files.search_paths import CONF, PROJECT_ROOT
 
-SHIPPED = {"maskrcnn2go": "weights", "mask_rcnn_rooms": "weights"}  # option, and its parameter that names the place
-HUGGING_FACE = {"rf_detr_seg": 134}  # option, and the MB that are downloaded
+SHIPPED = "plugins/"  # how the paths of what comes with the project begin
+MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # on huggingface.co
+MEGABYTES = {
+    "Roboflow/rf-detr-seg-nano": 134,
+    "facebook/mask2former-swin-tiny-coco-instance": 190,
+    "facebook/sam2.1-hiera-tiny": 156,
+    "google/owlv2-base-patch16-ensemble": 620,
+    "google/siglip2-base-patch16-224": 1500,
+}
+"""What is downloaded of a model id: its weights, as huggingface.co lists them."""
 
 
 def shipped() -> Iterator[Finding]:
     """Those that come with the project."""
-    for option, key in SHIPPED.items():
-        path = PROJECT_ROOT / str(_option(option)[key])
-        size = _size(path)
-        if size:
-            yield Finding(option, State.THERE, f"comes with the project, {size / 1e6:.1f} MB")
+    default = _default()
+    for name, value in _named():
+        if not value.startswith(SHIPPED):
+            continue
+        path = PROJECT_ROOT / value
+        if size := _size(path):
+            yield Finding(name, State.THERE, f"comes with the project, {size / 1e6:.1f} MB")
         else:
+            state = State.BROKEN if name == default else State.OPTIONAL
             remedy = "pip install --force-reinstall --no-deps instancemap"
-            yield Finding(option, State.BROKEN, f"{anonymous(str(path))} is missing", remedy)
+            yield Finding(name, state, f"{anonymous(str(path))} is missing", remedy)
 
 
 def downloaded() -> Iterator[Finding]:
@@ -41,28 +57,63 @@ def downloaded() -> Iterator[Finding]:
 
 def from_hugging_face() -> Iterator[Finding]:
     """Those that huggingface.co's own client keeps."""
-    home = Path(os.environ.get("HF_HOME") or Path.home() / ".cache" / "huggingface")
-    folder = Path(os.environ.get("HF_HUB_CACHE") or home / "hub")
-    off = ", but HF_HUB_OFFLINE is set" if os.environ.get("HF_HUB_OFFLINE") else ""
-    for option, megabytes in HUGGING_FACE.items():
-        model = str(_option(option)["model"])
-        size = _size(folder / f"models--{model.replace('/', '--')}" / "blobs")
-        if size:
-            yield Finding(option, State.THERE, f"{model}, {size / 1e6:.0f} MB in {anonymous(str(folder))}")
+    from framework.detection.hub_model import forbidden_by
+
+    folder = _hub_cache()
+    variable = forbidden_by()
+    off = f", but {variable} is set" if variable else ""
+    for name, model in _named():
+        if model.startswith(SHIPPED) or not MODEL_ID.fullmatch(model):
+            continue
+        kept = folder / f"models--{model.replace('/', '--')}"
+        if size := max(map(_whole_size, kept.glob("snapshots/*/")), default=0):
+            yield Finding(name, State.THERE, f"{model}, {size / 1e6:.0f} MB in {anonymous(str(folder))}")
         else:
+            size_of_it = f", {MEGABYTES[model]} MB" if model in MEGABYTES else ""
             yield Finding(
-                option,
+                name,
                 State.OPTIONAL,
-                f"{model} is not downloaded, {megabytes} MB{off}",
-                f"instancemap detector={option}",
+                f"{model} is {'only in part' if kept.exists() else 'not'} downloaded{size_of_it}{off}",
+                f"instancemap detector={name.partition('.')[0]}",
             )
 
 
-def _option(name: str) -> dict[str, object]:
+def _named() -> Iterator[tuple[str, str]]:
+    """The paths and model ids of every option, under its name; with the parameter's behind it where it has several."""
+    for path in sorted((CONF / "detector").glob("*.yaml")):
+        texts = {key: value for key, value in _content(path).items() if isinstance(value, str)}
+        places = {key: value for key, value in texts.items() if MODEL_ID.match(value)}
+        for key, value in places.items():
+            yield path.stem if len(places) == 1 else f"{path.stem}.{key}", value
+
+
+def _default() -> str:
+    """The detector of a run that names none."""
+    choices = _content(CONF / "config.yaml")["defaults"]
+    assert isinstance(choices, list)
+    return next(str(choice["detector"]) for choice in choices if isinstance(choice, dict) and "detector" in choice)
+
+
+def _content(path: Path) -> Mapping[str, object]:
     import yaml
 
-    found: dict[str, object] = yaml.safe_load((CONF / "detector" / f"{name}.yaml").read_text(encoding="utf-8"))
+    found: Mapping[str, object] = yaml.safe_load(path.read_text(encoding="utf-8"))
     return found
+
+
+def _hub_cache() -> Path:
+    """Where huggingface_hub keeps models, by the environment variables that it reads."""
+    if given := os.environ.get("HF_HUB_CACHE") or os.environ.get("HUGGINGFACE_HUB_CACHE"):
+        return Path(given)
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.get("HF_HOME") or cache / "huggingface") / "hub"
+
+
+def _whole_size(snapshot: Path) -> int:
+    """Bytes of a model that was downloaded to its end; 0 where its config or weights are not there."""
+    names = {file.name for file in snapshot.iterdir() if file.exists()}
+    whole = "config.json" in names and any(name.endswith((".safetensors", ".bin")) for name in names)
+    return _size(snapshot) if whole else 0
 
 
 def _size(path: Path) -> int:

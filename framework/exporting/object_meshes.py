@@ -12,6 +12,7 @@ from framework.exporting.decimation import decimated
 from framework.exporting.room import Room, RoomObject
 from framework.exporting.submeshes import corners_of, submesh
 from framework.geometry import inverse, transform
+from framework.progress import Progress
 
 REST = "room"  # the name of what is of no object
 
@@ -44,7 +45,7 @@ def object_parts(room: Room, triangles: int | None = None) -> list[Part]:
     found = [object_part(room, one) for one in room.objects]
     if triangles is None:
         return found
-    return [replace(part, mesh=decimated(part.mesh, triangles)) for part in found]
+    return _decimated(found, [triangles] * len(found))
 
 
 def object_part(room: Room, one: RoomObject) -> Part:
@@ -78,4 +79,16 @@ def _with_fewer(found: list[Part], triangles: int | None) -> list[Part]:
     if triangles is None or total <= triangles:
         return found
     share = triangles / total
-    return [replace(part, mesh=decimated(part.mesh, round(share * len(part.mesh.triangles)))) for part in found]
+    return _decimated(found, [round(share * len(part.mesh.triangles)) for part in found])
+
+
+def _decimated(found: Sequence[Part], most: Sequence[int]) -> list[Part]:
+    """The parts with at most so many triangles each. A million takes ten seconds, so it is shown how many are done."""
+    fewer = []
+    total = sum(len(part.mesh.triangles) for part in found)
+    with Progress(total, " triangles", unit_scale=True, leave=False) as bar:
+        for part, triangles in zip(found, most, strict=True):
+            bar.set_description(f"decimating {part.name}")
+            fewer.append(replace(part, mesh=decimated(part.mesh, triangles)))
+            bar.update(len(part.mesh.triangles))
+    return fewer

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import open3d as o3d
 
 from framework.data import Bool, Box, Float32, Float64, Instance, InstanceMesh, Int32
 from framework.mapping.instance_table import InstanceRecord, InstanceTable
@@ -141,6 +140,8 @@ def upright_box(points: Float32, up: Float64) -> Box:
 
 def oriented_box(points: Float32) -> Box:
     """The box along the principal axes of the points' convex hull (Open3D); `robust` lets flat and thin sets pass."""
+    import open3d as o3d  # takes half a second and 170 MB, and most maps know what is up
+
     four = np.resize(points, (max(len(points), 4), 3))  # Qhull refuses fewer; repeated points change nothing
     box = o3d.geometry.OrientedBoundingBox.create_from_points(
         o3d.utility.Vector3dVector(four.astype(np.float64)), robust=True

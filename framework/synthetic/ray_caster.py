@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
-import open3d as o3d
 from numba import get_num_threads
 
-from framework.data import Bool, Camera, Float32, Float64, Int32
+from framework.data import Array, Bool, Camera, Float32, Float64, Int32
+
+if TYPE_CHECKING:
+    import open3d as o3d
 
 Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 
@@ -27,24 +30,30 @@ class RayCaster:
     """Casts rays at a fixed triangle mesh, by as many threads as numba has. Safe to call from several threads."""
 
     def __init__(self, vertices: Float32, triangles: Int32) -> None:
+        import open3d as o3d
+
         # One thread builds the tree, so that ties between triangles are always decided alike.
         self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
         self._scene.add_triangles(
-            o3d.core.Tensor.from_numpy(np.ascontiguousarray(vertices, np.float32)),
-            o3d.core.Tensor.from_numpy(np.ascontiguousarray(triangles, np.uint32)),
+            _tensor(np.ascontiguousarray(vertices, np.float32)), _tensor(np.ascontiguousarray(triangles, np.uint32))
         )
 
     def cast(self, rays: Float32) -> Hits:
         """The first hits of rays (..., 6), origin and direction."""
-        answer = self._scene.cast_rays(o3d.core.Tensor.from_numpy(np.ascontiguousarray(rays)), get_num_threads())
+        answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
         return Hits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
         """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""
         rays = np.concatenate([origins, ends - origins], axis=-1).astype(np.float32)
-        tensor = o3d.core.Tensor.from_numpy(rays)
-        return np.asarray(self._scene.test_occlusions(tensor, 1e-3, 0.999, get_num_threads()).numpy())
+        return np.asarray(self._scene.test_occlusions(_tensor(rays), 1e-3, 0.999, get_num_threads()).numpy())
+
+
+def _tensor(array: Array) -> o3d.core.Tensor:
+    import open3d as o3d
+
+    return o3d.core.Tensor.from_numpy(array)
 
 
 def pixel_rays(camera: Camera, T_world_camera: Float64, u: Numbers, v: Numbers) -> Float32:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
+import open3d  # noqa: F401  # here and not in the middle of a run: boxes need it
 import simplejpeg
 from scipy.spatial.transform import Rotation
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +15,9 @@ from framework.mapping.label_rule import floored_log
 from framework.mapping.pixel_lists import list_points_by_pixel
 from framework.mapping.tsdf import Tsdf
 from framework.parameters import check_bounds
-from framework.rivals.open3d_grid import BlockGridSettings
-from framework.rivals.open3d_map import Open3DMap
+
+if TYPE_CHECKING:
+    from framework.rivals.open3d_map import Open3DMap
 
 
 @dataclass
@@ -31,6 +33,9 @@ class Open3DVoxelBlockGrid(MapFuser):
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
 
     def __post_init__(self) -> None:
+        from framework.rivals.open3d_grid import BlockGridSettings
+        from framework.rivals.open3d_map import Open3DMap
+
         check_bounds(self, class_floor=(1e-6, 0.999))
         settings = BlockGridSettings(
             voxel_size=self.tsdf.voxel_size,

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
+from typing import TYPE_CHECKING
 
 import numpy as np
-import open3d as o3d
 
 from framework.data import Array, Camera, Float32, Float64, Frame, Pose, UInt8
 from framework.geometry import nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
 from framework.parameters import check_bounds
 
-odometry = o3d.t.pipelines.odometry
+if TYPE_CHECKING:
+    import open3d as o3d
 
 
 class Method(Enum):
@@ -71,6 +72,8 @@ class Open3dOdometry(PoseTracker):
             max_turn=(1e-3, 3.15),
             min_matched=(0.0, 1.0),
         )
+        from open3d.t.pipelines import odometry
+
         iterations = (self.iterations_coarse, self.iterations_middle, self.iterations_fine)
         self._criteria = [odometry.OdometryConvergenceCriteria(count) for count in iterations]
         self._loss = odometry.OdometryLossParams(depth_outlier_trunc=self.max_distance)
@@ -105,6 +108,8 @@ class Open3dOdometry(PoseTracker):
         self, image: o3d.t.geometry.RGBDImage, reference: o3d.t.geometry.RGBDImage, frame: Frame
     ) -> tuple[Float64, str]:
         """T_last_camera, and one line that says why it is not to be trusted, empty if it is."""
+        from open3d.t.pipelines import odometry
+
         readings = np.count_nonzero((frame.depth > 0) & (frame.depth <= self.max_depth))
         if readings == 0:
             return np.eye(4), "the frame has no depth"
@@ -136,9 +141,13 @@ class Open3dOdometry(PoseTracker):
 
 
 def _rgbd_image(color: UInt8, depth: Float32) -> o3d.t.geometry.RGBDImage:
+    import open3d as o3d
+
     return o3d.t.geometry.RGBDImage(o3d.t.geometry.Image(_tensor(color)), o3d.t.geometry.Image(_tensor(depth)))
 
 
 def _tensor(array: Array) -> o3d.core.Tensor:
     """A copy: Open3D would keep the memory of an array that may be gone."""
+    import open3d as o3d
+
     return o3d.core.Tensor.from_numpy(np.ascontiguousarray(array)).clone()

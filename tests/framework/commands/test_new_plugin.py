@@ -19,7 +19,7 @@ from packaging.requirements import Requirement
 from framework.commands.new_plugin import LONGEST_NAME, check_name, files_of, write_repository
 from framework.doctor.requirements import NOT_OF_USERS
 from framework.errors import ConfigError
-from framework.registry import STAGES
+from framework.registry import GROUPS
 from tests import option_files
 
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -37,7 +37,7 @@ def test_the_example_is_what_new_plugin_writes() -> None:
 
 
 @pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
-@pytest.mark.parametrize("stage", STAGES)
+@pytest.mark.parametrize("stage", GROUPS)
 def test_what_is_written_is_in_style(stage: str, name: str, tmp_path: Path) -> None:
     """ruff also finds a name that is not defined, and a template that is no Python."""
     made = write_repository(stage, name, tmp_path)
@@ -98,13 +98,13 @@ def test_nothing_is_written_over_and_nothing_half(tmp_path: Path, monkeypatch: p
 
 @pytest.fixture(scope="module")
 def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a plugin's repository for each stage, and `env`, where all of them are installed from wheels.
+    """A folder with a plugin's repository for each group, and `env`, where all of them are installed from wheels.
 
     The libraries are those of this environment; InstanceMap itself is in its own, and nothing of the checkout.
     """
     folder = tmp_path_factory.mktemp("stranger")
     (folder / "wheels").mkdir()
-    for stage in STAGES.keys() - {"refiner"}:
+    for stage in GROUPS.keys() - {"refiner"}:
         write_repository(stage, f"my_{stage}", folder)
     line = [sys.executable, "-m", "framework", "new-plugin", "refiner", "my_refiner", "--in", str(folder)]
     said = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
@@ -146,7 +146,7 @@ def test_each_plugins_own_tests_pass_where_it_is_installed(place: Path) -> None:
     assert where.startswith(str(place))
     (place / "pytest.ini").touch()
     tests = [str(path) for path in place.glob("instancemap-my-*/tests/test_*.py")]
-    assert len(tests) == len(STAGES)
+    assert len(tests) == len(GROUPS)
     said = run(place, "python", "-m", "pytest", "--quiet", "-p", "no:dash", "--import-mode=importlib", *tests)
     assert " passed" in said
     assert "skipped" not in said
@@ -156,12 +156,14 @@ def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: P
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")
     chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
-    said = run(
-        place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), "hydra.sweep.dir=outputs/first_sweep"
-    )
+    more = ("viewer=my_viewer", "hydra.sweep.dir=outputs/first_sweep")
+    said = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
     records = [json.loads(path.read_text()) for path in (place / "outputs" / "first_sweep").glob("*/metrics.json")]
     assert [record["frames"] for record in records] == [3, 3]
     assert all(record["instances.count"] > 0 for record in records)
+    for job in ("refiner=gmm_em", "refiner=my_refiner"):
+        [log] = (place / "outputs" / "first_sweep").glob(f"*{job}*/frames.jsonl")
+        assert [json.loads(line)["frame"] for line in log.read_text().splitlines()] == [0, 1, 2]
     assert run(place, "instancemap", "tables", "outputs/first_sweep").strip() in said
     with (place / "outputs" / "first_sweep" / "table.csv").open() as table:
         rows = list(csv.DictReader(table))

@@ -2,12 +2,13 @@
 
 import hashlib
 import json
+import shutil
 import threading
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
-from framework.detection.hub_model import find_model
+from framework.detection.hub_model import TOKENIZER, find_model
 from framework.errors import DataError
 
 constants = pytest.importorskip("huggingface_hub.constants")
@@ -124,6 +125,21 @@ def test_weights_in_several_files(hub):
     assert hub.sent == ["model-00002-of-00002.safetensors"]
     (folder / "model.safetensors.index.json").write_text("[]")
     assert f"is damaged: delete {folder.parents[1]}, and run again" in fault()
+
+
+def test_a_tokenizer_comes_in_one_file_or_in_the_two_of_older_models(hub):
+    with pytest.raises(DataError, match=r"has no tokenizer\.json and no tokenizer_config\.json"):
+        find_model("somebody/something", "main", TOKENIZER)
+    hub.files |= dict.fromkeys(("vocab.json", "merges.txt", "tokenizer_config.json"), b"{}")
+    folder = find_model("somebody/something", "main", TOKENIZER)
+    assert {file.name for file in folder.iterdir()} == {*hub.files} - {"README.md"}
+    hub.sent.clear()
+    assert find_model("somebody/something", "main", TOKENIZER) == folder
+    assert not hub.sent
+    shutil.rmtree(folder.parents[1])
+    hub.files["tokenizer.json"] = b"{}"
+    names = {file.name for file in find_model("somebody/something", "main", TOKENIZER).iterdir()}
+    assert names == {*hub.files} - {"README.md", "vocab.json", "merges.txt"}
 
 
 def test_what_was_not_published_is_not_kept(hub):

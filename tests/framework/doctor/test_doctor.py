@@ -12,13 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
+from framework.detection.mask_rcnn.published_weights import PUBLISHED
 from framework.doctor import machine, networks, requirements, trial
 from framework.doctor.finding import Finding, State, anonymous, section
 from framework.kernels import DEFAULT, listed
 
 CHECKOUT = Path(__file__).resolve().parents[3]
+LOOKS = (networks.shipped, networks.downloaded, networks.from_hugging_face)
+HUB_VARIABLES = ("HF_HOME", "HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "INSTANCEMAP_OFFLINE", "TRANSFORMERS_OFFLINE")
 PROJECT = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
 
 
@@ -131,7 +135,76 @@ def test_missing_system_libraries_and_networks_are_told_with_what_gets_them(
     missing = Finding("libnone9", State.BROKEN, "libnone.so.9 is missing, for nothing", "apt-get install libnone9")
     assert list(machine.system_libraries()) == [missing]
     monkeypatch.setattr(networks, "PROJECT_ROOT", tmp_path)
-    assert {finding.state for finding in networks.shipped()} == {State.BROKEN}
+    states = {finding.name: finding.state for finding in networks.shipped()}
+    assert states.pop("maskrcnn2go") is State.BROKEN, "runs that name no detector need it"
+    assert set(states.values()) == {State.OPTIONAL}
+
+
+def test_every_option_of_a_detector_that_names_weights_is_listed() -> None:
+    """By the parameters that weights have, where `doctor` goes by what the values look like."""
+    named = [finding.name for look in LOOKS for finding in look()]
+    assert len(named) == len(set(named))
+    found: set[str] = set()
+    for path in (CHECKOUT / "conf" / "detector").glob("*.yaml"):
+        content: dict[str, Any] = yaml.safe_load(path.read_text())
+        given = {key: content[key] for key in ("weights", "model", "masks") if content.get(key, "???") != "???"}
+        for key, value in given.items():
+            found.add(value if value in PUBLISHED else path.stem if len(given) == 1 else f"{path.stem}.{key}")
+    assert found | PUBLISHED.keys() == set(named)
+    assert {"with_embeddings", "room_words", "open_vocabulary.model", "open_vocabulary.masks"} < found
+
+
+def test_a_new_option_with_weights_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    detectors = tmp_path / "conf" / "detector"
+    detectors.mkdir(parents=True)
+    (tmp_path / "conf" / "config.yaml").write_text("defaults:\n  - _self_\n  - detector: own\n")
+    (detectors / "own.yaml").write_text("_target_: some.Class\nnetwork: plugins/own.onnx # comes with the project\n")
+    (detectors / "two.yaml").write_text("first: somebody/one\nsecond: somebody/two\nwords: [a/b]\nrate: 0.5\n")
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "own.onnx").write_bytes(bytes(2_500_000))
+    monkeypatch.setattr(networks, "CONF", tmp_path / "conf")
+    monkeypatch.setattr(networks, "PROJECT_ROOT", tmp_path)
+    for name in (*HUB_VARIABLES, "HF_HUB_OFFLINE"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hub"))
+    assert [*networks.shipped()] == [Finding("own", State.THERE, "comes with the project, 2.5 MB")]
+    details = [(finding.name, finding.detail, finding.remedy) for finding in networks.from_hugging_face()]
+    assert details == [
+        ("two.first", "somebody/one is not downloaded", "instancemap detector=two"),
+        ("two.second", "somebody/two is not downloaded", "instancemap detector=two"),
+    ]
+
+
+def test_models_in_the_cache_of_hugging_face_are_found_when_they_are_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rf_detr_seg() -> tuple[State, str]:
+        return next((of.state, of.detail) for of in networks.from_hugging_face() if of.name == "rf_detr_seg")
+
+    for name in HUB_VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    model, size = "Roboflow/rf-detr-seg-nano", f"downloaded, {networks.MEGABYTES['Roboflow/rf-detr-seg-nano']} MB"
+    assert rf_detr_seg() == (State.OPTIONAL, f"{model} is not {size}, but HF_HUB_OFFLINE is set")
+    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
+    snapshot = tmp_path / "huggingface/hub/models--Roboflow--rf-detr-seg-nano/snapshots/0123"
+    blobs = snapshot.parents[1] / "blobs"
+    snapshot.mkdir(parents=True)
+    blobs.mkdir()
+    (snapshot.parent / ".DS_Store").touch()
+    (blobs / "abc").write_bytes(b"{}")
+    (blobs / "def.incomplete").write_bytes(bytes(1_000_000))
+    (snapshot / "config.json").symlink_to(blobs / "abc")
+    assert rf_detr_seg() == (State.OPTIONAL, f"{model} is only in part {size}")
+    (blobs / "def.incomplete").rename(blobs / "def")
+    (snapshot / "model.safetensors").symlink_to(blobs / "def")
+    assert rf_detr_seg() == (State.THERE, f"{model}, 1 MB in {anonymous(str(tmp_path))}/huggingface/hub")
+
+
+def test_the_size_of_every_model_id_is_known() -> None:
+    ids = {value for _, value in networks._named() if not value.startswith(networks.SHIPPED)}
+    assert ids == networks.MEGABYTES.keys()
 
 
 def test_little_room_on_a_disk_is_told(monkeypatch: pytest.MonkeyPatch) -> None:

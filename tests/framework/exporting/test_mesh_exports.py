@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
+import os
+import pty
+import struct
 import sys
+import termios
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -280,6 +285,20 @@ def test_fewer_triangles_keep_shape_colors_and_labels(room: Room) -> None:
         assert set(np.unique(part.mesh.instance_ids)) <= set(np.unique(full.mesh.instance_ids))
         np.testing.assert_array_equal(np.unique(part.mesh.colors, axis=0), np.unique(full.mesh.colors, axis=0))
     assert decimated(room.mesh, len(room.mesh.triangles)) is room.mesh
+
+
+def test_a_terminal_sees_how_many_triangles_are_decimated(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
+    monkeypatch.delenv("TQDM_DISABLE", raising=False)
+    with os.fdopen(theirs, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        parts(room, 400)
+    shown = os.read(ours, 100_000).decode()
+    os.close(ours)
+    assert "decimating room:   0%" in shown
+    for one in room.objects:
+        assert f"decimating {one.name}: " in shown
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -179,3 +180,18 @@ def test_other_models_are_refused_by_name(owlv2: Path, tmp_path: Path) -> None:
             OpenVocabulary(model=str(owlv2), masks="", device="cpu")
     finally:
         (owlv2 / "away.json").rename(owlv2 / "config.json")
+
+
+def test_a_tokenizer_of_two_files_is_read_as_owlv2_has_it(tmp_path: Path) -> None:
+    """vocab.json and merges.txt: google/owlv2-base-patch16-ensemble has no tokenizer.json."""
+    (write_owlv2(tmp_path) / "tokenizer.json").unlink()
+    letters = sorted(set("aphotofcuprbe"))
+    words = ["!", *letters, *(f"{letter}</w>" for letter in letters), "<|startoftext|>", "<|endoftext|>"]
+    end = words.index("<|endoftext|>")
+    (tmp_path / "vocab.json").write_text(json.dumps({word: k for k, word in enumerate(words)}))
+    (tmp_path / "merges.txt").write_text("#version: 0.2\n")
+    special = {"bos_token": "<|startoftext|>", "eos_token": words[end], "unk_token": words[end], "pad_token": "!"}
+    (tmp_path / "tokenizer_config.json").write_text(json.dumps({"tokenizer_class": "CLIPTokenizer", **special}))
+    tokens = WordBoxes(str(tmp_path), "main", ["cup"], CPU, half=False)._tokens["input_ids"][0]
+    letters_of = [words[k] for k in tokens if k not in (0, end - 1, end)]
+    assert "".join(letters_of).split("</w>") == ["a", "photo", "of", "a", "cup", ""]
