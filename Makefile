@@ -86,13 +86,16 @@ grep -q 'libEGL\.so\.1' <<<"$$libraries" || missing="$$missing libegl1"; \
 grep -q 'libgomp\.so\.1' <<<"$$libraries" || missing="$$missing libgomp1"
 endef
 
-# Chromium, in which tests open the pages that are written; without it they are skipped. Ubuntu's package is a stub.
+# Chromium, in which tests open the pages that are written; without it they are skipped. Ubuntu's package is a stub. What
+# drives it, playwright's node, needs libatomic1.
 .PHONY: browser
 browser:
-	@if ! command -v chromium google-chrome >/dev/null && command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
+	@PATH="$$PATH:/usr/sbin:/sbin"; \
+	if ! { command -v chromium && ldconfig -p | grep 'libatomic\.so\.1'; } >/dev/null 2>&1 \
+			&& command -v apt-get >/dev/null && test "$$(id -u)" = 0; then \
 		echo "installing chromium, for tests"; \
 		{ apt-get update && DEBIAN_FRONTEND=noninteractive apt-get install --yes --no-install-recommends \
-			chromium fonts-dejavu-core; } >/dev/null || echo "without chromium some tests are skipped"; \
+			chromium fonts-dejavu-core libatomic1; } >/dev/null || echo "without chromium some tests are skipped"; \
 	fi
 
 .PHONY: system-libraries

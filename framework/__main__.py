@@ -120,10 +120,8 @@ def main() -> None:
     if word in ("--help", "-h", "help"):
         width = max(map(len, COMMANDS))
         listed = "\n".join(f"  {name:<{width}}  {says}" for name, says in COMMANDS.items())
-        try:
-            print(HELP.format(program=program, commands=listed), end="", flush=True)
-        except OSError as error:
-            sys.exit(f"error: the help could not be written: {error.strerror}")
+        print(HELP.format(program=program, commands=listed), end="")
+        end_output("the help")
         return
     if word in COMMANDS:
         sys.argv[:2] = [f"{program} {word}"]
@@ -136,6 +134,16 @@ def main() -> None:
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # Windows has none
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
     import_module(module_of(word)).main()
+    end_output("what there is to say")
+
+
+def end_output(what: str) -> None:
+    """Writes what is still to be written to stdout, or ends the process with one line."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python tries once more when it ends
+        sys.exit(f"error: {what} could not be written: {error.strerror}")
 
 
 if __name__ == "__main__":
