@@ -120,8 +120,11 @@ def main() -> None:
     if word in ("--help", "-h", "help"):
         width = max(map(len, COMMANDS))
         listed = "\n".join(f"  {name:<{width}}  {says}" for name, says in COMMANDS.items())
-        print(HELP.format(program=program, commands=listed), end="")
-        end_output("the help")
+        try:
+            print(HELP.format(program=program, commands=listed), end="", flush=True)
+        except OSError as error:
+            drop_output()
+            sys.exit(f"error: the help could not be written: {error.strerror}")
         return
     if word in COMMANDS:
         sys.argv[:2] = [f"{program} {word}"]
@@ -133,17 +136,26 @@ def main() -> None:
         word = "run"
     if word in PRINTING and hasattr(signal, "SIGPIPE"):  # Windows has none
         signal.signal(signal.SIGPIPE, signal.SIG_DFL)
-    import_module(module_of(word)).main()
-    end_output("what there is to say")
+    try:
+        import_module(module_of(word)).main()
+    finally:
+        end_output()
 
 
-def end_output(what: str) -> None:
-    """Writes what is still to be written to stdout, or ends the process with one line."""
+def end_output() -> None:
+    """Writes what is still to be written to stdout; where it cannot, and nothing else is told, that is told."""
+    told = sys.exc_info()[0] is not None
     try:
         sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python tries once more when it ends
-        sys.exit(f"error: {what} could not be written: {error.strerror}")
+        drop_output()
+        if not told:
+            sys.exit(f"error: {error}")
+
+
+def drop_output() -> None:
+    """Writes what stdout still holds to nowhere: Python would try once more when it ends, and tell of that."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 if __name__ == "__main__":

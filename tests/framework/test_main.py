@@ -233,17 +233,15 @@ def test_a_run_with_closed_streams_leaves_its_record(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize(
-    ("words", "what"), [(["--help"], "the help"), (["plugins", "viewer", "none"], "what there is to say")]
-)
-def test_output_that_cannot_be_written_is_one_line(words: list[str], what: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("words", [["--help"], ["plugins", "viewer", "none"]], ids=" ".join)
+def test_output_that_cannot_be_written_is_one_line(words: list[str], tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         line = [sys.executable, "-m", "framework", *words]
         done = subprocess.run(
             line, cwd=tmp_path, env=environment(), stdout=full, stderr=subprocess.PIPE, text=True, check=False
         )
     assert done.returncode == 1
-    assert done.stderr == f"error: {what} could not be written: No space left on device\n"
+    assert re.fullmatch(r"error: .*No space left on device\n", done.stderr), done.stderr
 
 
 def test_a_failed_job_does_not_stop_a_sweep(tmp_path: Path) -> None:
