@@ -221,7 +221,9 @@ def best_first(labels, values, free):
     """
     best = 0
     for s in range(1, len(labels)):
-        if labels[s] != free and (values[s] > values[best] or (values[s] == values[best] and labels[s] < labels[best])):
+        if labels[s] == free:  # slots are filled from the front
+            break
+        if values[s] > values[best] or (values[s] == values[best] and labels[s] < labels[best]):
             best = s
     if best > 0:
         labels[0], labels[best] = labels[best], labels[0]
@@ -309,6 +311,7 @@ def update_voxel(evidence, voxel, measurement, point):
     class_values = evidence.class_value[voxel]
     combine = measurement.combine
     evicted = 0
+    absent = said = False
     # evidence of absence: an instance that was found in this frame, but not here
     for s in range(len(ids) if measurement.absence < 0 else 0):
         if ids[s] > 0 and measurement.matched[ids[s]]:
@@ -319,12 +322,14 @@ def update_voxel(evidence, voxel, measurement, point):
                 p = measurement.next_point[p]
             if not covered:
                 id_values[s] += measurement.absence
+                absent = True
     p = point
     while p >= 0:
         k = measurement.cluster[p]
         p = measurement.next_point[p]
         if measurement.instance_id[k] == 0:
             continue
+        said = True
         evicted += add_evidence(
             ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
         )
@@ -337,8 +342,10 @@ def update_voxel(evidence, voxel, measurement, point):
                     break
                 gain = measurement.class_said[k, label] >> NEW_CLASSES
                 evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
-    best_first(ids, id_values, 0)
-    best_class_first(classes, class_values)
+    if said or absent:
+        best_first(ids, id_values, 0)
+    if said:
+        best_class_first(classes, class_values)
     return evicted
 
 
