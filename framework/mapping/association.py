@@ -24,7 +24,7 @@ from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance, labeled_voxel, next_instance
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.object_embedding import ObjectEmbedding, agreed_space
-from framework.mapping.pixel_lists import PixelLists, cover_another
+from framework.mapping.pixel_lists import PixelLists, count_labels, cover_another
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import Pinhole
 from framework.mapping.voxel_grid import Grid
@@ -104,18 +104,6 @@ def look_up_instances(
 
 
 @njit(cache=True, nogil=True)
-def _count_visible(instance_ids, visible):
-    """Adds to visible (ids + 1,) the pixels of each instance, by runs: a counter raised by one waits for itself."""
-    label, count = np.int32(0), 0
-    for found in instance_ids.flat:
-        if found != label:
-            visible[label] += count
-            label, count = found, 0
-        count += 1
-    visible[label] += count
-
-
-@njit(cache=True, nogil=True)
 def _count_votes(pixels, cluster, instance_ids, stride, column, votes):
     """Adds to votes (N, M + 1) the points of each cluster that fall on the instance of each column, by runs.
 
@@ -144,7 +132,7 @@ def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1
     Each sample counts for the stride^2 pixels that it stands for.
     """
     visible = np.zeros(instance_ids.max() + 1, np.int32)
-    _count_visible(instance_ids, visible)
+    count_labels(instance_ids, visible)
     visible[0] = 0
     seen = np.flatnonzero(visible)
     column = np.full(len(visible), len(seen), np.int32)  # of each id in votes; the last one stands for no instance

@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from framework.data import Bool, Int32, PointClusters
 from framework.geometry import require_pixels_inside
@@ -20,6 +20,9 @@ class PixelLists(NamedTuple):
 
     first: Int32  # (H, W) the first point, -1 = under no cluster
     next: Int32  # (P,) the next point of the same pixel, -1 = last
+
+    def copy(self) -> PixelLists:
+        return PixelLists(self.first.copy(), self.next.copy())
 
 
 @njit(cache=True, nogil=True)
@@ -86,30 +89,46 @@ def _append(first, following, v, u, last, p):
     return p
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _keep_on_top(first, following, cluster, sizes, share, kept_first, kept_following):
-    """Copies each pixel's list without the points of clusters that one of less than `share` of their size lies on."""
-    for v in prange(first.shape[0]):
-        for u in range(first.shape[1]):
-            p = first[v, u]
-            if p < 0 or following[p] < 0:  # nothing lies on another here: so it is nearly everywhere
-                kept_first[v, u] = p
-                if p >= 0:
-                    kept_following[p] = -1
-                continue
-            smallest = np.float64(np.inf)
-            while p >= 0:
-                size = sizes[cluster[p]]
-                if size > 0:
-                    smallest = min(smallest, size)
-                p = following[p]
-            kept_first[v, u] = -1
-            last = np.int32(-1)
-            p = first[v, u]
-            while p >= 0:
-                if smallest >= share * sizes[cluster[p]]:
-                    last = _append(kept_first, kept_following, v, u, last, p)
-                p = following[p]
+@njit(cache=True, nogil=True)
+def count_labels(labels, counts):
+    """Adds to counts (n,) how often each label in [0, n) occurs; -1 is counted as n - 1.
+
+    By runs: a counter raised by one waits for itself.
+    """
+    label, count = np.int32(0), 0
+    for found in labels.flat:
+        if found != label:
+            counts[label] += count
+            label, count = found, 0
+        count += 1
+    counts[label] += count
+
+
+@njit(cache=True, nogil=True)
+def _keep_on_top(pixels, first, following, cluster, sizes, share, kept_first, kept_following):
+    """Makes those lists anew, of copies, that are without the points of clusters that one of less than `share` of their
+    size lies on.
+    """
+    for begin in range(pixels.shape[0]):
+        if cluster[begin] < 0 or following[begin] < 0:
+            continue  # nothing lies on another here: so it is nearly everywhere
+        u, v = pixels[begin, 0], pixels[begin, 1]
+        if first[v, u] != begin:
+            continue
+        smallest = np.float64(np.inf)
+        p = first[v, u]
+        while p >= 0:
+            size = sizes[cluster[p]]
+            if size > 0:
+                smallest = min(smallest, size)
+            p = following[p]
+        kept_first[v, u] = -1
+        last = np.int32(-1)
+        p = first[v, u]
+        while p >= 0:
+            if smallest >= share * sizes[cluster[p]]:
+                last = _append(kept_first, kept_following, v, u, last, p)
+            p = following[p]
 
 
 def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32, share: float) -> PixelLists:
@@ -121,31 +140,34 @@ def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32
     """
     if share == 0:
         return points
-    sizes = np.bincount(clusters.cluster[clusters.cluster >= 0], minlength=len(clusters))
-    sizes = np.where(instance_ids > 0, sizes, 0)
-    kept = PixelLists(np.empty_like(points.first), np.empty_like(points.next))
-    _keep_on_top(points.first, points.next, clusters.cluster, sizes, share, kept.first, kept.next)
+    counts = np.zeros(len(clusters) + 1, np.int64)
+    count_labels(clusters.cluster, counts)
+    sizes = np.where(instance_ids > 0, counts[:-1], 0)
+    kept = points.copy()
+    _keep_on_top(clusters.pixels, points.first, points.next, clusters.cluster, sizes, share, kept.first, kept.next)
     return kept
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _leave_to_others(first, following, cluster, lying, seen, stride, kept_first, kept_following):
-    """Copies each pixel's list without the points of clusters on which the instance seen there lies."""
-    for v in prange(first.shape[0]):
-        row = seen[v // stride]
-        column, left = 0, stride  # of u // stride: a division would cost more than all the rest
-        for u in range(first.shape[1]):
-            kept_first[v, u] = -1
-            last = np.int32(-1)
-            found = row[column]
-            left -= 1
-            if left == 0:
-                column, left = column + 1, stride
-            p = first[v, u]
-            while p >= 0:
-                if not lying[cluster[p], found]:
-                    last = _append(kept_first, kept_following, v, u, last, p)
-                p = following[p]
+@njit(cache=True, nogil=True)
+def _leave_to_others(pixels, cluster, lying, seen, stride, first, following):
+    """Takes the points of clusters on which the instance seen there lies out of the lists."""
+    bottom = np.zeros(lying.shape[0], np.bool_)  # clusters that something lies on
+    for k in range(lying.shape[0]):
+        bottom[k] = lying[k].any()
+    for p in range(pixels.shape[0]):
+        if cluster[p] < 0 or not bottom[cluster[p]]:
+            continue
+        u, v = pixels[p, 0], pixels[p, 1]
+        if not lying[cluster[p], seen[v // stride, u // stride]]:
+            continue
+        if first[v, u] == p:
+            first[v, u] = following[p]
+            continue
+        before = first[v, u]
+        while before >= 0 and following[before] != p:
+            before = following[before]
+        if before >= 0:  # else p is in no list
+            following[before] = following[p]
 
 
 def leave_to_others(clusters: PointClusters, points: PixelLists, lying: Bool, seen: Int32, stride: int) -> PixelLists:
@@ -153,6 +175,6 @@ def leave_to_others(clusters: PointClusters, points: PixelLists, lying: Bool, se
 
     `seen` holds the map's instance at every stride-th pixel of every stride-th row.
     """
-    kept = PixelLists(np.empty_like(points.first), np.empty_like(points.next))
-    _leave_to_others(points.first, points.next, clusters.cluster, lying, seen, stride, kept.first, kept.next)
+    kept = points.copy()
+    _leave_to_others(clusters.pixels, clusters.cluster, lying, seen, stride, kept.first, kept.next)
     return kept

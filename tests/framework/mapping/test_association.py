@@ -208,6 +208,9 @@ def test_who_leaves_a_pixel_to_what_lies_there_agrees_with_a_slow_reference(seed
         v, u = divmod(pixel, SHAPE[1])
         expected.append([k for k in at_pixel if not lying[k, seen[v // stride, u // stride]]])
     assert clusters_at(clusters, leave_to_others(clusters, points, lying, seen, stride)) == expected
+    on_top = keep_on_top(clusters, points, np.int32([3, 0, 1, 2]), 0.8)
+    both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(clusters, on_top), strict=True)]
+    assert clusters_at(clusters, leave_to_others(clusters, on_top, lying, seen, stride)) == both
     assert clusters_at(clusters, leave_to_others(clusters, points, lying & False, seen, stride)) == clusters_at(
         clusters, points
     ), "the lists given stay as they are"
