@@ -14,6 +14,7 @@ from numba import njit, prange
 from framework.data import Camera, Float32, Float64, Frame, Int32
 from framework.errors import FrameError, MapFullError
 from framework.geometry import inverse
+from framework.mapping.bit_slices import ONE, lowest_bit
 from framework.mapping.frustum import solid_blocks_in_view
 from framework.mapping.sensor import Sensor, pinhole, ray_direction
 from framework.mapping.voxel_grid import (
@@ -28,6 +29,7 @@ from framework.mapping.voxel_grid import (
 )
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
+WORD = 64  # bits
 RECENT = 1024  # block keys that a chunk remembers, to pass on each block about once
 MOST_SAMPLES = 4096  # along the band of a reading, half a block apart; the defaults have 6
 REPEATS = 8  # times that a chunk may pass on a block, in the mean: it remembers the latest ones
@@ -47,7 +49,8 @@ def _remembered(recent, key):
 
 @device
 def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
-    """The keys of the blocks at `samples` places along the truncation band of a row's readings, (samples * W,).
+    """The keys of the blocks at `samples` places along the truncation band of a row's readings, into keys[1:], place by
+    place.
 
     All that the loop reads stands in local variables, so that the compiler vectorises it.
     """
@@ -68,7 +71,7 @@ def _band_keys(readings, v, view, sensor, inverse_size, stride, samples, keys):
             by = np.int32(np.floor((ty + z * (first_y + column * step_y)) * inverse_size))
             bz = np.int32(np.floor((tz + z * (first_z + column * step_z)) * inverse_size))
             valid = (d >= nearest) & (d <= farthest)
-            keys[s * width + n] = pack_key(bx, by, bz) if valid else np.int64(NO_KEY)
+            keys[1 + s * width + n] = pack_key(bx, by, bz) if valid else np.int64(NO_KEY)
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
@@ -83,17 +86,20 @@ def _surface_blocks(depth, view, sensor, block_size, stride, samples, found, cou
     for chunk in prange(CHUNKS):
         recent = np.full(RECENT, NO_KEY, np.int64)
         readings = np.empty(columns, np.float32)
-        keys = np.empty(samples * columns, np.int64)
+        words = (samples * columns + WORD - 1) // WORD
+        keys = np.full(1 + words * WORD, NO_KEY, np.int64)
         n = 0
         for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
             for column in range(columns):
                 readings[column] = depth[row * stride, column * stride]
             _band_keys(readings, row * stride, view, sensor, inverse_size, stride, samples, keys)
-            last = np.int64(NO_KEY)
-            for i in range(samples * columns):
-                key = keys[i]
-                if key != last:
-                    last = key
+            for first in range(0, words * WORD, WORD):
+                word = np.uint64(0)  # a bit where the key is another than the one before, which the compiler vectorises
+                for i in range(WORD):
+                    word |= np.uint64(keys[first + i + 1] != keys[first + i]) << np.uint64(i)
+                while word != np.uint64(0):
+                    key = keys[1 + first + lowest_bit(word)]
+                    word &= word - ONE
                     if key != NO_KEY and not _remembered(recent, key):
                         if n < found.shape[1]:
                             found[chunk, n] = key
