@@ -132,7 +132,7 @@ def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1
     Each sample counts for the stride^2 pixels that it stands for.
     """
     visible = np.zeros(instance_ids.max() + 1, np.int32)
-    count_labels(instance_ids, visible)
+    count_labels(instance_ids.ravel(), visible)
     visible[0] = 0
     seen = np.flatnonzero(visible)
     column = np.full(len(visible), len(seen), np.int32)  # of each id in votes; the last one stands for no instance

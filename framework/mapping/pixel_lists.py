@@ -91,12 +91,12 @@ def _append(first, following, v, u, last, p):
 
 @njit(cache=True, nogil=True)
 def count_labels(labels, counts):
-    """Adds to counts (n,) how often each label in [0, n) occurs; -1 is counted as n - 1.
+    """Adds to counts (n,) how often each of labels (L,) occurs, in [0, n); -1 is counted as n - 1.
 
     By runs: a counter raised by one waits for itself.
     """
     label, count = np.int32(0), 0
-    for found in labels.flat:
+    for found in labels:
         if found != label:
             counts[label] += count
             label, count = found, 0
@@ -140,7 +140,7 @@ def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32
     """
     if share == 0:
         return points
-    counts = np.zeros(len(clusters) + 1, np.int64)
+    counts = np.zeros(len(clusters) + 1, np.int32)
     count_labels(clusters.cluster, counts)
     sizes = np.where(instance_ids > 0, counts[:-1], 0)
     kept = points.copy()
