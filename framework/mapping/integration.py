@@ -247,8 +247,7 @@ class Integrator:
         self.sensor = sensor
         self.frames = 0
         self._allocator = Allocator(voxels, sensor)
-        self._near_voxel = np.empty((0, BLOCK_VOXELS), np.uint16)
-        self._near_pixel = np.empty((0, BLOCK_VOXELS), np.int32)
+        self._near_voxel, self._near_pixel = reserved(voxels.max_blocks, _near_lists)
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what the next frame overwrites."""
@@ -275,9 +274,7 @@ class Integrator:
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
         count, n = np.empty(len(active), np.int32), len(active)
-        if len(self._near_pixel) < n:
-            self._near_voxel, self._near_pixel = reserved(self.voxels.max_blocks, _near_lists)
-        if len(self._near_pixel) < n:  # where reserving costs memory
+        if len(self._near_pixel) < n:  # where reserving costs memory, or after pickling; nothing is copied
             self._near_voxel, self._near_pixel = _near_lists(n * 9 // 8 + 1)
         seen = SeenBlocks(active, count, self._near_voxel[:n], self._near_pixel[:n])
         _integrate(

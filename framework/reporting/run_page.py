@@ -166,7 +166,9 @@ class RunReport:
             height = FLAT_HEIGHT if larger else HEIGHT
             beside += [(error_over_time(frames, self.true_path.errors, height), self._error_words())]
         figures = [tag("figure", picture, _caption(said)) for picture, said in beside]
-        charts = tag("figure", whole, _caption(self._way_words(), keys)), tag("div", *figures, class_="column")
+        charts = [tag("figure", whole, _caption(self._way_words(), keys))]
+        if figures:
+            charts.append(tag("div", *figures, class_="column"))
         return section("trajectory", "Trajectory", tag("div", *charts, class_="charts"))
 
     def _top_views(self, up: Float64) -> tuple[str, str]:

@@ -14,6 +14,7 @@ import pytest
 from framework import configs
 from framework.commands import report
 from framework.errors import DataError
+from framework.reporting import run_page
 from framework.reporting.run_page import RunReport
 from tests.reported_run import rename_class, write_run
 from tests.scenes.corner_room import CornerRoom
@@ -92,6 +93,18 @@ def test_without_the_recording_pictures_are_of_the_map_and_it_says_so(
     sources = {one["source"] for one in json.loads(re.findall(r'id="report-data">(.*?)</script>', page)[0])["objects"]}
     assert sources == {"map"}
     assert "The single objects cannot be compared any more" in texts(page)
+
+
+def test_a_view_from_above_alone_leaves_no_empty_place_beside_it(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(configs, "_added", [])  # no recording, and so no true way
+    monkeypatch.setattr(run_page, "SMALL_WAY", 0.0)  # the way is large enough among the objects
+    assert command(stored)[0] == 0
+    page = (stored / "report.html").read_text()
+    assert "The camera&#x27;s way from above" in page
+    assert "The same, larger." not in page
+    assert '<div class="column">' not in page
 
 
 def test_another_recording_in_its_place_is_not_taken_for_it(stored: Path, command, tmp_path: Path) -> None:
