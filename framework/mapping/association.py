@@ -24,7 +24,7 @@ from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance, labeled_voxel, next_instance
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.object_embedding import ObjectEmbedding, agreed_space
-from framework.mapping.pixel_lists import PixelLists, count_labels, cover_another
+from framework.mapping.pixel_lists import PixelLists, cover_another
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import Pinhole
 from framework.mapping.voxel_grid import Grid
@@ -104,41 +104,46 @@ def look_up_instances(
 
 
 @njit(cache=True, nogil=True)
-def _count_votes(pixels, cluster, instance_ids, stride, column, votes):
-    """Adds to votes (N, M + 1) the points of each cluster that fall on the instance of each column, by runs.
+def _count_samples(labels, counts):
+    """Adds to counts (n,) how often each of labels (h, w) occurs, by runs: a counter raised by one waits for itself."""
+    label, count = np.int32(0), 0
+    for found in labels.flat:
+        if found != label:
+            counts[label] += count
+            label, count = found, 0
+        count += 1
+    counts[label] += count
 
-    Divisions cost more than all the rest, so that of each coordinate is looked up; -1 = not a multiple of the stride.
-    """
-    sample = np.full(stride * max(instance_ids.shape), -1, np.int32)
-    for i in range(max(instance_ids.shape)):
-        sample[i * stride] = i
-    k, label, count = np.int32(0), np.int32(0), 0
-    for p in range(pixels.shape[0]):
-        u, v = sample[pixels[p, 0]], sample[pixels[p, 1]]
-        if cluster[p] >= 0 and u >= 0 and v >= 0:
-            found = instance_ids[v, u]
-            if found != label or cluster[p] != k:
-                if count > 0:
-                    votes[k, column[label]] += count
-                k, label, count = cluster[p], found, 0
+
+@njit(cache=True, nogil=True)
+def _count_votes(of_pixel, first, cluster, instance_ids, stride, column, votes):
+    """Adds to votes (N, M + 1) the pixels of each cluster that fall on the instance of each column, by runs."""
+    number, label, count = np.int32(0), np.int32(0), 0
+    for row in range(instance_ids.shape[0]):
+        for place in range(instance_ids.shape[1]):
+            i, found = of_pixel[row * stride, place * stride], instance_ids[row, place]
+            if i != number or found != label:
+                for k in range(first[number], first[number + 1]):
+                    votes[cluster[k], column[label]] += count
+                number, label, count = i, found, 0
             count += 1
-    if count > 0:
-        votes[k, column[label]] += count
+    for k in range(first[number], first[number + 1]):
+        votes[cluster[k], column[label]] += count
 
 
-def count_overlaps(clusters: PointClusters, instance_ids: Int32, stride: int = 1) -> Overlaps:
+def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
     """Votes of the clusters' pixels on `instance_ids` (h, w), the instances seen at every stride-th pixel.
 
     Each sample counts for the stride^2 pixels that it stands for.
     """
     visible = np.zeros(instance_ids.max() + 1, np.int32)
-    count_labels(instance_ids.ravel(), visible)
+    _count_samples(instance_ids, visible)
     visible[0] = 0
     seen = np.flatnonzero(visible)
     column = np.full(len(visible), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
     column[seen] = np.arange(len(seen), dtype=np.int32)
-    votes = np.zeros((len(clusters), len(seen) + 1), np.int32)
-    _count_votes(clusters.pixels, clusters.cluster, instance_ids, stride, column, votes)
+    votes = np.zeros((points.cluster_count, len(seen) + 1), np.int32)
+    _count_votes(points.of_pixel, points.first, points.cluster, instance_ids, stride, column, votes)
     return Overlaps(
         instance_ids=seen.astype(np.int32),
         visible=visible[seen] * stride**2,
@@ -256,11 +261,11 @@ class Association:
         )
         self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that see two as one, less those that do not
 
-    def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, clusters: PointClusters) -> Overlaps:
-        """How the clusters lie on the instances that the map has at the measured surface."""
+    def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
+        """How the clusters over each pixel lie on the instances that the map has at the measured surface."""
         stride = vote_stride(frame.camera)
         seen, *hidden = scene.instances_seen(frame, pose.T_world_camera, stride)
-        overlaps = count_overlaps(clusters, seen, stride)
+        overlaps = count_overlaps(points, seen, stride)
         return replace(overlaps, hidden=hidden[0]) if hidden else overlaps
 
     def associate(
@@ -278,9 +283,9 @@ class Association:
         if not self.split:
             may_create &= ~allowed.any(axis=1)
         if may_create.any():
-            may_create &= ~cover_another(clusters, points, self.duplicate_overlap)
+            may_create &= ~cover_another(points, clusters.scores, self.duplicate_overlap)
         if overlaps.hidden is not None and may_create.any():
-            hidden = count_overlaps(clusters, overlaps.hidden, overlaps.stride)
+            hidden = count_overlaps(points, overlaps.hidden, overlaps.stride)
             self._find_hidden(table, hidden, clusters, may_create, instance_ids)
         for k in np.flatnonzero(may_create & (instance_ids == 0)):
             instance_ids[k] = table.create(len(clusters.classes), frame_index).id

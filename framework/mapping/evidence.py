@@ -35,18 +35,25 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.errors import DataError
+from framework.mapping.bit_slices import ONE, lowest_bit
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.pages import PagesAhead
 from framework.mapping.prefetching import prefetch_line
+from framework.mapping.slot_vectors import (
+    ALL_NAMED,
+    CLASS_SLOTS,
+    NEW_CLASSES,
+    NO_CLASS,
+    add_said,
+    least_likely_slot,
+    likeliest_slot,
+)
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown, one_more, reserved
 
 Integers = npt.NDArray[Any]  # of int16, int32 or int64
 
-INSTANCE_SLOTS, CLASS_SLOTS = 4, 16  # labels that a voxel can tell apart in compact storage
+INSTANCE_SLOTS = 4  # instances that a voxel can tell apart in compact storage
 RESERVED = 128  # voxels with slots for each block of the budget: most have fewer, and slots for more are made
-NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
-ALL_NAMED = (1 << NEW_CLASSES) - 1
-NO_CLASS = 255  # in a free slot
 AHEAD = 4  # near voxels from the one in work to the one whose slots are asked for
 MERGED_AT_ONCE = 512  # voxels: where none of them knows an instance, they are passed over
 MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
@@ -73,7 +80,11 @@ class Storage(Enum):
 
 
 class Evidence(NamedTuple):
-    """How much speaks for each label, relative to every label not named. The best label is always in slot 0."""
+    """How much speaks for each label, relative to every label not named. The best label is always in slot 0.
+
+    The slots of a voxel lie together, 80 bytes in compact storage: voxels are seen in no order, and what waits for the
+    memory is then two cache lines, not four. So the arrays of slots are views of one.
+    """
 
     labeled: Int32  # (R, 512) the number of a voxel among those that have slots, -1 = it has none
     instance_ids: Int32  # (L, S), 0 = free slot
@@ -88,10 +99,10 @@ SLOTS = Evidence._fields[1:]
 class Measurement(NamedTuple):
     """What one frame's clusters say: N clusters, C classes."""
 
-    first_point: Int32  # (H, W) the first entry of each pixel's list of cluster points, -1 = under no cluster
-    next_point: Int32  # (P,) the next entry of the same pixel, -1 = last
-    cluster: Int32  # (P,) whose point it is
-    instance_id: Int32  # (N,) the instance that each cluster was associated with, 0 = none: it says nothing
+    of_pixel: Int32  # (H, W) the number of each pixel's list of clusters, as in PixelLists, 0 = under none
+    first: Int32  # (L + 1,) where the clusters of each list begin
+    cluster: Int32  # (first[L],) those that were associated with an instance: others say nothing
+    instance_id: Int32  # (N,) the instance that each cluster was associated with, 0 = none
     instance_gain: Float32  # (N,) for that instance, over any other
     absence: np.float32  # not above 0, for an instance matched in this frame but not seen here
     matched: Bool  # (ids + 1,) which instances were matched in this frame, by id
@@ -231,27 +242,12 @@ def best_first(labels, values, free):
 
 
 @device
-def _rank(label, value):
-    """Orders classes by their units, those of as many by their number, and free slots behind all."""
-    return np.int64(value) * np.int64(NO_CLASS + 1) - np.int64(label) if label != NO_CLASS else np.int64(-(1 << 62))
-
-
-@device
 def best_class_first(classes, units):
-    """best_first() of class slots, which are many: without a branch, until one may be out of place."""
-    most = units[len(classes) - 1]
-    for s in range(1, len(classes) - 1):
-        most = max(most, units[s])
-    if units[0] > most:
-        return
-    best = _rank(classes[0], units[0])
-    for s in range(1, len(classes)):
-        best = max(best, _rank(classes[s], units[s]))
-    for s in range(1, len(classes) if best != _rank(classes[0], units[0]) else 0):
-        if _rank(classes[s], units[s]) == best:
-            classes[0], classes[s] = classes[s], classes[0]
-            units[0], units[s] = units[s], units[0]
-            break
+    """best_first() of class slots."""
+    best = likeliest_slot(classes, units)
+    if best > 0:
+        classes[0], classes[best] = classes[best], classes[0]
+        units[0], units[best] = units[best], units[0]
 
 
 @device
@@ -260,76 +256,64 @@ def sum_classes(classes, units, measurement, k):
 
     Returns the number of evictions.
     """
-    most = measurement.most_units
-    said_by = measurement.class_said[k]
-    number: Any = said_by.dtype.type  # int32 where that is enough: twice as many fit into a vector
-    known = number(0)  # bits of the named classes that have a slot
-    filled = number(0)
-    too_much = number(0)
-    for s in range(len(classes)):  # without a branch, so that it is vectorised
-        said = said_by[classes[s]]
-        value = max(number(number(units[s]) + (said >> number(NEW_CLASSES))), number(-most))
-        units[s] = value
-        too_much = max(too_much, number(value - number(most)))
-        known |= said & number(ALL_NAMED)
-        filled += number(classes[s] != NO_CLASS)
+    most, said_by = measurement.most_units, measurement.class_said[k]
+    known, filled, too_much = add_said(classes, units, said_by, most)
     for s in range(filled if too_much > 0 else 0):  # the distances stay, and with them the likeliest class
         units[s] = max(units[s] - too_much, -most)
     evicted = 0
-    for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
+    rejected = False
+    missing = np.uint64(ALL_NAMED & ~known)
+    while missing != np.uint64(0):
+        m = lowest_bit(missing)
+        missing &= missing - ONE
         label = measurement.named_classes[k, m]
         if m > 0 and label == measurement.named_classes[k, 0]:
             break
-        if (known >> m) & 1:
-            continue
-        gain = measurement.class_said[k, label] >> NEW_CLASSES
-        least = filled
-        if filled == len(classes):
-            evicted += 1
-            least = 0
-            for s in range(1, len(classes)):
-                least = s if units[s] < units[least] else least
-            if units[least] >= gain:
-                continue  # the newcomer is itself the least likely: it is the one that is dropped
-        else:
+        evicted += rejected
+        if rejected:
+            continue  # so is each one after it, of which the cluster says less
+        gain = said_by[label] >> NEW_CLASSES
+        place = filled
+        if filled < len(classes):
             filled += 1
-        classes[least] = label
-        units[least] = gain
+        else:
+            evicted += 1
+            place = least_likely_slot(units)
+            rejected = units[place] >= gain  # the newcomer is itself the least likely: it is the one that is dropped
+        if not rejected:
+            classes[place] = label
+            units[place] = gain
     return evicted
 
 
 @device
-def update_voxel(evidence, voxel, measurement, point):
-    """Both recursions for one labelled voxel, seen at a pixel whose list of cluster points starts at `point`, -1 =
-    empty.
+def update_voxel(evidence, voxel, measurement, number):
+    """Both recursions for one labelled voxel, seen at a pixel with that `number` of a list of clusters.
 
     Returns the number of evictions.
     """
+    first, last = measurement.first[number], measurement.first[number + 1]
     ids = evidence.instance_ids[voxel]
     id_values = evidence.instance_value[voxel]
     classes = evidence.class_ids[voxel]
     class_values = evidence.class_value[voxel]
     combine = measurement.combine
     evicted = 0
-    absent = said = False
+    absent = False
+    said = first < last
     # evidence of absence: an instance that was found in this frame, but not here
     for s in range(len(ids) if measurement.absence < 0 else 0):
-        if ids[s] > 0 and measurement.matched[ids[s]]:
+        if ids[s] == 0:  # slots are filled from the front
+            break
+        if measurement.matched[ids[s]]:
             covered = False
-            p = point
-            while p >= 0:
-                covered = covered or measurement.instance_id[measurement.cluster[p]] == ids[s]
-                p = measurement.next_point[p]
+            for place in range(first, last):
+                covered = covered or measurement.instance_id[measurement.cluster[place]] == ids[s]
             if not covered:
                 id_values[s] += measurement.absence
                 absent = True
-    p = point
-    while p >= 0:
-        k = measurement.cluster[p]
-        p = measurement.next_point[p]
-        if measurement.instance_id[k] == 0:
-            continue
-        said = True
+    for place in range(first, last):
+        k = measurement.cluster[place]
         evicted += add_evidence(
             ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
         )
@@ -342,7 +326,7 @@ def update_voxel(evidence, voxel, measurement, point):
                     break
                 gain = measurement.class_said[k, label] >> NEW_CLASSES
                 evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
-    if said or absent:
+    if (said or absent) and ids[1] != 0:
         best_first(ids, id_values, 0)
     if said:
         best_class_first(classes, class_values)
@@ -350,11 +334,9 @@ def update_voxel(evidence, voxel, measurement, point):
 
 
 @device
-def _is_named(measurement, point):
-    """Whether one of a pixel's list of cluster points, -1 = empty, is of a cluster with an instance."""
-    while point >= 0 and measurement.instance_id[measurement.cluster[point]] == 0:
-        point = measurement.next_point[point]
-    return point >= 0
+def _is_named(measurement, number):
+    """Whether the list of clusters with that number has any."""
+    return measurement.first[number] < measurement.first[number + 1]
 
 
 @device
@@ -371,38 +353,42 @@ def _label(evidence, row, n, voxel, free_classes):
 
 @device
 def _ask_for_slots(evidence, voxel):
-    """Has a labelled voxel's slots loaded while the processor goes on."""
-    i = np.int64(voxel)
-    prefetch_line(evidence.instance_ids, i * evidence.instance_ids.shape[1] * evidence.instance_ids.itemsize)
-    prefetch_line(evidence.instance_value, i * evidence.instance_value.shape[1] * evidence.instance_value.itemsize)
-    prefetch_line(evidence.class_ids, i * evidence.class_ids.shape[1])
-    prefetch_line(evidence.class_value, i * evidence.class_value.shape[1] * evidence.class_value.itemsize)
+    """Has a labelled voxel's slots loaded while the processor goes on: in compact storage all of them."""
+    size = evidence.instance_ids.strides[0]
+    first = np.int64(voxel) * size
+    prefetch_line(evidence.instance_ids, first)
+    prefetch_line(evidence.instance_ids, first + size - 1)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _update(grid, seen, evidence, measurement, first_point, new, evicted):
+def _update(grid, seen, evidence, measurement, of_pixel, new, evicted):
     """Updates the near voxels of the seen blocks that have slots.
 
     Counts in new (A,) those without that lie under a cluster with an instance, in evicted (A,) slots given away.
     """
     for a in prange(seen.blocks.shape[0]):
-        evicted[a] = new[a] = 0
         row = grid.label_row[seen.blocks[a]]
-        last = seen.near_count[a] - 1
-        for i in range(seen.near_count[a]):
-            later = evidence.labeled[row, seen.near_voxel[a, min(i + AHEAD, last)]] if row >= 0 else np.int32(-1)
-            if later >= 0:
-                _ask_for_slots(evidence, later)
-            point = first_point[seen.near_pixel[a, i]]
-            voxel = evidence.labeled[row, seen.near_voxel[a, i]] if row >= 0 else np.int32(-1)
-            if voxel >= 0:
-                evicted[a] += update_voxel(evidence, voxel, measurement, point)
-            else:
-                new[a] = one_more(new[a], _is_named(measurement, point))
+        first, last = seen.near_first[a], seen.near_first[a] + seen.near_count[a]
+        given_away = without_slots = np.int32(0)
+        if row < 0:
+            for i in range(first, last):
+                without_slots = one_more(without_slots, _is_named(measurement, of_pixel[seen.near_pixel[i]]))
+        else:
+            labeled = evidence.labeled[row]
+            for i in range(first, last):
+                later = labeled[seen.near_voxel[min(i + AHEAD, last - 1)]]
+                if later >= 0:
+                    _ask_for_slots(evidence, later)
+                number, voxel = of_pixel[seen.near_pixel[i]], labeled[seen.near_voxel[i]]
+                if voxel >= 0:
+                    given_away += update_voxel(evidence, voxel, measurement, number)
+                else:
+                    without_slots = one_more(without_slots, _is_named(measurement, number))
+        evicted[a], new[a] = given_away, without_slots
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _label_new(grid, seen, evidence, measurement, first_point, new, first_new, free_classes, evicted):
+def _label_new(grid, seen, evidence, measurement, of_pixel, new, first_new, free_classes, evicted):
     """Gives the new (A,) voxels of each block their slots, from first_new (A,) on, and has them updated.
 
     free_classes (T,) is what slots for classes hold before; slots given away are added to evicted (A,).
@@ -410,11 +396,12 @@ def _label_new(grid, seen, evidence, measurement, first_point, new, first_new, f
     for a in prange(seen.blocks.shape[0]):
         voxel = first_new[a]
         row = grid.label_row[seen.blocks[a]]
-        for i in range(seen.near_count[a] if new[a] > 0 else 0):
-            point, n = first_point[seen.near_pixel[a, i]], seen.near_voxel[a, i]
-            if evidence.labeled[row, n] < 0 and _is_named(measurement, point):
+        first = seen.near_first[a]
+        for i in range(first, first + seen.near_count[a] if new[a] > 0 else first):
+            number, n = of_pixel[seen.near_pixel[i]], seen.near_voxel[i]
+            if evidence.labeled[row, n] < 0 and _is_named(measurement, number):
                 _label(evidence, row, n, voxel, free_classes)
-                evicted[a] += update_voxel(evidence, voxel, measurement, point)
+                evicted[a] += update_voxel(evidence, voxel, measurement, number)
                 voxel += np.int32(1)
 
 
@@ -449,16 +436,15 @@ def _merge_voxel(ids, values, kept, dropped, combine):
 
 @njit(cache=True, nogil=True, parallel=True)
 def _merge(evidence, count, kept, dropped, combine):
-    slots = evidence.instance_ids.shape[1]
-    all_ids = evidence.instance_ids.ravel()
+    all_ids = evidence.instance_ids
     for part in prange((count + MERGED_AT_ONCE - 1) // MERGED_AT_ONCE):
         first, last = part * MERGED_AT_ONCE, min((part + 1) * MERGED_AT_ONCE, count)
-        ids = all_ids[first * slots : last * slots]
-        found = np.int32(0)
-        for i in range(len(ids)):  # without a branch, so that it is vectorised: most parts have none
-            found = one_more(found, ids[i] == dropped)
-        for voxel in range(first, last if found > 0 else first):
-            _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
+        for voxel in range(first, last):
+            found = np.int32(0)
+            for s in range(all_ids.shape[1]):
+                found = one_more(found, all_ids[voxel, s] == dropped)
+            if found > 0:
+                _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
 
 
 class EvidenceRows:
@@ -473,17 +459,22 @@ class EvidenceRows:
         self.evicted = 0  # slots given to another label so far
         self._instance_slots = INSTANCE_SLOTS
         self._class_slots = CLASS_SLOTS
-        self.evidence = self._free()
         self._pages = PagesAhead()
+        self._free()
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what is only reserved, which is gigabytes."""
-        return {**vars(self), "evidence": self.in_use(), "_pages": PagesAhead()}
+        used = {"_labeled": self._labeled[: self.row_count], "_slots": self._slots[: self.voxel_count]}
+        return {**vars(self), **used, "evidence": None, "_pages": PagesAhead()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self._lay_out()
 
     @property
     def byte_count(self) -> int:
         """Of what is in use: capacity that no voxel has been given yet takes no memory."""
-        return sum(array.nbytes for array in self.in_use())
+        return self._labeled[: self.row_count].nbytes + self._slots[: self.voxel_count].nbytes
 
     def in_use(self) -> Evidence:
         """The evidence without capacity that is free."""
@@ -493,7 +484,7 @@ class EvidenceRows:
     def fill(self, saved: Evidence) -> None:
         """Takes over the evidence of a saved map, or its own with fewer slots for instances."""
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
-        self.evidence = self._free()
+        self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
         own = self.in_use()
         own.labeled[:] = saved.labeled
@@ -508,21 +499,21 @@ class EvidenceRows:
             raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
         if self.storage is Storage.EXACT:
             self._class_slots = max(classes, 1)
-            self.evidence = self._free()
+            self._free()
 
     def update(self, seen: SeenBlocks, measurement: Measurement) -> None:
         """Updates the voxels near the measured surface of the blocks that a frame has seen."""
         if not measurement.instance_id.any():
             return  # the frame says nothing, neither for an instance nor against one
-        first_point = measurement.first_point.ravel()
+        of_pixel = measurement.of_pixel.ravel()
         new = np.empty(len(seen.blocks), np.int32)
         evicted = np.empty(len(seen.blocks), np.int32)
         if self.storage is Storage.EXACT:
             self._make_room_for_instances(len(measurement.instance_id))
         grid, free_classes = self.voxels.grid, self._free_classes()
-        _update(grid, seen, self.evidence, measurement, first_point, new, evicted)
+        _update(grid, seen, self.evidence, measurement, of_pixel, new, evicted)
         first_new = self._make_room(seen.blocks, new)
-        _label_new(grid, seen, self.evidence, measurement, first_point, new, first_new, free_classes, evicted)
+        _label_new(grid, seen, self.evidence, measurement, of_pixel, new, first_new, free_classes, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
@@ -532,19 +523,17 @@ class EvidenceRows:
         """
         _merge(self.evidence, self.voxel_count, np.int32(kept), np.int32(dropped), int(self.combine))
 
-    def _free(self) -> Evidence:
-        rows = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
-        return Evidence(rows, **reserved(RESERVED * self.voxels.max_blocks, self._free_slots))
+    def _free(self) -> None:
+        self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
+        units = np.int16 if self.storage is Storage.COMPACT else np.int64
+        shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
+        kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, units), shapes, strict=True)
+        slots = np.dtype([(name, kind, (count,)) for name, kind, count in kinds], align=True)
+        self._slots = reserved(RESERVED * self.voxels.max_blocks, lambda voxels: np.empty(voxels, slots))
+        self._lay_out()
 
-    def _free_slots(self, voxels: int) -> dict[str, Any]:
-        return {
-            "instance_ids": np.empty((voxels, self._instance_slots), np.int32),
-            "instance_value": np.empty((voxels, self._instance_slots), np.float32),
-            "class_ids": np.empty((voxels, self._class_slots), np.uint8),
-            "class_value": np.empty(
-                (voxels, self._class_slots), np.int16 if self.storage is Storage.COMPACT else np.int64
-            ),
-        }
+    def _lay_out(self) -> None:
+        self.evidence = Evidence(self._labeled, **{name: self._slots[name] for name in SLOTS})
 
     def _free_classes(self) -> UInt8:
         """What a new voxel's class slots hold: nothing, or in exact storage every class."""
@@ -565,16 +554,14 @@ class EvidenceRows:
 
     def _reserve(self, rows: int, voxels: int) -> None:
         """Has so many rows and voxels in use; the new ones hold anything."""
-        if rows > len(self.evidence.labeled):
-            longer = grown(self.evidence.labeled, max(rows, 2 * len(self.evidence.labeled)))
-            self.evidence = self.evidence._replace(labeled=longer)
-        if voxels > len(self.evidence.instance_ids):
-            capacity = max(voxels, 2 * len(self.evidence.instance_ids))
-            slots = {name: grown(getattr(self.evidence, name), capacity) for name in SLOTS}
-            self.evidence = self.evidence._replace(**slots)
+        if rows > len(self._labeled):
+            self._labeled = grown(self._labeled, max(rows, 2 * len(self._labeled)))
+        if voxels > len(self._slots):
+            self._slots = grown(self._slots, max(voxels, 2 * len(self._slots)))
         self.row_count, self.voxel_count = rows, voxels
-        self._pages.ask((getattr(self.evidence, name) for name in SLOTS), voxels)
-        self._pages.ask([self.evidence.labeled], rows)
+        self._lay_out()
+        self._pages.ask([self._labeled], rows)
+        self._pages.ask([self._slots], voxels)
 
     def _make_room_for_instances(self, new: int) -> None:
         """Doubles the slots until every voxel has `new` free ones."""

@@ -12,7 +12,7 @@ from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMe
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes, look_up_instances
-from framework.mapping.evidence import NO_CLASS, Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.map_file import (
@@ -29,6 +29,7 @@ from framework.mapping.map_file import (
 from framework.mapping.meshing import Surface
 from framework.mapping.raycasting import render
 from framework.mapping.sensor import pinhole
+from framework.mapping.slot_vectors import NO_CLASS
 from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.vertex_labels import vertex_labels
 

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Bool, Float64, Frame, Int32, UInt16
@@ -42,6 +43,7 @@ from framework.mapping.voxel_grid import (
 )
 
 LAYER_VOXELS = BLOCK_SIDE**2
+GROUP = 16  # blocks whose near voxels are listed one behind the other, by one thread
 FAR = 1e9  # m
 LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias
@@ -164,32 +166,34 @@ def _is_colored(scratch, first):
 
 
 @device
-def _list_near(pixel, near_band, near_voxel, near_pixel, scratch):
-    """Lists the voxels whose distance to the measured surface in scratch[:512] is at most near_band, with their pixels.
+def _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch):
+    """Lists the voxels whose distance to the measured surface in scratch[:512] is at most near_band, with their pixels,
+    from place `first` on.
 
     A layer's comparisons are gathered in the bits of a word, which the compiler vectorises.
     """
-    found = np.int32(0)
     for layer in range(BLOCK_SIDE):
-        first = layer * LAYER_VOXELS
+        begin = layer * LAYER_VOXELS
         word = np.uint64(0)
         for n in range(LAYER_VOXELS):
-            word |= np.uint64(abs(scratch[first + n]) <= near_band) << np.uint64(n)
+            word |= np.uint64(abs(scratch[begin + n]) <= near_band) << np.uint64(n)
         while word != np.uint64(0):
-            n = first + lowest_bit(word)
+            n = begin + lowest_bit(word)
             word &= word - ONE
-            near_voxel[found] = np.uint16(n)
-            near_pixel[found] = pixel[n]
-            found += np.int32(1)
+            near_voxel[first] = np.uint16(n)
+            near_pixel[first] = pixel[n]
+            first += 1
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, near_count, near_voxel, near_pixel):
+def _integrate(
+    grid, active, depth, color, camera, sensor, rounding, near_band, near_first, near_count, near_voxel, near_pixel
+):
     """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
 
     `color` (H, W) holds a pixel's RGBA in its bytes, `camera` T_camera_world. `rounding` in [0, 1) is added before
-    values are truncated to integers. near_count (A,), near_voxel (A, 512) and near_pixel (A, 512) get the voxels within
-    near_band m of the measured surface, as SeenBlocks has them.
+    values are truncated to integers. near_first (A,), near_count (A,), near_voxel (512 A,) and near_pixel (512 A,) get
+    the voxels within near_band m of the measured surface, as SeenBlocks has them.
 
     A block is done in passes over its 512 voxels that the compiler vectorises: they hold no branches, read images only
     in loops of their own, and share one scratch array, so that few arrays have to be proved not to overlap.
@@ -199,44 +203,51 @@ def _integrate(grid, active, depth, color, camera, sensor, rounding, near_band, 
     color = color.ravel()
     solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     to_units = np.float32(1.0) / grid.tsdf_unit
-    for a in prange(active.shape[0]):
-        block = active[a]
-        after = np.int64(active[min(a + 1, active.shape[0] - 1)])
-        prefetch_row(grid.tsdf, after)
-        prefetch_row(grid.weight, after)
-        prefetch_row(grid.color, after)
-        tsdf, weight, packed = grid.tsdf[block], grid.weight[block], grid.color[block]
+    last = active.shape[0] - 1
+    for group in prange((active.shape[0] + GROUP - 1) // GROUP):
         pixel = np.empty(BLOCK_VOXELS, np.int32)
         scratch = np.empty(2 * BLOCK_VOXELS, np.float32)
-        _project_voxels(grid, block, camera, sensor.min_depth, shape, pixel, scratch)
-        for n in range(BLOCK_VOXELS):
-            scratch[n + BLOCK_VOXELS] = depth[np.uint32(pixel[n])]
-        colored_voxels, near_voxels = _average_distances(
-            tsdf, weight, grid.voxel_size, to_units, sensor, rounding, near_band, scratch
-        )
-        solid[block] = is_solid(tsdf)
-        if colored_voxels > 0:
-            seen = np.empty(LAYER_VOXELS, np.uint32)
-            for layer in range(BLOCK_SIDE):
+        seen = np.empty(LAYER_VOXELS, np.uint32)
+        first = group * GROUP * BLOCK_VOXELS
+        for a in range(group * GROUP, min((group + 1) * GROUP, active.shape[0])):
+            block = active[a]
+            after = np.int64(active[min(a + 1, last)])
+            prefetch_row(grid.tsdf, after)
+            prefetch_row(grid.weight, after)
+            prefetch_row(grid.color, after)
+            tsdf, weight, packed = grid.tsdf[block], grid.weight[block], grid.color[block]
+            _project_voxels(grid, block, camera, sensor.min_depth, shape, pixel, scratch)
+            for n in range(BLOCK_VOXELS):
+                scratch[n + BLOCK_VOXELS] = depth[np.uint32(pixel[n])]
+            colored_voxels, near_voxels = _average_distances(
+                tsdf, weight, grid.voxel_size, to_units, sensor, rounding, near_band, scratch
+            )
+            solid[block] = is_solid(tsdf)
+            for layer in range(BLOCK_SIDE if colored_voxels > 0 else 0):
                 if _is_colored(scratch, layer * LAYER_VOXELS):
                     _average_colors(packed, color, pixel, layer * LAYER_VOXELS, rounding, scratch, seen)
-        near_count[a] = near_voxels
-        if near_voxels > 0:
-            _list_near(pixel, near_band, near_voxel[a], near_pixel[a], scratch)
+            if near_voxels > 0:
+                _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch)
+            near_first[a], near_count[a] = first, near_voxels
+            first += near_voxels
 
 
 class SeenBlocks(NamedTuple):
-    """The A blocks that a frame has updated, and their voxels near the measured surface; valid until the next frame."""
+    """The A blocks that a frame has updated, and their voxels near the measured surface; valid until the next frame.
+
+    Those of a block lie one behind the other; between GROUPs of blocks there are gaps.
+    """
 
     blocks: Int32  # (A,) their numbers
-    near_count: Int32  # (A,) how many voxels of each block lie near the surface
-    near_voxel: UInt16  # (A, 512) their numbers in the block, ascending; the first near_count of a row are set
-    near_pixel: Int32  # (A, 512) the number v * width + u of the pixel that sees each of these
+    near_first: npt.NDArray[np.int64]  # (A,) where the voxels of each block begin that lie near the surface
+    near_count: Int32  # (A,) how many these are
+    near_voxel: UInt16  # (512 A,) their numbers in the block, ascending
+    near_pixel: Int32  # (512 A,) the number v * width + u of the pixel that sees each of these
 
 
 def _near_lists(blocks: int) -> tuple[UInt16, Int32]:
     """The near_voxel and near_pixel of so many blocks."""
-    return np.empty((blocks, BLOCK_VOXELS), np.uint16), np.empty((blocks, BLOCK_VOXELS), np.int32)
+    return np.empty(blocks * BLOCK_VOXELS, np.uint16), np.empty(blocks * BLOCK_VOXELS, np.int32)
 
 
 class Integrator:
@@ -273,10 +284,11 @@ class Integrator:
         self.frames += 1
         rounding = np.float32((self.frames * GOLDEN) % 1.0)
         view = pinhole(frame.camera, inverse(T_world_camera))
-        count, n = np.empty(len(active), np.int32), len(active)
+        first, count = np.empty(len(active), np.int64), np.empty(len(active), np.int32)
+        n = len(active) * BLOCK_VOXELS
         if len(self._near_pixel) < n:  # where reserving costs memory, or after pickling; nothing is copied
-            self._near_voxel, self._near_pixel = _near_lists(n * 9 // 8 + 1)
-        seen = SeenBlocks(active, count, self._near_voxel[:n], self._near_pixel[:n])
+            self._near_voxel, self._near_pixel = _near_lists(len(active) * 9 // 8 + 1)
+        seen = SeenBlocks(active, first, count, self._near_voxel[:n], self._near_pixel[:n])
         _integrate(
             self.voxels.grid,
             active,
@@ -286,6 +298,7 @@ class Integrator:
             self.sensor,
             rounding,
             np.float32(near_band),
+            seen.near_first,
             seen.near_count,
             seen.near_voxel,
             seen.near_pixel,

@@ -102,10 +102,10 @@ class LabeledVoxels:
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
         """What a frame's clusters, in the lists of each pixel, say of the voxels by this rule."""
-        points = keep_on_top(matches.clusters, points, matches.instance_ids, self.on_top)
+        points = keep_on_top(points, matches.instance_ids, self.on_top)
         others = self.lying_on_clusters(table, matches)
         if others.any():
-            points = leave_to_others(matches.clusters, points, others, matches.overlaps.seen, matches.overlaps.stride)
+            points = leave_to_others(points, others, matches.overlaps.seen, matches.overlaps.stride)
         matched = np.zeros(table.last_id + 1, np.bool_)
         matched[matches.instance_ids] = True
         class_gain, named, bits = named_classes(evidence.classes, rule.logarithmic)
@@ -114,9 +114,9 @@ class LabeledVoxels:
         if compact and rule.combine is Combine.SUM:
             class_gain = np.clip(class_gain, -MOST_GAIN / units, MOST_GAIN / units)
         return Measurement(
-            first_point=points.first,
-            next_point=points.next,
-            cluster=matches.clusters.cluster,
+            of_pixel=points.of_pixel,
+            first=points.first,
+            cluster=points.cluster,
             instance_id=matches.instance_ids,
             instance_gain=evidence.instances,
             absence=np.float32(evidence.absence),

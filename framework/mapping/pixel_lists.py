@@ -1,6 +1,8 @@
-"""The cluster points of each pixel: masks overlap, and a pixel may lie under several.
+"""The clusters over each pixel: masks overlap, and a pixel may lie under several.
 
-What clusters share decides which of two is the same object found twice, and which of two lies on top of the other.
+Pixels lie under few different combinations of clusters. Each combination is a list with a number, and an image has the
+number of each pixel's list, so that what concerns lists costs next to nothing. What clusters share decides which of two
+is the same object found twice, and which of two lies on top of the other.
 """
 
 from __future__ import annotations
@@ -10,171 +12,215 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from framework.data import Bool, Int32, PointClusters
+from framework.data import Bool, Float32, Int32, PointClusters
 from framework.geometry import require_pixels_inside
 from framework.mapping.voxel_grid import device
 
 
 class PixelLists(NamedTuple):
-    """The cluster points of each pixel as linked lists: a pixel under overlapping masks has several."""
+    """The clusters over each pixel, of N, as L lists: those of list i are cluster[first[i] : first[i + 1]]."""
 
-    first: Int32  # (H, W) the first point, -1 = under no cluster
-    next: Int32  # (P,) the next point of the same pixel, -1 = last
+    of_pixel: Int32  # (H, W) the number of each pixel's list; list 0 is empty
+    pixels: Int32  # (L,) how many pixels have each list
+    first: Int32  # (L + 1,)
+    cluster: Int32  # (first[L],) in the order of the points; of a list that no pixel has, nothing
+    cluster_count: int  # N
 
-    def copy(self) -> PixelLists:
-        return PixelLists(self.first.copy(), self.next.copy())
+
+@device
+def _are_inside(coordinates, width, height):
+    """Whether all pixels (2 P,), u and v in turns, lie in the image. Unsigned, negative coordinates are large."""
+    right = bottom = np.uint32(0)
+    for p in range(coordinates.shape[0] // 2):
+        right = max(right, np.uint32(coordinates[2 * p]))
+        bottom = max(bottom, np.uint32(coordinates[2 * p + 1]))
+    return right < width and bottom < height
 
 
 @njit(cache=True, nogil=True)
-def _link_points(pixels, cluster, first, following):
-    """Whether all pixels lie in the image; links the points up to the one that does not."""
-    first[:] = -1
-    for p in range(pixels.shape[0] - 1, -1, -1):
-        u, v = pixels[p, 0], pixels[p, 1]
-        if not (0 <= u < first.shape[1] and 0 <= v < first.shape[0]):
-            return False
-        if cluster[p] >= 0:
-            following[p] = first[v, u]
-            first[v, u] = p
-    return True
+def _link_points(coordinates, cluster, of_pixel, head, rest, child, sibling, count, length):
+    """Gives each pixel the number of its list; returns how many lists there are, or 0 where a point lies outside.
 
-
-def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """The points of `clusters` by the pixel of the (height, width) image that they were seen at, in order.
-
-    Raises DataError when a pixel lies outside the image.
+    A list is its `head` before another one, the `rest`; child is the latest list with a list as its rest, and sibling
+    the one before with the same rest. count is how many pixels have each list, length how many clusters it has. There
+    must be room for a list more than there are points; their coordinates (2 P,) are u and v in turns.
     """
-    lists = PixelLists(np.empty(shape, np.int32), np.empty(len(clusters.cluster), np.int32))
-    if not _link_points(clusters.pixels, clusters.cluster, lists.first, lists.next):
-        require_pixels_inside(clusters, shape)
+    width = of_pixel.shape[1]
+    if not _are_inside(coordinates, width, of_pixel.shape[0]):
+        return np.int32(0)
+    of_pixel[:] = 0
+    number = of_pixel.ravel()
+    count[0], child[0], length[0] = of_pixel.size, 0, 0
+    lists = np.int32(1)
+    p = cluster.shape[0] - 1
+    while p >= 0:  # a run of points of one cluster, at pixels that have had one list
+        k, last = cluster[p], p
+        if k < 0:
+            p -= 1
+            continue
+        pixel = np.uint32(coordinates[2 * p + 1] * width + coordinates[2 * p])
+        old = number[pixel]
+        new = child[old]
+        while new > 0 and head[new] != k:
+            new = sibling[new]
+        if new == 0:
+            new = lists
+            lists += np.int32(1)
+            head[new], rest[new], length[new] = k, old, length[old] + 1
+            count[new], child[new] = 0, 0
+            child[old], sibling[new] = new, child[old]
+        while True:
+            number[pixel] = new
+            p -= 1
+            if p < 0 or cluster[p] != k:
+                break
+            pixel = np.uint32(coordinates[2 * p + 1] * width + coordinates[2 * p])
+            if number[pixel] != old:
+                break
+        count[old] -= last - p
+        count[new] += last - p
     return lists
 
 
 @njit(cache=True, nogil=True)
-def _count_shared(first_point, next_point, cluster, shared):
+def _write_lists(head, rest, first, cluster):
+    for i in range(first.shape[0] - 1):
+        number = i
+        for place in range(first[i], first[i + 1]):
+            cluster[place] = head[number]
+            number = rest[number]
+
+
+def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
+    """The clusters over each pixel of the (height, width) image, by the points that were seen there.
+
+    Raises DataError when a pixel lies outside the image.
+    """
+    of_pixel = np.empty(shape, np.int32)
+    room = len(clusters.cluster) + 1
+    head, rest, child, sibling, count, length = (np.empty(room, np.int32) for _ in range(6))
+    lists = _link_points(clusters.pixels.ravel(), clusters.cluster, of_pixel, head, rest, child, sibling, count, length)
+    if lists == 0:
+        require_pixels_inside(clusters, shape)
+    count = count[:lists].copy()
+    first = _begins(np.where(count > 0, length[:lists], 0))
+    cluster = np.empty(first[-1], np.int32)
+    _write_lists(head, rest, first, cluster)
+    return PixelLists(of_pixel, count, first, cluster, len(clusters))
+
+
+def _begins(lengths: Int32) -> Int32:
+    """(L + 1,) where lists of so many clusters begin, one behind the other, and where the last one ends."""
+    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _count_shared(pixels, first, cluster, shared):
     """Adds to shared (N, N) the pixels that each two clusters have in common, itself on the diagonal."""
-    for pixel in range(first_point.size):
-        p = first_point.flat[pixel]
-        while p >= 0:
-            q = first_point.flat[pixel]
-            while q >= 0:
-                shared[cluster[p], cluster[q]] += 1
-                q = next_point[q]
-            p = next_point[p]
+    for i in range(pixels.shape[0]):
+        for a in range(first[i], first[i + 1]):
+            for b in range(first[i], first[i + 1]):
+                shared[cluster[a], cluster[b]] += pixels[i]
 
 
-def cover_another(clusters: PointClusters, points: PixelLists, threshold: float) -> Bool:
+def cover_another(points: PixelLists, scores: Float32, threshold: float) -> Bool:
     """(N,) clusters that share more than `threshold` of the smaller one's pixels with a cluster of a better score.
 
     Such a cluster is most likely the same object found twice and must not become an instance of its own.
     """
-    n = len(clusters)
+    n = points.cluster_count
     shared = np.zeros((n, n), np.int32)
-    _count_shared(points.first, points.next, clusters.cluster, shared)
+    _count_shared(points.pixels, points.first, points.cluster, shared)
     sizes = shared.diagonal()
     over_smaller = shared / np.maximum(np.minimum(sizes[:, None], sizes[None, :]), 1)
-    rank = np.lexsort((np.arange(n), -clusters.scores)).argsort()
+    rank = np.lexsort((np.arange(n), -scores)).argsort()
     better = rank[None, :] < rank[:, None]
     return np.asarray((better & (over_smaller > threshold)).any(axis=1))
 
 
-@device
-def _append(first, following, v, u, last, p):
-    """Puts point p at the end of the list of pixel (u, v), behind `last`, -1 = it is empty; returns p."""
-    if last < 0:
-        first[v, u] = p
-    else:
-        following[last] = p
-    following[p] = -1
-    return p
-
-
 @njit(cache=True, nogil=True)
-def count_labels(labels, counts):
-    """Adds to counts (n,) how often each of labels (L,) occurs, in [0, n); -1 is counted as n - 1.
-
-    By runs: a counter raised by one waits for itself.
-    """
-    label, count = np.int32(0), 0
-    for found in labels:
-        if found != label:
-            counts[label] += count
-            label, count = found, 0
-        count += 1
-    counts[label] += count
-
-
-@njit(cache=True, nogil=True)
-def _keep_on_top(pixels, first, following, cluster, sizes, share, kept_first, kept_following):
-    """Makes those lists anew, of copies, that are without the points of clusters that one of less than `share` of their
-    size lies on.
-    """
-    for begin in range(pixels.shape[0]):
-        if cluster[begin] < 0 or following[begin] < 0:
-            continue  # nothing lies on another here: so it is nearly everywhere
-        u, v = pixels[begin, 0], pixels[begin, 1]
-        if first[v, u] != begin:
-            continue
+def _keep_on_top(pixels, first, cluster, instance_ids, share, kept_first, kept):
+    """Fills kept_first (L + 1,) and kept, as long as cluster, of which the first kept_first[L] are set."""
+    sizes = np.zeros(instance_ids.shape[0], np.float64)
+    for i in range(pixels.shape[0]):
+        for place in range(first[i], first[i + 1]):
+            sizes[cluster[place]] += pixels[i]
+    n = 0
+    for i in range(pixels.shape[0]):
+        kept_first[i] = n
         smallest = np.float64(np.inf)
-        p = first[v, u]
-        while p >= 0:
-            size = sizes[cluster[p]]
-            if size > 0:
-                smallest = min(smallest, size)
-            p = following[p]
-        kept_first[v, u] = -1
-        last = np.int32(-1)
-        p = first[v, u]
-        while p >= 0:
-            if smallest >= share * sizes[cluster[p]]:
-                last = _append(kept_first, kept_following, v, u, last, p)
-            p = following[p]
+        for place in range(first[i], first[i + 1]):
+            if instance_ids[cluster[place]] > 0:
+                smallest = min(smallest, sizes[cluster[place]])
+        for place in range(first[i], first[i + 1]):
+            k = cluster[place]
+            if instance_ids[k] > 0 and smallest >= share * sizes[k]:
+                kept[n] = k
+                n += 1
+    kept_first[pixels.shape[0]] = n
 
 
-def keep_on_top(clusters: PointClusters, points: PixelLists, instance_ids: Int32, share: float) -> PixelLists:
-    """`points` where small clusters have for themselves what large ones claim as well.
+def keep_on_top(points: PixelLists, instance_ids: Int32, share: float) -> PixelLists:
+    """Only the clusters with an instance (`instance_ids` (N,), 0 = none), of which small ones have for themselves what
+    large ones claim as well.
 
     A network draws a large mask coarsely, over the small thing that lies on the object: a book on a couch. Under
     overlapping clusters a pixel is left to those that are not more than 1 / `share` times as large as the smallest
-    there. Clusters without an instance (`instance_ids` (N,) 0) take nothing from others; nobody does with share 0.
+    there; with share 0 to all.
     """
-    if share == 0:
-        return points
-    counts = np.zeros(len(clusters) + 1, np.int32)
-    count_labels(clusters.cluster, counts)
-    sizes = np.where(instance_ids > 0, counts[:-1], 0)
-    kept = points.copy()
-    _keep_on_top(clusters.pixels, points.first, points.next, clusters.cluster, sizes, share, kept.first, kept.next)
-    return kept
+    first, kept = np.empty_like(points.first), np.empty_like(points.cluster)
+    _keep_on_top(points.pixels, points.first, points.cluster, instance_ids, share, first, kept)
+    return points._replace(first=first, cluster=kept[: first[-1]])
 
 
 @njit(cache=True, nogil=True)
-def _leave_to_others(pixels, cluster, lying, seen, stride, first, following):
-    """Takes the points of clusters on which the instance seen there lies out of the lists."""
-    bottom = np.zeros(lying.shape[0], np.bool_)  # clusters that something lies on
-    for k in range(lying.shape[0]):
-        bottom[k] = lying[k].any()
-    for p in range(pixels.shape[0]):
-        if cluster[p] < 0 or not bottom[cluster[p]]:
-            continue
-        u, v = pixels[p, 0], pixels[p, 1]
-        if not lying[cluster[p], seen[v // stride, u // stride]]:
-            continue
-        if first[v, u] == p:
-            first[v, u] = following[p]
-            continue
-        before = first[v, u]
-        while before >= 0 and following[before] != p:
-            before = following[before]
-        if before >= 0:  # else p is in no list
-            following[before] = following[p]
+def _leave_to_others(of_pixel, pixels, first, cluster, lying, seen, stride, number, left):
+    """Gives pixels under a cluster on which the instance seen there lies the number of a new list, and counts them.
+
+    number (L, ids + 1), of zeros before, gets the one that each list is changed for under each instance, left (R, 2)
+    the list and the instance of each new one. Returns how many these are.
+    """
+    lists = first.shape[0] - 1
+    affected = np.zeros(lists, np.bool_)
+    for i in range(lists):
+        for place in range(first[i], first[i + 1]):
+            affected[i] |= lying[cluster[place]].any()
+    new = 0
+    column = np.arange(of_pixel.shape[1]) // stride
+    for v in range(of_pixel.shape[0]):
+        row = v // stride
+        for u in range(of_pixel.shape[1]):
+            i = of_pixel[v, u]
+            if not affected[i]:
+                continue
+            instance = seen[row, column[u]]
+            if number[i, instance] == 0:
+                number[i, instance] = i
+                for place in range(first[i], first[i + 1]):
+                    if lying[cluster[place], instance]:
+                        number[i, instance] = lists + new
+                if number[i, instance] != i:
+                    left[new, 0], left[new, 1] = i, instance
+                    new += 1
+            if number[i, instance] != i:
+                of_pixel[v, u] = number[i, instance]
+                pixels[i] -= 1
+                pixels[number[i, instance]] += 1
+    return new
 
 
-def leave_to_others(clusters: PointClusters, points: PixelLists, lying: Bool, seen: Int32, stride: int) -> PixelLists:
-    """`points` without those of clusters where the map has an instance that is `lying` (N, ids + 1) on them.
+def leave_to_others(points: PixelLists, lying: Bool, seen: Int32, stride: int) -> PixelLists:
+    """`points` without the clusters that the instance which the map has there is `lying` (N, ids + 1) on.
 
     `seen` holds the map's instance at every stride-th pixel of every stride-th row.
     """
-    kept = points.copy()
-    _leave_to_others(clusters.pixels, clusters.cluster, lying, seen, stride, kept.first, kept.next)
-    return kept
+    lists, of_pixel = len(points.pixels), points.of_pixel.copy()
+    number = np.zeros((lists, lying.shape[1]), np.int32)  # zeros that nobody writes cost nothing
+    pixels, left = np.zeros(lists + number.size, np.int32), np.empty((number.size, 2), np.int32)
+    pixels[:lists] = points.pixels
+    new = _leave_to_others(of_pixel, pixels, points.first, points.cluster, lying, seen, stride, number, left)
+    kept = [points.cluster[points.first[i] : points.first[i + 1]] for i in left[:new, 0]]
+    kept = [list_[~lying[list_, instance]] for list_, instance in zip(kept, left[:new, 1], strict=True)]
+    first = np.append(points.first, points.first[-1] + _begins(np.array([len(list_) for list_ in kept], np.int32))[1:])
+    cluster = np.concatenate([points.cluster, *kept])
+    return PixelLists(of_pixel, pixels[: lists + new].copy(), first.astype(np.int32), cluster, points.cluster_count)

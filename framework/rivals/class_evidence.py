@@ -24,10 +24,11 @@ from numba import njit, prange
 
 from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
-from framework.mapping.evidence import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS, best_first, named_classes
+from framework.mapping.evidence import best_first, named_classes
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.map_file import check_known, check_like
 from framework.mapping.pixel_lists import PixelLists
+from framework.mapping.slot_vectors import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
 
 MOST_EXPONENT = 700.0  # of a ratio that float64 can hold
@@ -63,10 +64,9 @@ class MaskClasses(NamedTuple):
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
     """What the clusters of a frame say, log P(class) / P(background) (N, C), as the voxels take it."""
     above_rest, named, bits = named_classes(log_ratio, logarithmic=True)
-    best = np.empty(points.first.shape, np.int32)
-    _find_best_cluster(points.first, points.next, clusters.cluster, clusters.scores, best)
+    best = _best_clusters(points.first, points.cluster, clusters.scores)
     return MaskClasses(
-        best.ravel(),
+        best[points.of_pixel.ravel()],
         log_ratio.astype(np.float32),
         (log_ratio - above_rest)[:, :1].sum(axis=1).astype(np.float32),
         named,
@@ -75,19 +75,16 @@ def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists
     )
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _find_best_cluster(first_point, next_point, cluster, scores, best):
-    """Fills best (H, W); of equal scores the first one counts."""
-    for v in prange(best.shape[0]):
-        for u in range(best.shape[1]):
-            found = np.int32(-1)
-            p = first_point[v, u]
-            while p >= 0:
-                k = cluster[p]
-                if found < 0 or scores[k] > scores[found] or (scores[k] == scores[found] and k < found):
-                    found = k
-                p = next_point[p]
-            best[v, u] = found
+@njit(cache=True, nogil=True)
+def _best_clusters(first, cluster, scores):
+    """(L,) the cluster of each list with the best score, of equal ones the first, -1 = there is none."""
+    best = np.full(first.shape[0] - 1, -1, np.int32)
+    for i in range(best.shape[0]):
+        for place in range(first[i], first[i + 1]):
+            k, found = cluster[place], best[i]
+            if found < 0 or scores[k] > scores[found] or (scores[k] == scores[found] and k < found):
+                best[i] = k
+    return best
 
 
 @device
@@ -152,9 +149,10 @@ def _find_blocks_under_masks(grid, seen, cluster, wants_row):
     """Notes in wants_row (A,) the blocks without a row that have a voxel under some mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
+        first = seen.near_first[a]
         if grid.label_row[seen.blocks[a]] < 0:
-            for i in range(seen.near_count[a]):
-                if cluster[seen.near_pixel[a, i]] >= 0:
+            for i in range(first, first + seen.near_count[a]):
+                if cluster[seen.near_pixel[i]] >= 0:
                     wants_row[a] = True
                     break
 
@@ -167,9 +165,10 @@ def _update(grid, seen, evidence, masks, evicted):
         evicted[a] = 0
         block = seen.blocks[a]
         row = grid.label_row[block]
-        for i in range(seen.near_count[a]):
-            n = seen.near_voxel[a, i]
-            k = masks.cluster[seen.near_pixel[a, i]]
+        first = seen.near_first[a]
+        for i in range(first, first + seen.near_count[a]):
+            n = seen.near_voxel[i]
+            k = masks.cluster[seen.near_pixel[i]]
             if k >= 0:
                 evicted[a] += observe_mask(evidence, row, n, masks, k)
             elif unmasked[block, n] < MOST_FRAMES:

@@ -9,8 +9,8 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Float64, Int32, UInt8
-from framework.mapping.evidence import NO_CLASS
 from framework.mapping.meshing import Surface
+from framework.mapping.slot_vectors import NO_CLASS
 from framework.mapping.vertex_labels import CHUNK, CORNERS, color_of, corner_voxels, keep_near, majority
 from framework.mapping.voxel_grid import BLOCK_VOXELS, Grid, device
 from framework.refinement.union_find import root, unite

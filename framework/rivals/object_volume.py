@@ -54,11 +54,12 @@ def _count_masks(seen, mask, counts):
     inside = mask.ravel()
     for a in prange(seen.blocks.shape[0]):
         block = seen.blocks[a]
-        for i in range(seen.near_count[a]):
-            n = seen.near_voxel[a, i]
+        first = seen.near_first[a]
+        for i in range(first, first + seen.near_count[a]):
+            n = seen.near_voxel[i]
             if observed[block, n] < most:
                 observed[block, n] += np.uint16(1)
-                foreground[block, n] += np.uint16(inside[seen.near_pixel[a, i]])
+                foreground[block, n] += np.uint16(inside[seen.near_pixel[i]])
 
 
 @njit(cache=True, nogil=True, parallel=True)

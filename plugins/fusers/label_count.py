@@ -36,7 +36,7 @@ class LabelCount(MapFuser):
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self.scene.begin(clusters.classes)
         points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = self.association.look_up(self.scene, frame, pose, clusters)
+        overlaps = self.association.look_up(self.scene, frame, pose, points)
         matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
         seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
         evidence = vote_for_best(clusters, np.ones(len(clusters), np.float32))

@@ -12,6 +12,7 @@ from framework.interfaces import MapFuser
 from framework.mapping.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_table import InstanceRecord
+from framework.mapping.pixel_lists import list_points_by_pixel
 from framework.mapping.tsdf import VoxelHashing
 from framework.parameters import check_bounds
 from framework.rivals.object_map import ObjectMap
@@ -68,8 +69,9 @@ class ObjectVolumes(MapFuser):
     def _look_up(self, frame: Frame, T_world_camera: Float64, clusters: PointClusters) -> Overlaps:
         """How the clusters lie on the objects that the map has at the measured surface."""
         stride = vote_stride(frame.camera)
+        points = list_points_by_pixel(clusters, frame.depth.shape)
         return count_overlaps(
-            clusters, self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride), stride
+            points, self.scene.instances_seen(frame.camera, T_world_camera, frame.depth, stride), stride
         )
 
     def _associate(self, overlaps: Overlaps, clusters: PointClusters, frame: Frame) -> Matches:

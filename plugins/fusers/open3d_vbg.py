@@ -51,7 +51,7 @@ class Open3DVoxelBlockGrid(MapFuser):
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self.scene.begin(clusters.classes)
         points = list_points_by_pixel(clusters, frame.depth.shape)
-        overlaps = self.association.look_up(self.scene, frame, pose, clusters)
+        overlaps = self.association.look_up(self.scene, frame, pose, points)
         matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
         self.scene.integrate(frame, pose.T_world_camera)
         seen_ids = _paint(clusters, matches.instance_ids, frame.depth.shape)

@@ -1,5 +1,8 @@
 """Exact small cases of association."""
 
+from dataclasses import replace
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -7,7 +10,7 @@ from hypothesis import strategies as st
 
 from framework.data import PointClusters
 from framework.errors import DataError
-from framework.mapping.association import OverlapRule, class_agreement, count_overlaps, match_one_to_one
+from framework.mapping.association import OverlapRule, Overlaps, class_agreement, count_overlaps, match_one_to_one
 from framework.mapping.pixel_lists import (
     PixelLists,
     cover_another,
@@ -32,6 +35,12 @@ def clusters_of(masks: list[np.ndarray], scores: list[float]) -> PointClusters:
     )
 
 
+def overlaps_of(clusters: PointClusters, seen: np.ndarray, stride: int = 1) -> Overlaps:
+    """How the clusters lie on the instances `seen` at every stride-th pixel of an image."""
+    points = list_points_by_pixel(clusters, (stride * seen.shape[0], stride * seen.shape[1]))
+    return count_overlaps(points, seen, stride)
+
+
 def columns(first: int, last: int) -> np.ndarray:
     mask = np.zeros(SHAPE, np.bool_)
     mask[:, first:last] = True
@@ -42,7 +51,7 @@ def test_votes_are_pixels_shared() -> None:
     seen = np.zeros(SHAPE, np.int32)
     seen[:, :2] = 7
     seen[:, 4] = 3
-    overlaps = count_overlaps(clusters_of([columns(0, 3), columns(3, 5), columns(2, 3)], [1, 1, 1]), seen)
+    overlaps = overlaps_of(clusters_of([columns(0, 3), columns(3, 5), columns(2, 3)], [1, 1, 1]), seen)
     assert overlaps.instance_ids.tolist() == [3, 7]
     assert overlaps.visible.tolist() == [4, 8]
     assert overlaps.sizes.tolist() == [12, 8, 4]
@@ -68,7 +77,7 @@ def best_first(overlap: np.ndarray, threshold: float) -> np.ndarray:
 
 def test_nothing_seen_and_nothing_detected() -> None:
     seen = np.zeros(SHAPE, np.int32)
-    assert count_overlaps(clusters_of([columns(0, 2)], [1]), seen).votes.shape == (1, 0)
+    assert overlaps_of(clusters_of([columns(0, 2)], [1]), seen).votes.shape == (1, 0)
     empty = PointClusters(
         np.zeros((0, 3), np.float32),
         np.zeros((0, 2), np.int32),
@@ -77,9 +86,9 @@ def test_nothing_seen_and_nothing_detected() -> None:
         np.zeros(0, np.float32),
         ("a", "b"),
     )
-    assert count_overlaps(empty, seen).votes.shape == (0, 0)
-    assert len(best_first(count_overlaps(empty, seen + 1).over_smaller(least=1), 0.3)) == 0
-    assert len(cover_another(empty, list_points_by_pixel(empty, SHAPE), 0.5)) == 0
+    assert overlaps_of(empty, seen).votes.shape == (0, 0)
+    assert len(best_first(overlaps_of(empty, seen + 1).over_smaller(least=1), 0.3)) == 0
+    assert len(cover_another(list_points_by_pixel(empty, SHAPE), empty.scores, 0.5)) == 0
 
 
 def test_every_second_pixel_stands_for_four() -> None:
@@ -89,7 +98,7 @@ def test_every_second_pixel_stands_for_four() -> None:
     n = len(pixels)
     one = np.ones((1, 1), np.float32)
     clusters = PointClusters(np.zeros((n, 3), np.float32), pixels, np.zeros(n, np.int32), one, one[0], ("object",))
-    all_pixels, sampled = count_overlaps(clusters, seen), count_overlaps(clusters, seen[::2, ::2].copy(), 2)
+    all_pixels, sampled = overlaps_of(clusters, seen), overlaps_of(clusters, seen[::2, ::2].copy(), 2)
     for name in ("instance_ids", "visible", "sizes", "votes"):
         assert getattr(sampled, name).tolist() == getattr(all_pixels, name).tolist(), name
 
@@ -104,7 +113,7 @@ def test_stray_pixels_of_an_instance_do_not_win_a_cluster() -> None:
     seen = np.zeros(SHAPE, np.int32)
     seen[:, :3] = 1  # the object, of which the cluster sees most
     seen[0, 0] = 2  # a stray voxel of another one
-    overlaps = count_overlaps(clusters_of([columns(0, 2)], [1]), seen)
+    overlaps = overlaps_of(clusters_of([columns(0, 2)], [1]), seen)
     assert best_first(overlaps.over_smaller(least=1), 0.35).tolist() == [1], "7/8 of 1 lose against 1/1 of 2"
     assert best_first(overlaps.over_smaller(least=4), 0.35).tolist() == [0]
 
@@ -113,7 +122,7 @@ def test_a_table_does_not_get_the_book_that_lies_on_it() -> None:
     """Its mask covers all of the book, and not quite all of the table."""
     seen = np.full(SHAPE, 1, np.int32)
     seen[:, 2] = 2  # the book
-    overlaps = count_overlaps(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
+    overlaps = overlaps_of(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
     smaller = overlaps.over_smaller(least=1)
     assert smaller[0].argmax() != 0, "counted over the smaller alone, the book is the table's best match"
     assert match_one_to_one(smaller > 0.35, overlaps.over_union(least=1)).tolist() == [0, 1]
@@ -130,7 +139,7 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 
 def test_a_second_detection_of_an_object_is_told_by_its_overlap() -> None:
     clusters = clusters_of([columns(0, 3), columns(0, 2), columns(3, 5)], [0.5, 0.9, 0.4])
-    assert cover_another(clusters, list_points_by_pixel(clusters, SHAPE), 0.6).tolist() == [True, False, False]
+    assert cover_another(list_points_by_pixel(clusters, SHAPE), clusters.scores, 0.6).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
@@ -145,25 +154,21 @@ def test_points_of_no_cluster_have_no_say() -> None:
     clusters = clusters_of([columns(0, 3), columns(1, 4)], [1, 0.5])
     clusters.cluster[clusters.pixels[:, 0] == 1] = -1
     seen = np.full(SHAPE, 4, np.int32)
-    overlaps = count_overlaps(clusters, seen)
+    overlaps = overlaps_of(clusters, seen)
     assert overlaps.sizes.tolist() == [8, 8]
     assert overlaps.votes.tolist() == [[8], [8]]
     points = list_points_by_pixel(clusters, SHAPE)
-    assert (points.first >= 0).any(axis=0).tolist() == [True, False, True, True, False]
+    assert (points.of_pixel > 0).any(axis=0).tolist() == [True, False, True, True, False]
     # 4 of the 8 pixels of each are shared: columns 0, 2 against 2, 3
-    assert cover_another(clusters, points, 0.49).tolist() == [False, True]
-    assert cover_another(clusters, points, 0.5).tolist() == [False, False]
+    assert cover_another(points, clusters.scores, 0.49).tolist() == [False, True]
+    assert cover_another(points, clusters.scores, 0.5).tolist() == [False, False]
 
 
-def clusters_at(clusters: PointClusters, points: PixelLists) -> list[list[int]]:
+def clusters_at(points: PixelLists) -> list[list[int]]:
     """The clusters in each pixel's list, row by row."""
-    found = []
-    for p in points.first.ravel().tolist():
-        found.append([])
-        while p >= 0:
-            found[-1].append(int(clusters.cluster[p]))
-            p = int(points.next[p])
-    return found
+    lists = [points.cluster[first:last].tolist() for first, last in pairwise(points.first.tolist())]
+    assert points.pixels.tolist() == np.bincount(points.of_pixel.ravel(), minlength=len(lists)).tolist()
+    return [lists[i] for i in points.of_pixel.ravel()]
 
 
 def test_a_book_on_a_table_has_its_pixels_for_itself() -> None:
@@ -171,11 +176,35 @@ def test_a_book_on_a_table_has_its_pixels_for_itself() -> None:
     clusters = clusters_of([table, book], [0.9, 0.2])
     points = list_points_by_pixel(clusters, SHAPE)
     ids = np.int32([7, 9])
-    assert clusters_at(clusters, keep_on_top(clusters, points, ids, 0.25)) == 4 * [[0], [0], [1], [0], [0]]
-    assert clusters_at(clusters, keep_on_top(clusters, points, ids, 0.2)) == 4 * [[0], [0], [0, 1], [0], [0]]
-    unmatched = keep_on_top(clusters, points, np.int32([7, 0]), 0.25)
-    assert clusters_at(clusters, unmatched) == 4 * [[0], [0], [0, 1], [0], [0]], "it takes nothing"
-    assert clusters_at(clusters, points) == 4 * [[0], [0], [0, 1], [0], [0]], "the lists given stay as they are"
+    assert clusters_at(keep_on_top(points, ids, 0.25)) == 4 * [[0], [0], [1], [0], [0]]
+    assert clusters_at(keep_on_top(points, ids, 0.2)) == 4 * [[0], [0], [0, 1], [0], [0]]
+    unmatched = keep_on_top(points, np.int32([7, 0]), 0.25)
+    assert clusters_at(unmatched) == 4 * [[0], [0], [0], [0], [0]], "it takes nothing, and has no say"
+    assert clusters_at(points) == 4 * [[0], [0], [0, 1], [0], [0]], "the lists given stay as they are"
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10_000))
+def test_each_pixel_has_its_clusters_in_the_order_of_the_points(seed: int) -> None:
+    """Points in any order, some of no cluster, some twice at one pixel under one cluster."""
+    rng = np.random.default_rng(seed)
+    clusters = clusters_of([rng.random(SHAPE) < filled for filled in rng.random(4)], [1] * 4)
+    count = len(clusters.cluster)
+    order = rng.permutation(np.append(np.arange(count), rng.integers(0, count, 5 if count else 0)))
+    clusters = replace(
+        clusters,
+        points_world=clusters.points_world[order],
+        pixels=clusters.pixels[order],
+        cluster=np.where(rng.random(len(order)) < 0.1, -1, clusters.cluster[order]).astype(np.int32),
+    )
+    expected = [[] for _ in range(SHAPE[0] * SHAPE[1])]
+    for (u, v), k in zip(clusters.pixels.tolist(), clusters.cluster.tolist(), strict=True):
+        if k >= 0:
+            expected[v * SHAPE[1] + u].append(k)
+    points = list_points_by_pixel(clusters, SHAPE)
+    assert clusters_at(points) == expected
+    used = [tuple(found) for found in expected]
+    assert (points.pixels > 0).sum() == len({*used, ()}) - (() not in used), "a list for each combination"
 
 
 @settings(max_examples=100, deadline=None)
@@ -189,10 +218,10 @@ def test_who_keeps_a_pixel_agrees_with_a_slow_reference(seed: int, share: float)
     ids = rng.integers(0, 3, 4).astype(np.int32)
     sizes = [int((clusters.cluster == k).sum()) for k in range(4)]
     expected = []
-    for at_pixel in clusters_at(clusters, points):
+    for at_pixel in clusters_at(points):
         small = [sizes[k] for k in at_pixel if ids[k]]
-        expected.append([k for k in at_pixel if not ids[k] or all(size >= share * sizes[k] for size in small)])
-    assert clusters_at(clusters, keep_on_top(clusters, points, ids, share)) == expected
+        expected.append([k for k in at_pixel if ids[k] and all(size >= share * sizes[k] for size in small)])
+    assert clusters_at(keep_on_top(points, ids, share)) == expected
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -204,13 +233,12 @@ def test_who_leaves_a_pixel_to_what_lies_there_agrees_with_a_slow_reference(seed
     seen = rng.integers(0, 3, tuple(-(-side // stride) for side in SHAPE)).astype(np.int32)
     lying = rng.random((4, 3)) < 0.4
     expected = []
-    for pixel, at_pixel in enumerate(clusters_at(clusters, points)):
+    for pixel, at_pixel in enumerate(clusters_at(points)):
         v, u = divmod(pixel, SHAPE[1])
         expected.append([k for k in at_pixel if not lying[k, seen[v // stride, u // stride]]])
-    assert clusters_at(clusters, leave_to_others(clusters, points, lying, seen, stride)) == expected
-    on_top = keep_on_top(clusters, points, np.int32([3, 0, 1, 2]), 0.8)
-    both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(clusters, on_top), strict=True)]
-    assert clusters_at(clusters, leave_to_others(clusters, on_top, lying, seen, stride)) == both
-    assert clusters_at(clusters, leave_to_others(clusters, points, lying & False, seen, stride)) == clusters_at(
-        clusters, points
-    ), "the lists given stay as they are"
+    assert clusters_at(leave_to_others(points, lying, seen, stride)) == expected
+    on_top = keep_on_top(points, np.int32([3, 0, 1, 2]), 0.8)
+    both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(on_top), strict=True)]
+    assert clusters_at(leave_to_others(on_top, lying, seen, stride)) == both
+    unchanged = leave_to_others(points, lying & False, seen, stride)
+    assert clusters_at(unchanged) == clusters_at(points), "the lists given stay as they are"

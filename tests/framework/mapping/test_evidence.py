@@ -9,13 +9,9 @@ from framework.data import Int32
 from framework.errors import DataError
 from framework.mapping import evidence as evidence_module
 from framework.mapping.evidence import (
-    ALL_NAMED,
-    CLASS_SLOTS,
     INSTANCE_SLOTS,
     MOST_GAIN,
     MOST_UNITS,
-    NEW_CLASSES,
-    NO_CLASS,
     SLOTS,
     Combine,
     Evidence,
@@ -31,11 +27,13 @@ from framework.mapping.evidence import (
     update_voxel,
 )
 from framework.mapping.integration import SeenBlocks
+from framework.mapping.slot_vectors import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.voxel_grid import VoxelGrid
 from tests.thread_counts import by_one_thread_and_two
 
 FLOOR = 0.05
 UNITS = 1 << 16  # as fine as in exact storage
+BARE, COVERED = np.int32(0), np.int32(1)  # numbers of the lists of clusters over a pixel: none, all of a measurement
 
 
 def blank() -> Evidence:
@@ -57,15 +55,14 @@ def measured(
     last_id: int,
 ) -> Measurement:
     """Every cluster covers the one pixel that there is."""
-    n = len(ids)
-    first, following = np.zeros((1, 1), np.int32), np.append(np.arange(1, n), -1).astype(np.int32)
+    said = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
     gains, named, bits = named_classes(np.log(distributions), logarithmic=True)
     return Measurement(
-        first,
-        following,
-        np.arange(n, dtype=np.int32),
+        np.full((1, 1), COVERED),
+        np.array([0, 0, len(said)], np.int32),
+        said,
         np.array(ids, np.int32),
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
@@ -109,7 +106,7 @@ def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) 
         instance = int(rng.integers(1, labels + 1))
         score = float(rng.uniform(0.2, 1))
         p = distribution(rng, classes)
-        evicted = update_voxel(evidence, 0, measured([instance], [score], p[None], 1.0, labels), np.int32(0))
+        evicted = update_voxel(evidence, 0, measured([instance], [score], p[None], 1.0, labels), COVERED)
         assert evicted == 0
         # P(O = instance) = score, P(O = any other) = FLOOR
         instance_log += np.log(FLOOR)
@@ -142,7 +139,7 @@ def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
             p = np.exp(logits) / np.exp(logits).sum()
             p = 0.9 * p + 0.1 / 80
             log += np.log(p)
-            evictions += update_voxel(evidence, 0, measured([1], [0.9], p[None], 1.0, 1), np.int32(0))
+            evictions += update_voxel(evidence, 0, measured([1], [0.9], p[None], 1.0, 1), COVERED)
         agree += best_class(evidence, 0) == np.argmax(log)
     assert agree >= 0.97 * voxels
     assert evictions > 0
@@ -151,7 +148,7 @@ def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
 def test_a_voxel_under_two_masks_hears_both() -> None:
     evidence = blank()
     p = np.full((2, 3), 1 / 3)
-    update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), np.int32(0))
+    update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), COVERED)
     found = dict(zip(evidence.instance_ids[0].tolist(), evidence.instance_value[0].tolist(), strict=True))
     assert found[1] == np.float32(np.log(0.9 / FLOOR))
     assert found[2] == np.float32(np.log(0.5 / FLOOR))
@@ -160,20 +157,20 @@ def test_a_voxel_under_two_masks_hears_both() -> None:
 def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
     evidence = blank()
     one = np.full((1, 3), 1 / 3)
-    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), np.int32(0))
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
     before = float(evidence.instance_value[0, 0])
-    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), np.int32(-1))  # instance 2 found, not here
+    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), BARE)  # instance 2 found, not here
     assert float(evidence.instance_value[0, 0]) == before
-    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))  # instance 1 found, not here
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)  # instance 1 found, not here
     assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
     for _ in range(10):
-        update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), np.int32(-1))
+        update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
     assert best_instance(evidence, 0) == 0, "the rest has become more likely"
 
 
 def test_a_cluster_without_instance_says_nothing() -> None:
     evidence = blank()
-    update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), np.int32(0))
+    update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), COVERED)
     assert (evidence.instance_ids == 0).all()
     assert (evidence.class_ids == NO_CLASS).all()
 
@@ -264,14 +261,14 @@ SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2
 def test_the_other_rules(combine: Combine, weighed: bool, instance: int, label: int) -> None:
     evidence = blank()
     for ids, scores, classes in SEEN:
-        update_voxel(evidence, 0, voted(ids, scores if weighed else [1.0], classes, combine), np.int32(0))
+        update_voxel(evidence, 0, voted(ids, scores if weighed else [1.0], classes, combine), COVERED)
     assert best_instance(evidence, 0) == instance
     assert best_class(evidence, 0) == label
 
 
 def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> None:
     evidence = blank()
-    update_voxel(evidence, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), np.int32(0))
+    update_voxel(evidence, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), COVERED)
     assert best_instance(evidence, 0) == 2
     assert best_class(evidence, 0) == 5
     assert (evidence.instance_ids[0, 1:] == 0).all()
@@ -280,7 +277,7 @@ def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> 
 def test_counts_are_counts() -> None:
     evidence = blank()
     for _ in range(3):
-        assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), np.int32(0)) == 0
+        assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), COVERED) == 0
     assert evidence.instance_value[0].tolist() == [3, 0, 0, 0]
     assert evidence.class_value[0, 0] == 300, "units"
     assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
@@ -293,7 +290,7 @@ def test_small_numbers_saturate_and_do_not_wrap() -> None:
     gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
     bits = (said.class_said & ALL_NAMED).astype(np.uint8)
     for _ in range(40):
-        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits, np.int32)), np.int32(0))
+        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits, np.int32)), COVERED)
     assert evidence.class_value[0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
     assert best_class(evidence, 0) == 2
 
@@ -309,7 +306,7 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
         class_said=class_said(gains, 64, bits, np.int32), named_classes=named, most_units=MOST_UNITS
     )
     for _ in range(1000):
-        update_voxel(evidence, 0, said, np.int32(0))
+        update_voxel(evidence, 0, said, COVERED)
         assert best_class(evidence, 0) == classes - 1
 
 
@@ -327,13 +324,15 @@ def at_pixel(block: int, *voxels: int) -> SeenBlocks:
 
 def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
     """A frame that sees the voxels of some blocks at pixels (A, 512), -1 = not near."""
-    seen = SeenBlocks(
-        blocks, (pixels >= 0).sum(axis=1, dtype=np.int32), np.zeros(pixels.shape, np.uint16), np.zeros_like(pixels)
+    block, voxel = np.nonzero(pixels >= 0)
+    count = np.bincount(block, minlength=len(blocks))
+    return SeenBlocks(
+        blocks,
+        np.cumsum(count) - count,
+        count.astype(np.int32),
+        voxel.astype(np.uint16),
+        pixels[block, voxel],
     )
-    for a, count in enumerate(seen.near_count):
-        seen.near_voxel[a, :count] = np.flatnonzero(pixels[a] >= 0)
-        seen.near_pixel[a, :count] = pixels[a][pixels[a] >= 0]
-    return seen
 
 
 def test_only_voxels_that_are_named_have_slots() -> None:
@@ -376,10 +375,13 @@ def _updated(max_blocks: int) -> Evidence:
         points = 12
         cluster = rng.integers(0, 4, points).astype(np.int32)
         pixel_of = rng.integers(0, 8, points)  # of 10 pixels, so that two are under none
-        first, following = np.full(10, -1, np.int32), np.full(points, -1, np.int32)
-        for p in reversed(range(points)):
-            following[p], first[pixel_of[p]] = first[pixel_of[p]], p
-        said = said._replace(first_point=first[None], next_point=following, cluster=cluster, absence=np.float32(-0.2))
+        lists = [[k for k in cluster[pixel_of == pixel] if instances[k]] for pixel in range(10)]
+        said = said._replace(
+            of_pixel=np.arange(1, 11, dtype=np.int32)[None],
+            first=np.cumsum([0, 0, *map(len, lists)], dtype=np.int32),
+            cluster=np.array([k for clusters in lists for k in clusters], np.int32),
+            absence=np.float32(-0.2),
+        )
         said = said._replace(class_said=said.class_said.astype(np.int32), most_units=MOST_UNITS)  # as compact storage
         blocks = rng.permutation(4)[:3].astype(np.int32)
         pixels = rng.integers(-1, 10, (3, 512)).astype(np.int32)
@@ -387,12 +389,9 @@ def _updated(max_blocks: int) -> Evidence:
         rows.update(seen_at(blocks, pixels), said)
         for a in range(2):
             for n in range(512):
-                point = first[pixels[a, n]] if pixels[a, n] >= 0 else -1
-                key, p, named = (int(blocks[a]), n), point, False
-                while p >= 0:
-                    named, p = named or bool(said.instance_id[cluster[p]]), following[p]
-                if pixels[a, n] >= 0 and (named or key in by_voxel):
-                    evicted += update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(point))
+                key, pixel = (int(blocks[a]), n), pixels[a, n]
+                if pixel >= 0 and (lists[pixel] or key in by_voxel):
+                    evicted += update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(pixel + 1))
     evidence = rows.in_use()
     assert len(by_voxel) == rows.voxel_count > 100
     for (block, n), own in by_voxel.items():
@@ -405,7 +404,7 @@ def _updated(max_blocks: int) -> Evidence:
 
 def test_slots_that_a_new_voxel_gives_away_count() -> None:
     said = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
-    expected = update_voxel(blank(), 0, said, np.int32(0))
+    expected = update_voxel(blank(), 0, said, COVERED)
     rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
     rows.begin(6)
     rows.voxels.allocate(np.zeros((1, 3), np.int32))

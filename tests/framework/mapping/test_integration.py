@@ -30,10 +30,10 @@ def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) ->
     """The blocks that a frame has updated, and the pixels that see their voxels near the surface, -1 for the others."""
     seen = integrator.integrate(frame, T_world_camera, VOXEL)
     pixels = np.full((len(seen.blocks), 512), -1)
-    for a, count in enumerate(seen.near_count):
-        voxels = seen.near_voxel[a, :count]
+    for a, (first, count) in enumerate(zip(seen.near_first, seen.near_count, strict=True)):
+        voxels = seen.near_voxel[first : first + count]
         assert (np.diff(voxels.astype(int)) > 0).all()
-        pixels[a, voxels] = seen.near_pixel[a, :count]
+        pixels[a, voxels] = seen.near_pixel[first : first + count]
     return seen.blocks, pixels
 
 
@@ -93,7 +93,8 @@ def test_a_frame_that_sees_more_blocks_takes_no_memory_that_was_reserved(
 
 def near_pixels(seen: SeenBlocks) -> list[int]:
     """The pixels that see voxels near the surface, as often as they see one."""
-    return sorted(int(p) for row, count in zip(seen.near_pixel, seen.near_count, strict=True) for p in row[:count])
+    parts = zip(seen.near_first.tolist(), seen.near_count.tolist(), strict=True)
+    return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
 
 
 def test_every_voxel_near_the_surface_is_seen() -> None:

@@ -8,8 +8,8 @@ from numba import njit
 
 from framework.data import PointClusters
 from framework.errors import DataError
-from framework.mapping.evidence import CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.pixel_lists import list_points_by_pixel
+from framework.mapping.slot_vectors import CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.voxel_grid import VoxelGrid
 from framework.rivals.class_evidence import ClassEvidence, ClassRows, MaskClasses, mask_classes, observe_mask
 
