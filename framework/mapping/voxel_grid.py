@@ -25,7 +25,7 @@ from numba import njit
 
 from framework.data import Int32, UInt8
 from framework.errors import MapFullError
-from framework.mapping.pages import PagesAhead
+from framework.mapping.pages import PagesAhead, keep_freed_memory
 
 try:
     import resource
@@ -293,6 +293,7 @@ class VoxelGrid:
     """Owns the arrays of the grid and makes them grow. The kernels work on `self.grid`."""
 
     def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
+        keep_freed_memory()
         self.max_blocks = max_blocks
         self.block_count = 0
         self.region_count = 0

@@ -84,8 +84,9 @@ def _smooth(normals, reach, across, smooth):
         for i in range(3):
             across[i, v] = np.float32(0.0)
             for d in range(-reach, reach + 1):
-                for u in range(max(-d, 0), min(width - d, width)):
-                    across[i, v, u] += normals[i, v, u + d]
+                first = max(-d, 0)
+                for n in range(width - abs(d)):  # unsigned, a place needs no look at whether it counts from the end
+                    across[i, v, np.uint64(first + n)] += normals[i, v, np.uint64(first + d + n)]
     for v in prange(height):
         smooth[:, v] = np.float32(0.0)
         for w in range(max(v - reach, 0), min(v + reach + 1, height)):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import platform
 import queue
+import subprocess
 import sys
 import time
 from pathlib import Path
@@ -96,3 +97,29 @@ def test_a_process_that_forked_asks_a_thread_of_its_own() -> None:
     if child == 0:
         os._exit(int(pages._asked() is asked))
     assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+
+
+FAULTS = """
+import os, resource, sys
+import numpy as np
+from framework.mapping.voxel_grid import VoxelGrid
+if sys.argv[1] == "kept":
+    VoxelGrid(0.01, 0.05, 10)
+for k in range(20):
+    if k == 10:
+        before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    images = [np.ones(2**20) for _ in range(3)]
+    del images
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc can be told")
+@pytest.mark.parametrize(("way", "said"), [("kept", {}), ("as ever", {}), ("kept", {"GLIBC_TUNABLES": ""})])
+def test_what_a_frame_needs_comes_without_new_pages(way: str, said: dict[str, str]) -> None:
+    """Ten times 24 MiB are 61,000 pages of 4 KiB, or 120 huge ones."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith(("MALLOC_", "GLIBC_"))}
+    answer = subprocess.run(
+        [sys.executable, "-c", FAULTS, way], env={**environment, **said}, check=True, capture_output=True, text=True
+    )
+    assert (int(answer.stdout) < 100) == (way == "kept" and not said)
