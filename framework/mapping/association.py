@@ -21,10 +21,11 @@ from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Float64, Frame, Int32, PointClusters, Pose
 from framework.errors import DataError
-from framework.mapping.evidence import Evidence, best_instance, labeled_voxel, next_instance
+from framework.mapping.evidence import Evidence, best_instance, label_row, next_instance
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.object_embedding import ObjectEmbedding, agreed_space
 from framework.mapping.pixel_lists import PixelLists, cover_another
+from framework.mapping.prefetching import prefetch_element
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import Pinhole
 from framework.mapping.voxel_grid import Grid
@@ -87,16 +88,21 @@ def look_up_instances(
     for row in prange(instance_ids.shape[1]):
         key = np.int64(-2)
         region = np.int32(-1)
-        blocks, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
+        rows, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
         for column in range(columns):
-            blocks[column] = -1
+            rows[column] = -1
             z = depth[row * stride, column * stride]
             if z > np.float32(0.0):
                 block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
-                blocks[column], voxels[column] = block, n
-        # in passes of their own, in which many loads that wait for the memory are under way at once
+                rows[column], voxels[column] = label_row(grid, block), n
+                if rows[column] >= 0:
+                    prefetch_element(evidence.labeled, rows[column], n)
+        # in passes of their own, each of which has the memory asked for that the next one needs
         for column in range(columns):
-            voxels[column] = labeled_voxel(grid, evidence, blocks[column], voxels[column])
+            voxel = evidence.labeled[rows[column], voxels[column]] if rows[column] >= 0 else np.int32(-1)
+            voxels[column] = voxel
+            if voxel >= 0:
+                prefetch_element(evidence.instance_ids, voxel, 0)
         for column in range(columns):
             voxel = voxels[column]
             instance_ids[0, row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)

@@ -147,9 +147,15 @@ def class_said(gains: Float64, units: int, named_bit: UInt8, kind: type[np.signe
 
 
 @device
+def label_row(grid, block):
+    """The row of a block, -1 = of none, in Evidence.labeled; -1 if it has none."""
+    return grid.label_row[block] if block >= 0 else np.int32(-1)
+
+
+@device
 def labeled_voxel(grid, evidence, block, n):
     """The number of voxel n of a block, -1 = of none, among those that have slots; -1 if it has none."""
-    row = grid.label_row[block] if block >= 0 else np.int32(-1)
+    row = label_row(grid, block)
     return evidence.labeled[row, n] if row >= 0 else np.int32(-1)
 
 

@@ -10,11 +10,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32, PointClusters
 from framework.geometry import require_pixels_inside
 from framework.mapping.voxel_grid import device
+
+CHUNKS = 16  # of image rows
 
 
 class PixelLists(NamedTuple):
@@ -173,40 +175,52 @@ def keep_on_top(points: PixelLists, instance_ids: Int32, share: float) -> PixelL
     return points._replace(first=first, cluster=kept[: first[-1]])
 
 
-@njit(cache=True, nogil=True)
-def _leave_to_others(of_pixel, pixels, first, cluster, lying, seen, stride, number, left):
-    """Gives pixels under a cluster on which the instance seen there lies the number of a new list, and counts them.
+@njit(cache=True, nogil=True, parallel=True)
+def _renumber(of_pixel, seen, stride, column, number, renumbered, moved):
+    """Fills renumbered (H, W) with number[i, column[k]] for a pixel with list i where the map has instance k.
 
-    number (L, ids + 1), of zeros before, gets the one that each list is changed for under each instance, left (R, 2)
-    the list and the instance of each new one. Returns how many these are.
+    Counts in moved (CHUNKS, lists), of zeros before, the pixels that get another number.
+    """
+    height, width = of_pixel.shape
+    for chunk in prange(CHUNKS):
+        for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
+            row, old_row, new_row = seen[v // stride], of_pixel[v], renumbered[v]
+            new_row[:] = old_row
+            for place in range(row.shape[0]):
+                k = column[row[place]]
+                for u in range(place * stride, min((place + 1) * stride, width) if k > 0 else 0):
+                    old = old_row[u]
+                    new = number[old, k]
+                    new_row[u] = new
+                    if new != old:
+                        moved[chunk, new] += 1
+
+
+@njit(cache=True, nogil=True)
+def _lists_without(first, cluster, lying, instances, number, origin, ends, kept):
+    """Fills number (L, 1 + J) with the list that each becomes where none and where each of `instances` (J,) is seen.
+
+    New lists are numbered on: origin gets what each was made of, ends where its clusters end in kept. Returns how many
+    lists these are, and of how many clusters in all.
     """
     lists = first.shape[0] - 1
-    affected = np.zeros(lists, np.bool_)
+    new = length = 0
     for i in range(lists):
-        for place in range(first[i], first[i + 1]):
-            affected[i] |= lying[cluster[place]].any()
-    new = 0
-    column = np.arange(of_pixel.shape[1]) // stride
-    for v in range(of_pixel.shape[0]):
-        row = v // stride
-        for u in range(of_pixel.shape[1]):
-            i = of_pixel[v, u]
-            if not affected[i]:
-                continue
-            instance = seen[row, column[u]]
-            if number[i, instance] == 0:
-                number[i, instance] = i
-                for place in range(first[i], first[i + 1]):
-                    if lying[cluster[place], instance]:
-                        number[i, instance] = lists + new
-                if number[i, instance] != i:
-                    left[new, 0], left[new, 1] = i, instance
-                    new += 1
-            if number[i, instance] != i:
-                of_pixel[v, u] = number[i, instance]
-                pixels[i] -= 1
-                pixels[number[i, instance]] += 1
-    return new
+        number[i, 0] = i
+    for j in range(instances.shape[0]):
+        for i in range(lists):
+            before = length
+            for place in range(first[i], first[i + 1]):
+                if not lying[cluster[place], instances[j]]:
+                    kept[length] = cluster[place]
+                    length += 1
+            if length - before == first[i + 1] - first[i]:
+                number[i, 1 + j], length = i, before
+            else:
+                number[i, 1 + j] = lists + new
+                origin[new], ends[new] = i, length
+                new += 1
+    return new, length
 
 
 def leave_to_others(points: PixelLists, lying: Bool, seen: Int32, stride: int) -> PixelLists:
@@ -214,13 +228,18 @@ def leave_to_others(points: PixelLists, lying: Bool, seen: Int32, stride: int) -
 
     `seen` holds the map's instance at every stride-th pixel of every stride-th row.
     """
-    lists, of_pixel = len(points.pixels), points.of_pixel.copy()
-    number = np.zeros((lists, lying.shape[1]), np.int32)  # zeros that nobody writes cost nothing
-    pixels, left = np.zeros(lists + number.size, np.int32), np.empty((number.size, 2), np.int32)
+    instances = np.flatnonzero(lying.any(axis=0))
+    column = np.zeros(lying.shape[1], np.int32)
+    column[instances] = np.arange(1, len(instances) + 1)
+    lists = len(points.pixels)
+    number = np.empty((lists, 1 + len(instances)), np.int32)
+    origin, ends = np.empty((2, lists * len(instances)), np.int32)
+    kept = np.empty(len(points.cluster) * len(instances), np.int32)
+    new, length = _lists_without(points.first, points.cluster, lying, instances, number, origin, ends, kept)
+    of_pixel, moved = np.empty_like(points.of_pixel), np.zeros((CHUNKS, lists + new), np.int32)
+    _renumber(points.of_pixel, seen, stride, column, number, of_pixel, moved)
+    pixels = moved.sum(axis=0, dtype=np.int32)
     pixels[:lists] = points.pixels
-    new = _leave_to_others(of_pixel, pixels, points.first, points.cluster, lying, seen, stride, number, left)
-    kept = [points.cluster[points.first[i] : points.first[i + 1]] for i in left[:new, 0]]
-    kept = [list_[~lying[list_, instance]] for list_, instance in zip(kept, left[:new, 1], strict=True)]
-    first = np.append(points.first, points.first[-1] + _begins(np.array([len(list_) for list_ in kept], np.int32))[1:])
-    cluster = np.concatenate([points.cluster, *kept])
-    return PixelLists(of_pixel, pixels[: lists + new].copy(), first.astype(np.int32), cluster, points.cluster_count)
+    np.subtract.at(pixels, origin[:new], pixels[lists:])
+    first = np.concatenate([points.first, points.first[-1] + ends[:new]])
+    return PixelLists(of_pixel, pixels, first, np.concatenate([points.cluster, kept[:length]]), points.cluster_count)

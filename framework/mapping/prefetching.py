@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
@@ -29,6 +30,12 @@ def prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.int64), generate
+
+
+@device
+def prefetch_element(array, row, column):
+    """Has array[row, column] loaded while the processor goes on."""
+    prefetch_line(array, np.int64(row) * array.strides[0] + np.int64(column) * array.strides[1])
 
 
 @device

@@ -56,12 +56,39 @@ def is_coarse(depth: Float32, otherwise: bool) -> bool:
     the noise of a structured-light camera: a Kinect's are 1.5 to 1.9 standard deviations at any distance, millimetres
     0.8 or less; those of 39 mm are 20 at 1 m and 3 at 3 m. `otherwise` is the answer where too few values occur.
     """
-    values = np.unique(depth[::SAMPLED, ::SAMPLED])
-    values = values[values > 0]
+    values = _distinct(depth[::SAMPLED, ::SAMPLED])
     if len(values) < FEWEST_VALUES:
         return otherwise
     steps = np.diff(values) / (LEAST + GROWTH * (values[:-1] - NEAR) ** 2)
     return bool(np.percentile(steps[: len(steps) // 2], 25) > COARSE)  # a gap may be two steps, no step is missed
+
+
+def _distinct(depth: Float32) -> Float32:
+    """The different readings in depth (H, W) m, ascending: few, as a rule, and they are found faster than sorted."""
+    bits = np.ascontiguousarray(depth).view(np.int32)
+    table = np.zeros(1 << (2 * bits.size).bit_length(), np.int32)
+    found = np.empty(bits.size, np.int32)
+    return np.sort(found[: _find_distinct(bits.ravel(), table, found)].view(np.float32))
+
+
+@njit(cache=True, nogil=True)
+def _find_distinct(bits, table, found):
+    """Fills `found` with the different ones of the bits that are above 0, and returns how many; table (2^k,) is a hash
+    table of zeros, of more than twice as many.
+    """
+    count = 0
+    last = np.uint64(table.shape[0] - 1)
+    for value in bits:
+        if value <= 0:
+            continue
+        slot = (np.uint64(value) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)) & last
+        while table[slot] != 0 and table[slot] != value:
+            slot = (slot + np.uint64(1)) & last
+        if table[slot] == 0:
+            table[slot] = value
+            found[count] = value
+            count += 1
+    return count
 
 
 def _halved(camera: Camera) -> Camera:
