@@ -38,7 +38,7 @@ from framework.errors import DataError
 from framework.mapping.bit_slices import ONE, lowest_bit
 from framework.mapping.integration import SeenBlocks
 from framework.mapping.pages import PagesAhead
-from framework.mapping.prefetching import prefetch_line
+from framework.mapping.prefetching import prefetch_line, prefetch_row
 from framework.mapping.slot_vectors import (
     ALL_NAMED,
     CLASS_SLOTS,
@@ -54,7 +54,7 @@ Integers = npt.NDArray[Any]  # of int16, int32 or int64
 
 INSTANCE_SLOTS = 4  # instances that a voxel can tell apart in compact storage
 RESERVED = 128  # voxels with slots for each block of the budget: most have fewer, and slots for more are made
-AHEAD = 4  # near voxels from the one in work to the one whose slots are asked for
+GROUP = 16  # blocks that one thread updates in a row
 MERGED_AT_ONCE = 512  # voxels: where none of them knows an instance, they are passed over
 MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
 MOST_GAIN = 2**15 - 1 - MOST_UNITS  # units that one cluster may add there: what int16 has room for
@@ -372,36 +372,53 @@ def _update(grid, seen, evidence, measurement, of_pixel, new, evicted):
 
     Counts in new (A,) those without that lie under a cluster with an instance, in evicted (A,) slots given away.
     """
-    for a in prange(seen.blocks.shape[0]):
-        row = grid.label_row[seen.blocks[a]]
-        first, last = seen.near_first[a], seen.near_first[a] + seen.near_count[a]
-        given_away = without_slots = np.int32(0)
-        if row < 0:
+    blocks = seen.blocks.shape[0]
+    for group in prange((blocks + GROUP - 1) // GROUP):
+        voxels, numbers = np.empty(BLOCK_VOXELS, np.int32), np.empty(BLOCK_VOXELS, np.int32)
+        for a in range(group * GROUP, min((group + 1) * GROUP, blocks)):
+            row = grid.label_row[seen.blocks[a]]
+            after = grid.label_row[seen.blocks[min(a + 1, blocks - 1)]]
+            if after >= 0:
+                prefetch_row(evidence.labeled, np.int64(after))
+            first, last = seen.near_first[a], seen.near_first[a] + seen.near_count[a]
+            given_away = without_slots = count = np.int32(0)
             for i in range(first, last):
-                without_slots = one_more(without_slots, _is_named(measurement, of_pixel[seen.near_pixel[i]]))
-        else:
-            labeled = evidence.labeled[row]
-            for i in range(first, last):
-                later = labeled[seen.near_voxel[min(i + AHEAD, last - 1)]]
-                if later >= 0:
-                    _ask_for_slots(evidence, later)
-                number, voxel = of_pixel[seen.near_pixel[i]], labeled[seen.near_voxel[i]]
+                number = of_pixel[np.uint32(seen.near_pixel[i])]
+                voxel = evidence.labeled[row, seen.near_voxel[i]] if row >= 0 else np.int32(-1)
                 if voxel >= 0:
-                    given_away += update_voxel(evidence, voxel, measurement, number)
+                    _ask_for_slots(evidence, voxel)
+                    voxels[count], numbers[count] = voxel, number
+                    count += np.int32(1)
                 else:
                     without_slots = one_more(without_slots, _is_named(measurement, number))
-        evicted[a], new[a] = given_away, without_slots
+            for i in range(count):
+                given_away += update_voxel(evidence, voxels[i], measurement, numbers[i])
+            evicted[a], new[a] = given_away, without_slots
+
+
+@njit(cache=True, nogil=True)
+def _number_new(blocks, new, label_row, row_count, voxel_count, rows, first_new):
+    """Fills rows (A,) with the row of each block, a new one where it has new (A,) voxels and none, and first_new (A,)
+    with the number of the first of these; returns how many rows and voxels there are then.
+    """
+    for a in range(blocks.shape[0]):
+        rows[a], first_new[a] = label_row[blocks[a]], voxel_count
+        if new[a] > 0 and rows[a] < 0:
+            rows[a] = row_count
+            row_count += 1
+        voxel_count += new[a]
+    return row_count, voxel_count
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _label_new(grid, seen, evidence, measurement, of_pixel, new, first_new, free_classes, evicted):
-    """Gives the new (A,) voxels of each block their slots, from first_new (A,) on, and has them updated.
+def _label_new(grid, seen, evidence, measurement, of_pixel, new, rows, first_new, free_classes, evicted):
+    """Gives the new (A,) voxels of each block, in its row, their slots, from first_new (A,) on, and has them updated.
 
     free_classes (T,) is what slots for classes hold before; slots given away are added to evicted (A,).
     """
     for a in prange(seen.blocks.shape[0]):
-        voxel = first_new[a]
-        row = grid.label_row[seen.blocks[a]]
+        voxel, row = first_new[a], rows[a]
+        grid.label_row[seen.blocks[a]] = row
         first = seen.near_first[a]
         for i in range(first, first + seen.near_count[a] if new[a] > 0 else first):
             number, n = of_pixel[seen.near_pixel[i]], seen.near_voxel[i]
@@ -518,8 +535,8 @@ class EvidenceRows:
             self._make_room_for_instances(len(measurement.instance_id))
         grid, free_classes = self.voxels.grid, self._free_classes()
         _update(grid, seen, self.evidence, measurement, of_pixel, new, evicted)
-        first_new = self._make_room(seen.blocks, new)
-        _label_new(grid, seen, self.evidence, measurement, of_pixel, new, first_new, free_classes, evicted)
+        rows, first_new = self._make_room(seen.blocks, new)
+        _label_new(grid, seen, self.evidence, measurement, of_pixel, new, rows, first_new, free_classes, evicted)
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
@@ -546,17 +563,18 @@ class EvidenceRows:
         named = np.arange(self._class_slots) if self.storage is Storage.EXACT else np.full(self._class_slots, NO_CLASS)
         return named.astype(np.uint8)
 
-    def _make_room(self, blocks: Int32, new: Int32) -> Int32:
+    def _make_room(self, blocks: Int32, new: Int32) -> tuple[Int32, Int32]:
         """Reserves slots for so many `new` (A,) voxels of each of these blocks, and rows for the blocks without one.
 
-        Returns (A,) the number of each block's first new voxel.
+        Returns the row of each block (A,) and the number of its first new voxel (A,).
         """
-        without = blocks[(new > 0) & (self.voxels.grid.label_row[blocks] < 0)]
-        rows, first_new = self.row_count, self.voxel_count + np.cumsum(new) - new
-        self._reserve(rows + len(without), self.voxel_count + int(new.sum()))
-        self.evidence.labeled[rows : self.row_count] = -1
-        self.voxels.grid.label_row[without] = np.arange(rows, self.row_count, dtype=np.int32)
-        return np.asarray(first_new, np.int32)
+        rows_before = self.row_count
+        rows, first_new = np.empty((2, len(blocks)), np.int32)
+        self._reserve(
+            *_number_new(blocks, new, self.voxels.grid.label_row, rows_before, self.voxel_count, rows, first_new)
+        )
+        self.evidence.labeled[rows_before : self.row_count] = -1
+        return rows, first_new
 
     def _reserve(self, rows: int, voxels: int) -> None:
         """Has so many rows and voxels in use; the new ones hold anything."""
