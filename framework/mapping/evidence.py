@@ -416,9 +416,10 @@ def _label_new(grid, seen, evidence, measurement, of_pixel, new, rows, first_new
 
     free_classes (T,) is what slots for classes hold before; slots given away are added to evicted (A,).
     """
+    row_of = grid.label_row  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         voxel, row = first_new[a], rows[a]
-        grid.label_row[seen.blocks[a]] = row
+        row_of[seen.blocks[a]] = row
         first = seen.near_first[a]
         for i in range(first, first + seen.near_count[a] if new[a] > 0 else first):
             number, n = of_pixel[seen.near_pixel[i]], seen.near_voxel[i]
