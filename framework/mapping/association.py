@@ -24,11 +24,11 @@ from framework.errors import DataError
 from framework.mapping.evidence import Evidence, best_instance, label_row, next_instance
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.object_embedding import ObjectEmbedding, agreed_space
-from framework.mapping.pixel_lists import PixelLists, cover_another
+from framework.mapping.pixel_lists import CHUNKS, PixelLists, cover_another
 from framework.mapping.prefetching import prefetch_element
 from framework.mapping.raycasting import voxel_seen
 from framework.mapping.sensor import Pinhole
-from framework.mapping.voxel_grid import Grid
+from framework.mapping.voxel_grid import Grid, device
 from framework.parameters import check_bounds
 
 VOTES_ACROSS = 320  # pixels of an image row that vote: more cost time and tell the same
@@ -110,31 +110,38 @@ def look_up_instances(
 
 
 @njit(cache=True, nogil=True)
-def _count_samples(labels, counts):
-    """Adds to counts (n,) how often each of labels (h, w) occurs, by runs: a counter raised by one waits for itself."""
-    label, count = np.int32(0), 0
-    for found in labels.flat:
-        if found != label:
-            counts[label] += count
-            label, count = found, 0
-        count += 1
-    counts[label] += count
+def _find_seen(instance_ids, seen):
+    """Marks in seen (ids + 1,) the instances that occur in instance_ids (h, w)."""
+    for instance in instance_ids.flat:
+        seen[np.uint32(instance)] = True
 
 
-@njit(cache=True, nogil=True)
+@device
+def _add_run(count, number, label, first, cluster, column, votes):
+    """Adds `count` pixels with a list's number and an instance to the votes (N + 1, M + 1) of its clusters, and of all
+    pixels, in the last row.
+    """
+    votes[votes.shape[0] - 1, column[label]] += count
+    for place in range(first[number], first[number + 1]):
+        votes[cluster[place], column[label]] += count
+
+
+@njit(cache=True, nogil=True, parallel=True)
 def _count_votes(of_pixel, first, cluster, instance_ids, stride, column, votes):
-    """Adds to votes (N, M + 1) the pixels of each cluster that fall on the instance of each column, by runs."""
-    number, label, count = np.int32(0), np.int32(0), 0
-    for row in range(instance_ids.shape[0]):
-        for place in range(instance_ids.shape[1]):
-            i, found = of_pixel[row * stride, place * stride], instance_ids[row, place]
-            if i != number or found != label:
-                for k in range(first[number], first[number + 1]):
-                    votes[cluster[k], column[label]] += count
-                number, label, count = i, found, 0
-            count += 1
-    for k in range(first[number], first[number + 1]):
-        votes[cluster[k], column[label]] += count
+    """Adds to votes (CHUNKS, N + 1, M + 1) the pixels of each cluster, and of any or none, that fall on the instance of
+    each column, by runs: a counter raised by one waits for itself.
+    """
+    rows = instance_ids.shape[0]
+    for chunk in prange(CHUNKS):
+        number, label, count = np.int32(0), np.int32(0), np.int32(0)
+        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
+            for place in range(instance_ids.shape[1]):
+                i, found = of_pixel[row * stride, place * stride], instance_ids[row, place]
+                if i != number or found != label:
+                    _add_run(count, number, label, first, cluster, column, votes[chunk])
+                    number, label, count = i, found, np.int32(0)
+                count += np.int32(1)
+        _add_run(count, number, label, first, cluster, column, votes[chunk])
 
 
 def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
@@ -142,19 +149,19 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
 
     Each sample counts for the stride^2 pixels that it stands for.
     """
-    visible = np.zeros(instance_ids.max() + 1, np.int32)
-    _count_samples(instance_ids, visible)
-    visible[0] = 0
-    seen = np.flatnonzero(visible)
-    column = np.full(len(visible), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
+    is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
+    _find_seen(instance_ids, is_seen)
+    seen = np.flatnonzero(is_seen[1:]) + 1
+    column = np.full(len(is_seen), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
     column[seen] = np.arange(len(seen), dtype=np.int32)
-    votes = np.zeros((points.cluster_count, len(seen) + 1), np.int32)
-    _count_votes(points.of_pixel, points.first, points.cluster, instance_ids, stride, column, votes)
+    by_chunk = np.zeros((CHUNKS, points.cluster_count + 1, len(seen) + 1), np.int32)
+    _count_votes(points.of_pixel, points.first, points.cluster, instance_ids, stride, column, by_chunk)
+    votes = by_chunk.sum(axis=0, dtype=np.int32) * np.int32(stride**2)
     return Overlaps(
         instance_ids=seen.astype(np.int32),
-        visible=visible[seen] * stride**2,
-        sizes=votes.sum(axis=1, dtype=np.int32) * stride**2,
-        votes=votes[:, :-1] * stride**2,
+        visible=votes[-1, :-1],
+        sizes=votes[:-1].sum(axis=1, dtype=np.int32),
+        votes=votes[:-1, :-1],
         seen=instance_ids,
         stride=stride,
     )

@@ -19,6 +19,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, SurfaceView
@@ -42,6 +43,18 @@ J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in ra
 TERM_SIZE = ADDED + SUMS * LANES  # behind the fields, what the batch adds to the lanes
 FAR = 2.0  # m; ATE of freiburg1_rpy's first 300 frames 26.7 mm without, 24.7 mm with it; of redkitchen 21.2 mm both
 NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
+
+
+def _places() -> npt.NDArray[np.int64]:
+    """(6, 6) where the numbers of the symmetric matrix stand among the sums."""
+    places = np.empty((6, 6), np.int64)
+    for i in range(6):
+        following = (i + np.arange(4)) % 6
+        places[i, following] = places[following, i] = i * ROW + np.arange(4)
+    return places
+
+
+PLACES = _places()
 
 
 class ModelView(NamedTuple):
@@ -435,15 +448,10 @@ def linearize(
         sums,
     )
     total = sums.sum(axis=0)
-    products = total[: 6 * ROW].reshape(6, ROW)
-    A = np.empty((6, 6))
-    for i in range(6):
-        following = (i + np.arange(4)) % 6
-        A[i, following] = A[following, i] = products[i, :4]
     visible, weighed, close, behind, weighed_colors, compared = (int(count) for count in total[SUMS:])
     return NormalEquations(
-        A=A,
-        b=products[:, 4].copy(),
+        A=total[PLACES],
+        b=total[ROW - 1 : 6 * ROW : ROW].copy(),
         visible=visible,
         matched=weighed if weights.depth_weight > 0 else weighed_colors,
         close=close,
