@@ -55,7 +55,8 @@ Integers = npt.NDArray[Any]  # of int16, int32 or int64
 INSTANCE_SLOTS = 4  # instances that a voxel can tell apart in compact storage
 RESERVED = 128  # voxels with slots for each block of the budget: most have fewer, and slots for more are made
 GROUP = 16  # blocks that one thread updates in a row
-MERGED_AT_ONCE = 512  # voxels: where none of them knows an instance, they are passed over
+BITS = 64  # of a word that tells which instances a row may know: instance k is bit k % BITS
+ANY_INSTANCE = np.uint64(2**BITS - 1)
 MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
 MOST_GAIN = 2**15 - 1 - MOST_UNITS  # units that one cluster may add there: what int16 has room for
 
@@ -366,11 +367,26 @@ def _ask_for_slots(evidence, voxel):
     prefetch_line(evidence.instance_ids, first + size - 1)
 
 
+@device
+def _instance_bit(instance):
+    return ONE << (np.uint64(instance) % np.uint64(BITS))
+
+
+@njit(cache=True, nogil=True)
+def _find_named(first, cluster, instance_id, named):
+    """Fills named (L,) with the bits of the instances of each list's clusters."""
+    for i in range(named.shape[0]):
+        named[i] = 0
+        for place in range(first[i], first[i + 1]):
+            named[i] |= _instance_bit(instance_id[cluster[place]])
+
+
 @njit(cache=True, nogil=True, parallel=True)
-def _update(grid, seen, evidence, measurement, of_pixel, new, evicted):
+def _update(grid, seen, evidence, measurement, of_pixel, named, known, new, evicted):
     """Updates the near voxels of the seen blocks that have slots.
 
-    Counts in new (A,) those without that lie under a cluster with an instance, in evicted (A,) slots given away.
+    Adds to a row's instances, known (R,), those that are named (L,) in the lists of its voxels' pixels. Counts in
+    new (A,) those without that lie under a cluster with an instance, in evicted (A,) slots given away.
     """
     blocks = seen.blocks.shape[0]
     for group in prange((blocks + GROUP - 1) // GROUP):
@@ -382,6 +398,7 @@ def _update(grid, seen, evidence, measurement, of_pixel, new, evicted):
                 prefetch_row(evidence.labeled, np.int64(after))
             first, last = seen.near_first[a], seen.near_first[a] + seen.near_count[a]
             given_away = without_slots = count = np.int32(0)
+            more = np.uint64(0)
             for i in range(first, last):
                 number = of_pixel[np.uint32(seen.near_pixel[i])]
                 voxel = evidence.labeled[row, seen.near_voxel[i]] if row >= 0 else np.int32(-1)
@@ -389,11 +406,14 @@ def _update(grid, seen, evidence, measurement, of_pixel, new, evicted):
                     _ask_for_slots(evidence, voxel)
                     voxels[count], numbers[count] = voxel, number
                     count += np.int32(1)
+                    more |= named[number]
                 else:
                     without_slots = one_more(without_slots, _is_named(measurement, number))
             for i in range(count):
                 given_away += update_voxel(evidence, voxels[i], measurement, numbers[i])
             evicted[a], new[a] = given_away, without_slots
+            if row >= 0:
+                known[row] |= more
 
 
 @njit(cache=True, nogil=True)
@@ -411,8 +431,9 @@ def _number_new(blocks, new, label_row, row_count, voxel_count, rows, first_new)
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _label_new(grid, seen, evidence, measurement, of_pixel, new, rows, first_new, free_classes, evicted):
-    """Gives the new (A,) voxels of each block, in its row, their slots, from first_new (A,) on, and has them updated.
+def _label_new(grid, seen, evidence, measurement, of_pixel, named, known, new, rows, first_new, free_classes, evicted):
+    """Gives the new (A,) voxels of each block, in its row, their slots, from first_new (A,) on, and updates them like
+    _update().
 
     free_classes (T,) is what slots for classes hold before; slots given away are added to evicted (A,).
     """
@@ -426,6 +447,7 @@ def _label_new(grid, seen, evidence, measurement, of_pixel, new, rows, first_new
             if evidence.labeled[row, n] < 0 and _is_named(measurement, number):
                 _label(evidence, row, n, voxel, free_classes)
                 evicted[a] += update_voxel(evidence, voxel, measurement, number)
+                known[row] |= named[number]
                 voxel += np.int32(1)
 
 
@@ -459,16 +481,14 @@ def _merge_voxel(ids, values, kept, dropped, combine):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _merge(evidence, count, kept, dropped, combine):
-    all_ids = evidence.instance_ids
-    for part in prange((count + MERGED_AT_ONCE - 1) // MERGED_AT_ONCE):
-        first, last = part * MERGED_AT_ONCE, min((part + 1) * MERGED_AT_ONCE, count)
-        for voxel in range(first, last):
-            found = np.int32(0)
-            for s in range(all_ids.shape[1]):
-                found = one_more(found, all_ids[voxel, s] == dropped)
-            if found > 0:
-                _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
+def _merge(evidence, known, kept, dropped, combine):
+    """Merges in the rows that may know the dropped instance, of known (R,), which then may know the other one."""
+    for row in prange(known.shape[0]):
+        if known[row] & _instance_bit(dropped):
+            known[row] |= _instance_bit(kept)
+            for voxel in evidence.labeled[row]:
+                if voxel >= 0:
+                    _merge_voxel(evidence.instance_ids[voxel], evidence.instance_value[voxel], kept, dropped, combine)
 
 
 class EvidenceRows:
@@ -488,7 +508,8 @@ class EvidenceRows:
 
     def __getstate__(self) -> dict[str, Any]:
         """For pickling: without what is only reserved, which is gigabytes."""
-        used = {"_labeled": self._labeled[: self.row_count], "_slots": self._slots[: self.voxel_count]}
+        rows = {name: getattr(self, name)[: self.row_count] for name in ("_labeled", "_known")}
+        used = {**rows, "_slots": self._slots[: self.voxel_count]}
         return {**vars(self), **used, "evidence": None, "_pages": PagesAhead()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -498,7 +519,8 @@ class EvidenceRows:
     @property
     def byte_count(self) -> int:
         """Of what is in use: capacity that no voxel has been given yet takes no memory."""
-        return self._labeled[: self.row_count].nbytes + self._slots[: self.voxel_count].nbytes
+        rows = self._labeled[: self.row_count].nbytes + self._known[: self.row_count].nbytes
+        return rows + self._slots[: self.voxel_count].nbytes
 
     def in_use(self) -> Evidence:
         """The evidence without capacity that is free."""
@@ -510,6 +532,7 @@ class EvidenceRows:
         self._instance_slots = max(self._instance_slots, saved.instance_ids.shape[1])
         self._free()
         self._reserve(len(saved.labeled), len(saved.instance_ids))
+        self._known[: self.row_count] = ANY_INSTANCE
         own = self.in_use()
         own.labeled[:] = saved.labeled
         for name in SLOTS:
@@ -535,20 +558,27 @@ class EvidenceRows:
         if self.storage is Storage.EXACT:
             self._make_room_for_instances(len(measurement.instance_id))
         grid, free_classes = self.voxels.grid, self._free_classes()
-        _update(grid, seen, self.evidence, measurement, of_pixel, new, evicted)
+        named = np.empty(len(measurement.first) - 1, np.uint64)
+        _find_named(measurement.first, measurement.cluster, measurement.instance_id, named)
+        _update(grid, seen, self.evidence, measurement, of_pixel, named, self._known, new, evicted)
         rows, first_new = self._make_room(seen.blocks, new)
-        _label_new(grid, seen, self.evidence, measurement, of_pixel, new, rows, first_new, free_classes, evicted)
+        _label_new(
+            grid, seen, self.evidence, measurement, of_pixel, named, self._known, new, rows, first_new, free_classes,
+            evicted,
+        )  # fmt: skip
         self.evicted += int(evicted.sum())
 
     def merge_instances(self, kept: int, dropped: int) -> None:
         """Combines the evidence for instance `dropped` with that for `kept` in every voxel.
 
-        Rare, and it goes through the slots of the whole map.
+        Rare, and it goes through the blocks in which the dropped one was named, and one in 64 others.
         """
-        _merge(self.evidence, self.voxel_count, np.int32(kept), np.int32(dropped), int(self.combine))
+        known = self._known[: self.row_count]
+        _merge(self.evidence, known, np.int32(kept), np.int32(dropped), int(self.combine))
 
     def _free(self) -> None:
         self._labeled = reserved(self.voxels.max_blocks, lambda rows: np.empty((rows, BLOCK_VOXELS), np.int32))
+        self._known = np.empty(len(self._labeled), np.uint64)  # a row's instances: those that its voxels may know
         units = np.int16 if self.storage is Storage.COMPACT else np.int64
         shapes = self._instance_slots, self._instance_slots, self._class_slots, self._class_slots
         kinds = zip(SLOTS, (np.int32, np.float32, np.uint8, units), shapes, strict=True)
@@ -575,12 +605,14 @@ class EvidenceRows:
             *_number_new(blocks, new, self.voxels.grid.label_row, rows_before, self.voxel_count, rows, first_new)
         )
         self.evidence.labeled[rows_before : self.row_count] = -1
+        self._known[rows_before : self.row_count] = 0
         return rows, first_new
 
     def _reserve(self, rows: int, voxels: int) -> None:
         """Has so many rows and voxels in use; the new ones hold anything."""
         if rows > len(self._labeled):
             self._labeled = grown(self._labeled, max(rows, 2 * len(self._labeled)))
+            self._known = grown(self._known, len(self._labeled))
         if voxels > len(self._slots):
             self._slots = grown(self._slots, max(voxels, 2 * len(self._slots)))
         self.row_count, self.voxel_count = rows, voxels

@@ -18,6 +18,7 @@ from framework.mapping.evidence import (
     EvidenceRows,
     Measurement,
     Storage,
+    _merge_voxel,
     add_evidence,
     best_class,
     best_counted_instance,
@@ -185,6 +186,15 @@ def test_class_gains_are_relative_to_the_classes_not_named() -> None:
     assert np.allclose(gains, np.log(p / rest), atol=1e-5)
 
 
+def with_voxels(count: int) -> EvidenceRows:
+    """Labels of a map from before, of so many voxels, whose slots hold anything."""
+    labeled = np.full(-(-count // 512) * 512, -1, np.int32)
+    labeled[:count] = np.arange(count)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 100))
+    rows.fill(Evidence(labeled.reshape(-1, 512), *(np.zeros((count, slots)) for slots in (4, 4, 16, 16))))
+    return rows
+
+
 @pytest.mark.parametrize(
     ("ids", "logs", "merged_ids", "merged_logs"),
     [
@@ -197,8 +207,7 @@ def test_class_gains_are_relative_to_the_classes_not_named() -> None:
 def test_merging_adds_evidence_and_keeps_the_best_first(
     ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
 ) -> None:
-    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
-    rows.voxel_count = 1
+    rows = with_voxels(1)
     rows.evidence.instance_ids[0], rows.evidence.instance_value[0] = ids, logs
     rows.merge_instances(3, 2)
     found = dict(zip(rows.evidence.instance_ids[0].tolist(), rows.evidence.instance_value[0].tolist(), strict=True))
@@ -210,13 +219,12 @@ def test_merging_adds_evidence_and_keeps_the_best_first(
 @pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
 def test_merging_finds_every_voxel(count: int) -> None:
     """Of thousands, a few know the instance: the first and the last in use, and some between; none beyond."""
-    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 100))
+    rows = with_voxels(count)
     evidence = rows.evidence
     evidence.instance_ids[: count + 100], evidence.instance_value[: count + 100] = [4, 2, 0, 0], [7, 5, 0, 0]
     known = np.unique([0, count // 3, count - 1])
     evidence.instance_ids[known, 1] = 3
     evidence.instance_ids[count : count + 100, 1] = 3
-    rows.voxel_count = count
     before = evidence.instance_ids[: count + 100].copy()
     rows.merge_instances(4, 3)
     expected = before.copy()
@@ -369,8 +377,8 @@ def _updated(max_blocks: int) -> Evidence:
     rows.voxels.allocate(np.array([[k, 0, 0] for k in range(4)], np.int32))
     by_voxel: dict[tuple[int, int], Evidence] = {}
     evicted = 0
-    for _ in range(5):
-        instances = [0, 1, 2, int(rng.integers(3, 8))]
+    for frame in range(40):  # in the last of which no voxel is new
+        instances = [0, 1, 2, 3 + frame]
         said = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
         points = 12
         cluster = rng.integers(0, 4, points).astype(np.int32)
@@ -399,6 +407,14 @@ def _updated(max_blocks: int) -> Evidence:
         for name in SLOTS:
             np.testing.assert_array_equal(getattr(evidence, name)[voxel], getattr(own, name)[0], err_msg=name)
     assert rows.evicted == evicted
+    for kept, dropped in ((41, 42), *((2, k) for k in range(3, 42)), (1, 2)):
+        rows.merge_instances(kept, dropped)
+        for own in by_voxel.values():
+            _merge_voxel(own.instance_ids[0], own.instance_value[0], kept, dropped, int(Combine.SUM))
+    for (block, n), own in by_voxel.items():
+        voxel = evidence.labeled[rows.voxels.grid.label_row[block], n]
+        np.testing.assert_array_equal(evidence.instance_ids[voxel], own.instance_ids[0])
+        np.testing.assert_array_equal(evidence.instance_value[voxel], own.instance_value[0])
     return evidence
 
 
