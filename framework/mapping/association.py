@@ -113,7 +113,8 @@ def look_up_instances(
 def _find_seen(instance_ids, seen):
     """Marks in seen (ids + 1,) the instances that occur in instance_ids (h, w)."""
     for instance in instance_ids.flat:
-        seen[np.uint32(instance)] = True
+        if instance > 0:
+            seen[instance] = True
 
 
 @device
@@ -151,7 +152,7 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
     """
     is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
     _find_seen(instance_ids, is_seen)
-    seen = np.flatnonzero(is_seen[1:]) + 1
+    seen = np.flatnonzero(is_seen)
     column = np.full(len(is_seen), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
     column[seen] = np.arange(len(seen), dtype=np.int32)
     by_chunk = np.zeros((CHUNKS, points.cluster_count + 1, len(seen) + 1), np.int32)

@@ -36,7 +36,7 @@ from numba import njit, prange
 from framework.data import Bool, Float32, Float64, Int32, UInt8
 from framework.errors import DataError
 from framework.mapping.bit_slices import ONE, lowest_bit
-from framework.mapping.integration import SeenBlocks
+from framework.mapping.integration import GROUP, SeenBlocks
 from framework.mapping.pages import PagesAhead
 from framework.mapping.prefetching import prefetch_line, prefetch_row
 from framework.mapping.slot_vectors import (
@@ -54,7 +54,6 @@ Integers = npt.NDArray[Any]  # of int16, int32 or int64
 
 INSTANCE_SLOTS = 4  # instances that a voxel can tell apart in compact storage
 RESERVED = 128  # voxels with slots for each block of the budget: most have fewer, and slots for more are made
-GROUP = 16  # blocks that one thread updates in a row
 BITS = 64  # of a word that tells which instances a row may know: instance k is bit k % BITS
 ANY_INSTANCE = np.uint64(2**BITS - 1)
 MOST_UNITS = 30_000  # of class evidence in compact storage; where more speaks for a class, all lose what is too much
@@ -400,7 +399,7 @@ def _update(grid, seen, evidence, measurement, of_pixel, named, known, new, evic
             given_away = without_slots = count = np.int32(0)
             more = np.uint64(0)
             for i in range(first, last):
-                number = of_pixel[np.uint32(seen.near_pixel[i])]
+                number = of_pixel[seen.near_pixel[i]]
                 voxel = evidence.labeled[row, seen.near_voxel[i]] if row >= 0 else np.int32(-1)
                 if voxel >= 0:
                     _ask_for_slots(evidence, voxel)
@@ -417,12 +416,12 @@ def _update(grid, seen, evidence, measurement, of_pixel, named, known, new, evic
 
 
 @njit(cache=True, nogil=True)
-def _number_new(blocks, new, label_row, row_count, voxel_count, rows, first_new):
+def _number_new(blocks, new, row_of, row_count, voxel_count, rows, first_new):
     """Fills rows (A,) with the row of each block, a new one where it has new (A,) voxels and none, and first_new (A,)
     with the number of the first of these; returns how many rows and voxels there are then.
     """
     for a in range(blocks.shape[0]):
-        rows[a], first_new[a] = label_row[blocks[a]], voxel_count
+        rows[a], first_new[a] = row_of[blocks[a]], voxel_count
         if new[a] > 0 and rows[a] < 0:
             rows[a] = row_count
             row_count += 1

@@ -43,7 +43,7 @@ from framework.mapping.voxel_grid import (
 )
 
 LAYER_VOXELS = BLOCK_SIDE**2
-GROUP = 16  # blocks whose near voxels are listed one behind the other, by one thread
+GROUP = 16  # blocks that one thread does in a row, and whose near voxels are listed one behind the other
 FAR = 1e9  # m
 LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
 GOLDEN = 0.6180339887498949  # rounding offsets frac(k * GOLDEN) are spread evenly, so rounded averages have no bias

@@ -142,9 +142,11 @@ class LabeledVoxels:
         small = 2 * overlaps.visible <= overlaps.sizes[:, None]
         other = matches.instance_ids[:, None] != overlaps.instance_ids
         under = covered & small & other
-        for m in np.flatnonzero(under.any(axis=0)):  # few, as a rule
-            record = table.records[int(overlaps.instance_ids[m])]
-            if self.confirmation.is_met(record):
-                agreement = class_agreement(clusters.class_probabilities, table.class_probabilities(record)[None])
-                lying[:, record.id] = under[:, m] & (agreement[:, 0] < OTHER_CLASS)
+        if not under.any():  # as a rule
+            return lying
+        records = [table.records[int(k)] for k in overlaps.instance_ids]
+        counts = np.array([self.confirmation.is_met(record) for record in records])
+        known = np.stack([table.class_probabilities(record) for record in records])
+        other_class = class_agreement(clusters.class_probabilities, known) < OTHER_CLASS
+        lying[:, overlaps.instance_ids] = counts & other_class & under
         return lying

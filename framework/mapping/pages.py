@@ -27,13 +27,13 @@ PAGE = 2**21  # bytes, of a huge page
 SMALL = PAGE // 2  # bytes: what has no more in use, as the many maps of single objects, is given no page ahead
 POPULATE_WRITE = 23  # of madvise(2), Linux 5.14 and later: gives pages as if they were written, and writes nothing
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-MOST_KEPT = 2**28  # bytes that are free and stay
+MOST_KEPT = 2**28  # bytes at the end of a heap that are free and stay
 MOST_SHARED = 2**25  # bytes of an array that is made of what was freed, and not of new pages; glibc takes no more
 
 
 @cache
 def keep_freed_memory() -> None:
-    """Has the process keep what it frees, up to MOST_KEPT bytes, where glibc is its C library.
+    """Has the process keep what it frees, about MOST_KEPT bytes, where glibc is its C library.
 
     Who has set that by the environment is left alone.
     """

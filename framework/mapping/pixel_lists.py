@@ -25,7 +25,7 @@ class PixelLists(NamedTuple):
     of_pixel: Int32  # (H, W) the number of each pixel's list; list 0 is empty
     pixels: Int32  # (L,) how many pixels have each list
     first: Int32  # (L + 1,)
-    cluster: Int32  # (first[L],) in the order of the points; of a list that no pixel has, nothing
+    cluster: Int32  # (first[L],) in the order of the points
     cluster_count: int  # N
 
 
@@ -95,6 +95,8 @@ def _write_lists(head, rest, first, cluster):
 
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
     """The clusters over each pixel of the (height, width) image, by the points that were seen there.
+
+    Lists that no pixel has are empty.
 
     Raises DataError when a pixel lies outside the image.
     """

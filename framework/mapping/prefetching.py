@@ -18,7 +18,7 @@ _READ, _KEEP, _DATA = 0, 2, 1  # llvm.prefetch: for reading; into the second lev
 
 @intrinsic
 def prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
-    """Has the cache line loaded that is `offset` bytes after the beginning of a C-contiguous array."""
+    """Has the cache line loaded that is `offset` bytes after the first element of an array."""
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         byte, int32 = ir.IntType(8), ir.IntType(32)

@@ -1,8 +1,8 @@
 """What is done to all class slots of a voxel at once.
 
 The sixteen of compact storage are one vector. LLVM unrolls so short a loop before it could make vectors of it, so the
-vectors are written out, in LLVM's own terms, which are the same for any processor. Exact storage has other types and
-more slots, and is done by loops, which say the same.
+vectors are written out, in LLVM's own terms, which are the same for any little-endian processor. Exact storage has
+other types and more slots, and is done by loops, which say the same.
 """
 
 from __future__ import annotations
@@ -101,12 +101,12 @@ class _Slots:
     def load(self, address: Any) -> Any:
         number = address.type.pointee
         loaded = self.builder.load(self.builder.bitcast(address, _vector(number).as_pointer()))
-        loaded.align = number.width // 8
+        loaded.align = 1
         return loaded
 
     def store(self, vector: Any, address: Any) -> None:
         stored = self.builder.store(vector, self.builder.bitcast(address, vector.type.as_pointer()))
-        stored.align = vector.type.element.width // 8
+        stored.align = 1
 
     def look_up(self, table: Any, places: Any) -> Any:
         """The numbers at the bytes `places` of a table."""
@@ -186,7 +186,9 @@ def _least_likely_of_vector(_context: Any, units: Any) -> Any:
 
 
 def _are_compact(*arrays: Any) -> bool:
-    """Whether class ids, units and what is said have the types of compact storage."""
+    """Whether class ids, units and what is said have the types of compact storage, which has CLASS_SLOTS of a voxel,
+    one behind the other.
+    """
     return all(
         array.dtype == kind for array, kind in zip(arrays, (types.uint8, types.int16, types.int32), strict=False)
     )

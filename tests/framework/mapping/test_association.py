@@ -99,8 +99,17 @@ def test_every_second_pixel_stands_for_four() -> None:
     one = np.ones((1, 1), np.float32)
     clusters = PointClusters(np.zeros((n, 3), np.float32), pixels, np.zeros(n, np.int32), one, one[0], ("object",))
     all_pixels, sampled = overlaps_of(clusters, seen), overlaps_of(clusters, seen[::2, ::2].copy(), 2)
+    kept = (pixels < 7).all(axis=1)
+    smaller = replace(
+        clusters,
+        points_world=clusters.points_world[kept],
+        pixels=pixels[kept],
+        cluster=clusters.cluster[kept],
+    )
+    odd = count_overlaps(list_points_by_pixel(smaller, (7, 7)), seen[:7:2, :7:2].copy(), 2)  # the same samples
     for name in ("instance_ids", "visible", "sizes", "votes"):
         assert getattr(sampled, name).tolist() == getattr(all_pixels, name).tolist(), name
+        assert getattr(odd, name).tolist() == getattr(sampled, name).tolist(), name
 
 
 def test_the_best_overlap_goes_first_and_each_instance_goes_once() -> None:

@@ -122,4 +122,4 @@ def test_what_a_frame_needs_comes_without_new_pages(way: str, said: dict[str, st
     answer = subprocess.run(
         [sys.executable, "-c", FAULTS, way], env={**environment, **said}, check=True, capture_output=True, text=True
     )
-    assert (int(answer.stdout) < 100) == (way == "kept" and not said)
+    assert (int(answer.stdout) < 60) == (way == "kept" and not said)
