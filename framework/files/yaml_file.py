@@ -16,6 +16,7 @@ from framework.files.whole_files import read_text
 
 LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, that of a sweep 20
 DEEPEST = 50  # mappings and lists in each other
+TOO_DEEP = f"its mappings and lists are more than {DEEPEST} deep"
 MOST_VALUES = 200_000  # keys and values, those that aliases repeat counted as often as they stand for
 
 _EventLoader = getattr(
@@ -40,12 +41,22 @@ def yaml_faults(path: Path) -> Iterator[None]:
         raise DataError(f"{path} cannot be read: {in_one_line(error)}") from error
 
 
+def _events(where: object, text: str) -> Iterator[Any]:
+    """Raises DataError at the library's own bound, which from PyYAML 6.0.4 on comes before it tells of any level."""
+    try:
+        yield from yaml.parse(text, _EventLoader)
+    except yaml.YAMLError as error:
+        if "maximum nesting depth" in str(error):
+            raise DataError(f"{where}: {TOO_DEEP}") from error
+        raise
+
+
 def check_yaml(where: object, text: str) -> None:
     """Raises DataError for YAML that is too deep or stands for too much, and YAMLError for what is none."""
     counts = [0]  # of the values in each of the mappings and lists that are open, outermost first
     open_anchors: list[Hashable] = []
     anchors: dict[Hashable, int] = {}
-    for event in yaml.parse(text, _EventLoader):
+    for event in _events(where, text):
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in anchors:
                 raise DataError(f"{where}: *{event.anchor} stands for nothing, or for what it is in")
@@ -61,6 +72,6 @@ def check_yaml(where: object, text: str) -> None:
             counts[-1] += count
             anchors[open_anchors.pop()] = count
         if len(counts) > DEEPEST:
-            raise DataError(f"{where}: its mappings and lists are more than {DEEPEST} deep")
+            raise DataError(f"{where}: {TOO_DEEP}")
         if counts[-1] > MOST_VALUES:
             raise DataError(f"{where}: it stands for more than {MOST_VALUES} keys and values")
