@@ -1,4 +1,4 @@
-"""Who gets how many cores: the thread that reads and detects ahead, and the one that maps what was detected.
+"""Who gets how many cores: the threads that read and detect ahead, and the one that maps what was detected.
 
 A parallel loop waits for its slowest thread, and a thread whose core is taken is late by milliseconds. So loops of two
 threads that share all cores wait for each other: on two cores, beside a network that takes one, tracking and fusion
@@ -38,14 +38,14 @@ class CoreSharing:
     def __init__(self, with_a_thread_ahead: bool = True) -> None:
         self.cores = int(numba.get_num_threads())
         self._alone = not with_a_thread_ahead
-        self._ahead: deque[float] = deque(maxlen=RECENT)  # s of CPU time a frame, of the thread itself
+        self._ahead: deque[float] = deque(maxlen=RECENT)  # s of CPU time a frame, of its thread itself
         self._mapping: deque[float] = deque(maxlen=RECENT)  # likewise, times its threads: it is one loop after another
         self._lock = threading.Lock()
 
     @contextmanager
-    def ahead(self) -> Iterator[None]:
-        """Around what is done ahead with one frame."""
-        with self._with_threads(self.cores if self._alone else max(self.cores_ahead(), 1)):
+    def ahead(self, workers: int = 1) -> Iterator[None]:
+        """Around what one of so many workers does ahead with one frame."""
+        with self._with_threads(self.cores if self._alone else max(self.cores_ahead() // workers, 1)):
             began = time.thread_time()
             yield
             self._note(self._ahead, time.thread_time() - began)
@@ -60,7 +60,7 @@ class CoreSharing:
             self._note(self._mapping, threads * (time.thread_time() - began))
 
     def cores_ahead(self) -> int:
-        """The share of the thread ahead, rounded.
+        """The share of what is done ahead, rounded.
 
         0: its work is so little that the mapping has all cores, and is disturbed. All of them: the other way round.
         """

@@ -96,6 +96,9 @@ class Detector(ABC):
     """Finds object instances in one image."""
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; known once the detector is built
+    concurrent: bool = (
+        False  # whether several threads may call `detect` at once, each of which it keeps about a core busy
+    )
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import gc
 import signal
 import time
-from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from collections.abc import Generator, Iterator, Mapping
+from contextlib import AbstractContextManager, closing, contextmanager
 from dataclasses import dataclass, field, replace
-from itertools import repeat
+from itertools import count
 from pathlib import Path
-from typing import TypeVar, cast
-
-import numba
+from typing import cast
 
 from framework.core_sharing import CoreSharing
 from framework.data import Array, Detections, Frame, Pose
@@ -37,11 +33,9 @@ from framework.interruption import Interruption, signals_deferred
 from framework.journal import Journal, RunResult, StageTime
 from framework.refinement.refine import refine
 from framework.viewing.guarded_viewer import GuardedViewer
+from framework.working_ahead import Turns, map_ahead
 
 WITHOUT_POSES = "add the sequence's poses, or choose a tracker that needs none, tracker=voxel_hashing_icp"
-
-Item = TypeVar("Item")
-Outcome = TypeVar("Outcome")
 
 
 @dataclass
@@ -52,9 +46,7 @@ class Pipeline:
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    ahead: int = (
-        2  # frames that a worker thread reads and detects in front of the mapping, 1 of a live video; 0 = no thread
-    )
+    ahead: int = 2  # frames that other threads read and detect in front of the mapping, 1 of a live video; 0 = none
     viewer: Viewer = field(default_factory=Viewer)
 
     def __post_init__(self) -> None:
@@ -169,18 +161,21 @@ class Pipeline:
     ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
-        Frame k + 1 is read and detected while frame k is tracked and fused; the results of a recording do not depend on
-        it. What comes of a live video meanwhile is dropped, but for the newest frame.
+        Frame k + 1 is read and detected while frame k is tracked and fused, and frame k + 2, too, by a detector that
+        takes several frames at once; the results of a recording do not depend on it. What comes of a live video
+        meanwhile is dropped, but for the newest frame.
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
         ahead = self.ahead if stream.most_ahead is None else min(self.ahead, stream.most_ahead)
+        workers = max(1, min(ahead, sharing.cores)) if self.detector.concurrent else 1
+        turns = Turns()
 
-        def work(stream: FrameStream) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-            with sharing.ahead():
-                return self.read_and_detect(stream)
+        def work(number: int) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
+            with sharing.ahead(workers):
+                return self.read_and_detect(stream, turns.turn(number))
 
-        # the stream ends first: the worker may be waiting for its next frame
-        with closing(map_ahead(work, repeat(stream), ahead)) as outcomes, stream:
+        # the stream ends first: a worker may be waiting for its next frame
+        with closing(map_ahead(work, count(), ahead, workers)) as outcomes, stream:
             for outcome in outcomes:
                 interruption.check()  # waiting for a frame may have taken long
                 journal.frames_dropped = stream.dropped
@@ -194,26 +189,30 @@ class Pipeline:
                 journal.timings += timings
                 yield frame, detections
 
-    def read_and_detect(self, stream: FrameStream) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
-        """The next frame, its detections and what they took; or why it cannot be used. None at the end."""
-        read_frame = stream.take()
-        if read_frame is None:
-            return None
+    def read_and_detect(
+        self, stream: FrameStream, turn: AbstractContextManager[None]
+    ) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
+        """The next frame, read when it is its `turn`, its detections and what they took; or why it cannot be used.
+
+        None at the end.
+        """
         try:
-            started = time.perf_counter()
-            frame = read_frame()
-            read = time.perf_counter()
+            with turn:
+                read_frame = stream.take()
+                if read_frame is None:
+                    return None
+                began = time.perf_counter()
+                frame = read_frame()
+                read_ms = 1e3 * (time.perf_counter() - began)
+            began = time.perf_counter()
             detections = self.detector.detect(frame)
-            detected = time.perf_counter()
+            detect_ms = 1e3 * (time.perf_counter() - began)
         except FrameError as error:
             return error
         return (
             frame,
             detections,
-            [
-                StageTime(frame.index, "read", 1e3 * (read - started)),
-                StageTime(frame.index, "detect", 1e3 * (detected - read)),
-            ],
+            [StageTime(frame.index, "read", read_ms), StageTime(frame.index, "detect", detect_ms)],
         )
 
     def map_frame(self, frame: Frame, detections: Detections, journal: Journal) -> Pose:
@@ -260,25 +259,3 @@ def sparing_what_is_there() -> Iterator[None]:
         yield
     finally:
         gc.unfreeze()
-
-
-def map_ahead(function: Callable[[Item], Outcome], items: Iterable[Item], ahead: int) -> Generator[Outcome]:
-    """`map(function, items)` by a worker thread that stays at most `ahead` outcomes in front of the consumer.
-
-    What the worker raises is raised here, in its place. Closing the generator ends the worker after the item in work.
-    """
-    if ahead == 0:
-        yield from map(function, items)
-        return
-    # numba keeps its number of threads by thread: the worker gets the consumer's
-    worker = ThreadPoolExecutor(1, "detect-ahead", numba.set_num_threads, (numba.get_num_threads(),))
-    pending: deque[Future[Outcome]] = deque()
-    try:
-        for item in items:
-            pending.append(worker.submit(function, item))
-            if len(pending) > ahead:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        worker.shutdown(cancel_futures=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 
 from framework.contracts.comparison import same
@@ -30,6 +32,16 @@ class DetectorContract:
         backwards = [detector.detect(frame_at(k)) for k in (1, 0)]
         assert same(forwards[0], backwards[1])
         assert same(forwards[1], backwards[0])
+
+    def test_detector_that_says_so_takes_several_frames_at_once(self) -> None:
+        detector = self.plugin()
+        if not detector.concurrent:
+            return
+        frames = [frame_at(k % 2) for k in range(8)]
+        with ThreadPoolExecutor(3) as threads:
+            at_once = list(threads.map(detector.detect, frames))
+        for frame, found in zip(frames, at_once, strict=True):
+            assert same(found, detector.detect(frame))
 
     def test_detector_takes_a_blank_image(self) -> None:
         detector = self.plugin()

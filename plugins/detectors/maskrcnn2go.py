@@ -94,7 +94,7 @@ class MaskRCNN2Go(Detector):
         self._anchors: Float32 = tensors.pop("anchor").cpu().numpy()
         first = next(operator for operator in graph if operator["type"] == "Int8ConvRelu")["inputs"][1]
         tensors[first] = tensors[first].flip(1)  # trained on BGR; frames are RGB
-        self._integers = self._computes_in_integers()
+        self._integers = self.concurrent = self._computes_in_integers()
         network = partial(int8_network, spacings=spacings) if self._integers else float_network
         outputs = ("xif3_6_int8", "rpn_cls_logits_int8", "rpn_bbox_pred_int8")
         boxes = ("cls_score_int8", "bbox_pred_int8")

@@ -64,6 +64,12 @@ def test_a_side_with_little_to_do_leaves_all_cores_to_the_other(
         assert numba.get_num_threads() == 1
 
 
+def test_workers_ahead_divide_their_share(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+    pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
+    with sharing.ahead(workers=2):
+        assert numba.get_num_threads() == max(sharing.cores // 2, 1)
+
+
 def test_a_slow_frame_changes_nothing(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
     pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
     with sharing.mapping():

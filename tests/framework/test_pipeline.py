@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 from tqdm import TMonitor
@@ -20,7 +21,7 @@ from framework.data import Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import SceneMap, Viewer
 from framework.journal import RunResult
-from framework.pipeline import Pipeline, map_ahead
+from framework.pipeline import Pipeline
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.scenes.corner_room import (
@@ -34,6 +35,7 @@ from tests.scenes.corner_room import (
     pose_at,
 )
 
+PATIENCE_S = 10.0
 AHEAD = pytest.mark.parametrize("ahead", [0, 1, 3])
 
 
@@ -334,34 +336,70 @@ def test_garbage_is_collected_among_what_a_run_makes(room: CornerRoom) -> None:
         gc.unfreeze()
 
 
-def test_map_ahead_is_bounded_and_ordered() -> None:
-    begun: list[int] = []
+@dataclass
+class _InPairs(SphereDetector):
+    """Each detection waits until another one is in work: there must be an even number of them."""
 
-    def square(k: int) -> int:
-        begun.append(k)
-        return k * k
+    concurrent = True
 
-    outcomes = map_ahead(square, range(10), ahead=2)
-    assert next(outcomes) == 0
-    assert max(begun, default=0) <= 2
-    assert list(outcomes) == [k * k for k in range(1, 10)]
-    assert begun == list(range(10))
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._pair = threading.Barrier(2)
+
+    def detect(self, frame: Frame) -> Detections:
+        self._pair.wait(PATIENCE_S)
+        return super().detect(frame)
 
 
-def test_detection_of_the_next_frame_overlaps_with_this_one() -> None:
-    """Each side waits for the other: without a worker thread this would never end."""
-    fusing, detected = threading.Event(), threading.Event()
+@dataclass
+class _OneReader(CornerRoom):
+    """Can only be read in order, one frame after the other, as a film can."""
 
-    def detect(k: int) -> int:
-        if k == 1:
-            assert fusing.wait(10)
-            detected.set()
-        return k
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.slow_s, self._next, self._reading = 0.005, 0, threading.Lock()
 
-    for k in map_ahead(detect, range(2), ahead=1):
-        if k == 0:
-            fusing.set()
-            assert detected.wait(10)
+    def __getitem__(self, k: int) -> Frame:
+        assert self._reading.acquire(blocking=False), "two at once"
+        assert k == self._next, "not in order"
+        self._next += 1
+        try:
+            return super().__getitem__(k)
+        finally:
+            self._reading.release()
+
+
+@pytest.mark.parametrize("ahead", [2, 3])
+def test_a_detector_that_can_is_given_two_frames_at_once_and_they_are_read_and_mapped_in_order(
+    ahead: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(numba, "get_num_threads", lambda: 2)
+    threads = working_threads()
+    result = pipeline(ahead, detector=_InPairs()).run(_OneReader())
+    assert [frame.index for frame in result.tracked] == list(range(6))
+    np.testing.assert_array_equal(mapped(result).mesh().vertices, mapped(pipeline().run(CornerRoom())).mesh().vertices)
+    result = pipeline(ahead, detector=_InPairs()).run(_OneReader(frames=7, unreadable=3))
+    assert [frame.index for frame in result.tracked] == [0, 1, 2, 4, 5, 6]
+    assert working_threads() == threads
+
+
+def test_a_detector_that_can_is_given_one_frame_at_a_time_where_there_are_no_cores_or_threads_for_more(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    @dataclass
+    class Alone(SphereDetector):
+        concurrent = True
+
+        def detect(self, frame: Frame) -> Detections:
+            found.append([thread.name for thread in threading.enumerate() if thread.name.startswith("detect-ahead")])
+            return super().detect(frame)
+
+    found: list[list[str]] = []
+    for cores, ahead in ((1, 2), (2, 1), (2, 0)):
+        monkeypatch.setattr(numba, "get_num_threads", lambda cores=cores: cores)
+        pipeline(ahead, detector=Alone()).run(CornerRoom())
+        assert max(map(len, found)) == min(ahead, 1)
+        found.clear()
 
 
 def test_ahead_is_checked() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import FrozenInstanceError, dataclass, replace
 from pathlib import Path
@@ -38,6 +39,17 @@ class Forgetful(SphereDetector):
         kept = slice(max(self.left, 0))
         parts = {name: getattr(found, name)[kept] for name in ("masks", "boxes", "scores", "class_probabilities")}
         return replace(found, **parts)
+
+
+class Sharing(SphereDetector):
+    """Says that it takes several frames at once, and keeps the frame in work for all of them."""
+
+    concurrent = True
+
+    def detect(self, frame: Frame) -> Detections:
+        self.frame = frame
+        time.sleep(0.01)
+        return super().detect(self.frame)
 
 
 @dataclass
@@ -83,6 +95,7 @@ class Backwards(CornerRoom):
     ("contract", "plugin", "test"),
     [
         (DetectorContract, Forgetful(), "test_detector_gives_the_same_for_the_same_frame_in_any_order"),
+        (DetectorContract, Sharing(), "test_detector_that_says_so_takes_several_frames_at_once"),
         (RefinerContract, Shifting(), "test_refiner_invents_no_points"),
         (RefinerContract, Dropping(), "test_refiner_invents_no_points"),
         (TrackerContract, Writing(writes=True), "test_tracker_returns_a_pose_and_leaves_the_map_alone"),
