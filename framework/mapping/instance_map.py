@@ -12,7 +12,8 @@ from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMe
 from framework.errors import DataError
 from framework.interfaces import SceneMap
 from framework.mapping.association import agreed_classes, look_up_instances
-from framework.mapping.evidence import Combine, Evidence, EvidenceRows, Storage
+from framework.mapping.evidence import Combine, Evidence
+from framework.mapping.evidence_rows import EvidenceRows, Storage
 from framework.mapping.instance_list import Confirmation, list_instances
 from framework.mapping.instance_table import InstanceTable
 from framework.mapping.map_file import (

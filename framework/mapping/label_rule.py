@@ -11,7 +11,8 @@ from framework.data import Bool, Float32, Float64, PointClusters
 from framework.errors import ConfigError
 from framework.interfaces import SceneMap
 from framework.mapping.association import Matches, class_agreement
-from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, Storage, class_said, named_classes
+from framework.mapping.evidence import MOST_GAIN, MOST_UNITS, Combine, Measurement, class_said, named_classes
+from framework.mapping.evidence_rows import Storage
 from framework.mapping.instance_list import Confirmation
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instance_table import InstanceTable

@@ -12,7 +12,7 @@ import pytest
 CHECKOUT = Path(__file__).resolve().parents[2]
 LAYERS = [
     ["errors"],
-    ["core_sharing", "data", "interruption", "parameters", "progress", "settings"],
+    ["core_sharing", "data", "interruption", "parameters", "progress", "settings", "working_ahead"],
     ["geometry", "kernels", "sensor_noise"],
     ["kernel_worker"],
     ["interfaces"],

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame
-from framework.mapping.evidence import EvidenceRows
+from framework.mapping.evidence_rows import EvidenceRows
 from framework.mapping.integration import Integrator
 from framework.mapping.raycasting import TILE, cast_coarse, cast_view, render, render_near, tile_bounds
 from framework.mapping.sensor import Sensor, pinhole
