@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import njit
 from torch import Tensor
 from torch.nn import functional
 
@@ -59,11 +60,23 @@ class Quantisation(NamedTuple):
     zero_point: int
 
     def quantised(self, x: Tensor) -> Tensor:
-        """uint8, rounded to the nearest."""
-        return (x * (1 / self.scale)).add_(self.zero_point).round_().clamp_(0, MOST).to(torch.uint8)
+        """uint8, rounded to the nearest, of x (N, C, H, W) on the CPU."""
+        channels_last = x.permute(0, 2, 3, 1).contiguous()
+        rounded = torch.empty_like(channels_last, dtype=torch.uint8)
+        flat = channels_last.numpy().reshape(-1), rounded.numpy().reshape(-1)
+        _round(*flat, np.float32(1 / self.scale), np.float32(self.zero_point))
+        return rounded.permute(0, 3, 1, 2)
 
     def real(self, q: Tensor) -> Tensor:
         return (q.float() - self.zero_point) * self.scale
+
+
+@njit(cache=True, nogil=True)
+def _round(values, rounded, steps, zero_point):
+    """Fills rounded (N,) uint8 with values (N,) * steps + zero_point: in one pass, where torch makes five."""
+    for i in range(values.shape[0]):
+        nearest = np.rint(values[i] * steps + zero_point)
+        rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MOST))))
 
 
 def dequantised(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:

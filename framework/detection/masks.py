@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from numba import njit
 
@@ -28,20 +26,17 @@ def tight_boxes(masks: Bool) -> Float32:
     return np.asarray(_bounds(masks.view(np.uint8)), np.float32)
 
 
-def mask_overlaps(masks: Bool) -> Float64:
-    """The (N, N) numbers of pixels that masks (N, H, W) share; on the diagonal their areas."""
-    n = len(masks)
-    bits = np.packbits(masks.reshape(n, math.prod(masks.shape[1:])), axis=1)
-    words = np.pad(bits, ((0, 0), (0, -bits.shape[1] % 8))).view(np.uint64)
-    shared = np.zeros((n, n))
-    for i in range(n):
-        shared[i, i:] = np.bitwise_count(words[i] & words[i:]).sum(axis=1, dtype=np.int64)
-    return np.maximum(shared, shared.T)
+def mask_overlaps(masks: Bool, boxes: Float32) -> Float64:
+    """The (N, N) numbers of pixels that masks (N, H, W) in tight boxes (N, 4) share; on the diagonal their areas."""
+    return np.asarray(_shared(masks.view(np.uint8), boxes.astype(np.int64)), np.float64)
 
 
-def suppress_duplicates(masks: Bool, iou: float) -> Int32:
-    """The indices of the masks (N, H, W), best first, that are not empty and overlap no better survivor by `iou`."""
-    overlaps = mask_overlaps(masks)
+def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
+    """The indices of the masks (N, H, W), best first, that are not empty and overlap no better survivor by `iou`.
+
+    boxes (N, 4) are the masks' tight ones.
+    """
+    overlaps = mask_overlaps(masks, boxes)
     areas = overlaps.diagonal()
     covered = overlaps > iou * (areas[:, None] + areas - overlaps)
     survives = areas > 0
@@ -54,9 +49,9 @@ def without_duplicates(
     masks: Bool, scores: Float32, class_probabilities: Float32, classes: tuple[str, ...], iou: float
 ) -> Detections:
     """The detections, best first, whose masks (N, H, W) `suppress_duplicates` leaves, in tight boxes."""
-    kept = suppress_duplicates(masks, iou)
-    masks = masks[kept]
-    return Detections(masks, tight_boxes(masks), scores[kept], class_probabilities[kept], classes)
+    boxes = tight_boxes(masks)
+    kept = suppress_duplicates(masks, boxes, iou)
+    return Detections(masks[kept], boxes[kept], scores[kept], class_probabilities[kept], classes)
 
 
 @njit(cache=True, nogil=True)
@@ -83,6 +78,24 @@ def _bounds(masks):
         if x2 >= 0:
             bounds[i, 0], bounds[i, 1], bounds[i, 2], bounds[i, 3] = x1, y1, x2, y2
     return bounds
+
+
+@njit(cache=True, nogil=True)
+def _shared(masks, bounds):
+    """Counts the pixels of two masks where their bounds (N, 4) meet: most masks are small, and few meet."""
+    n = len(masks)
+    shared = np.zeros((n, n), np.int64)
+    for i in range(n):
+        for j in range(i, n):
+            x1, y1 = max(bounds[i, 0], bounds[j, 0]), max(bounds[i, 1], bounds[j, 1])
+            x2, y2 = min(bounds[i, 2], bounds[j, 2]), min(bounds[i, 3], bounds[j, 3])
+            for v in range(y1, y2 + 1):
+                count = np.int32(0)
+                for u in range(np.uint64(x1), np.uint64(max(x2 + 1, x1))):
+                    count += np.int32(masks[i, v, u] & masks[j, v, u])
+                shared[i, j] += count
+            shared[j, i] = shared[i, j]
+    return shared
 
 
 @njit(cache=True, nogil=True)

@@ -102,11 +102,13 @@ def _products(cells: Tensor, x: Samples, y: Samples) -> Tensor:
 
 def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
     """The same as sums over windows; boxes of like windows go together, for a chunk's widest one sets its cost."""
-    pooled = cells.new_empty((len(x.start), y.bins, x.bins, cells.shape[1]))
     sizes = x.windows * y.windows
-    order = sizes.argsort()
     largest = int(sizes.max()) if len(sizes) else 1
-    for chosen in order.split(max(1, CHUNK // (x.bins * y.bins * largest))):
+    at_once = max(1, CHUNK // (x.bins * y.bins * largest))
+    if len(sizes) <= at_once:
+        return _sum_chunk(cells, x, y).permute(0, 3, 1, 2)
+    pooled = cells.new_empty((len(sizes), y.bins, x.bins, cells.shape[1]))
+    for chosen in sizes.argsort().split(at_once):
         pooled[chosen] = _sum_chunk(cells, x.of(chosen), y.of(chosen))
     return pooled.permute(0, 3, 1, 2)
 

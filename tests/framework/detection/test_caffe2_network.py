@@ -117,6 +117,19 @@ def integer_network(kind, args, weight, weight_scale, bias):
     return network, result
 
 
+@pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
+def test_numbers_are_rounded_to_the_nearest_and_halves_to_even_ones(memory_format):
+    quantisation = Quantisation(0.25, 100)
+    steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # halves of steps, beyond both ends
+    found = quantisation.quantised((steps * 0.25).contiguous(memory_format=memory_format))
+    assert found.dtype == torch.uint8
+    np.testing.assert_array_equal(found, np.clip(np.rint(steps.numpy() + 100), 0, 255))
+    uneven = torch.randn(3, 7, 5, 4) * 20
+    found = Quantisation(0.0312, 7).quantised(uneven)
+    np.testing.assert_array_equal(found, (uneven * (1 / 0.0312)).add(7).round().clamp(0, 255).to(torch.uint8))
+    assert quantisation.quantised(uneven[:0]).shape == (0, 7, 5, 4)
+
+
 @in_integers
 @pytest.mark.parametrize(("stride", "pad", "group"), [(1, 1, 1), (2, 1, 1), (1, 1, 6), (2, 0, 3)])
 @pytest.mark.parametrize("kind", ["Int8Conv", "Int8ConvRelu"])

@@ -61,10 +61,18 @@ def test_tight_boxes_are_the_first_and_last_pixels():
 
 
 def test_overlaps_count_shared_pixels():
-    masks = np.random.default_rng(6).random((7, 13, 17)) > 0.5  # 221 pixels: no multiple of 64
-    flat = masks.reshape(7, -1).astype(int)
-    np.testing.assert_array_equal(mask_overlaps(masks), flat @ flat.T)
-    assert mask_overlaps(masks[:0]).shape == (0, 0)
+    """Of masks that fill the image, lie in a corner of it, meet in a row or column, or are empty."""
+    rng = np.random.default_rng(6)
+    masks = rng.random((12, 40, 300)) > 0.5
+    for mask in masks[2:]:
+        (v1, v2), (u1, u2) = (np.sort(rng.integers(0, side + 1, 2)) for side in mask.shape)
+        mask[:v1], mask[v2:], mask[:, :u1], mask[:, u2:] = False, False, False, False
+    masks[2] = False
+    masks[3], masks[4] = False, False
+    masks[3, :21, :101], masks[4, 20:, 100:] = True, True
+    flat = masks.reshape(len(masks), -1).astype(int)
+    np.testing.assert_array_equal(mask_overlaps(masks, tight_boxes(masks)), flat @ flat.T)
+    assert mask_overlaps(masks[:0], tight_boxes(masks[:0])).shape == (0, 0)
 
 
 def test_duplicates_fall_to_the_first_survivor_and_empty_masks_go():
@@ -73,5 +81,6 @@ def test_duplicates_fall_to_the_first_survivor_and_empty_masks_go():
     masks[1, :, :7] = True  # IoU 6/7 with 0
     masks[2, :, 1:8] = True  # IoU 5/8 with 0 and 6/8 with 1, which is gone
     masks[4, 8:, 8:] = True
-    assert suppress_duplicates(masks, 0.7).tolist() == [0, 2, 4]
-    assert suppress_duplicates(masks, 1.0).tolist() == [0, 1, 2, 4]
+    boxes = tight_boxes(masks)
+    assert suppress_duplicates(masks, boxes, 0.7).tolist() == [0, 2, 4]
+    assert suppress_duplicates(masks, boxes, 1.0).tolist() == [0, 1, 2, 4]

@@ -63,7 +63,7 @@ def test_detections_keep_the_contract(detector):
     assert (np.diff(found.scores) <= 0).all()
     np.testing.assert_allclose(found.class_probabilities.sum(axis=1), 1, atol=1e-5)
     np.testing.assert_array_equal(found.boxes, tight_boxes(found.masks))
-    overlaps = mask_overlaps(found.masks)
+    overlaps = mask_overlaps(found.masks, found.boxes)
     areas = overlaps.diagonal()
     iou = overlaps / (areas[:, None] + areas - overlaps)
     np.fill_diagonal(iou, 0)

@@ -169,7 +169,8 @@ def test_same_input_same_output_and_the_input_stays_as_it_was(detector):
 
 def test_no_two_masks_of_one_object(detector):
     frame = shared_picture("redkitchen", 0)
-    overlaps = mask_overlaps(detector.detect(frame).masks)
+    found = detector.detect(frame)
+    overlaps = mask_overlaps(found.masks, found.boxes)
     areas = overlaps.diagonal()
     iou = overlaps / (areas[:, None] + areas - overlaps)
     np.fill_diagonal(iou, 0)
