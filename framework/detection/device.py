@@ -4,10 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from threading import Lock
 
 import torch
 
 from framework.parameters import require
+
+_changing = Lock()
+_before: list[int] = []  # torch's number of threads before, once for each thread that is within one_torch_thread()
 
 
 def torch_device(device: str, name: str = "detector.device") -> torch.device:
@@ -23,10 +27,16 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Has torch compute in the calling thread alone: what is short is done before others have woken up."""
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
+    """Has torch compute in the calling thread alone: what is short is done before others have woken up.
+
+    Several threads may be within at once. Torch keeps the number by thread, and threads that are new to it get the one
+    that was set last: so whoever leaves sets the one from before the first came.
+    """
+    with _changing:
+        _before.append(_before[0] if _before else torch.get_num_threads())
+        torch.set_num_threads(1)
     try:
         yield
     finally:
-        torch.set_num_threads(threads)
+        with _changing:
+            torch.set_num_threads(_before.pop())
