@@ -12,9 +12,9 @@ from pathlib import Path
 
 __version__ = "0.1.0"
 
-# The detector's thread and the mapping thread both launch parallel kernels. Of numba's threading layers only OpenMP and
+# The detector's threads and the mapping thread all launch parallel kernels. Of numba's threading layers only OpenMP and
 # TBB allow that; OpenMP comes with torch's requirements, TBB does not, and an old one on the system only gives a
-# warning. OpenMP's idle threads must sleep: by default they spin, and take the cores from the other thread. A few
+# warning. OpenMP's idle threads must sleep: by default they spin, and take the cores from the other threads. A few
 # microseconds of spinning are worth it, from one kernel of a stage to the next.
 os.environ.setdefault("NUMBA_THREADING_LAYER", "omp")
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")

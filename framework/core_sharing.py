@@ -5,8 +5,10 @@ threads that share all cores wait for each other: on two cores, beside a network
 have taken up to ten times as long with two threads as with one. Each gets cores of its own instead, in proportion to
 its work. No result depends on it, as no kernel's result depends on its number of threads.
 
-This is about numba's kernels. The threads of a network are its own: they are neither limited here nor counted. What no
-frame waits for stands back where cores are scarce.
+This is about numba's kernels. The threads of a network are its own: they are neither limited here nor counted. So
+detectors that take several frames at once may have more threads than their share has cores: on two cores, the second
+one uses what is left of the mapping's core while that waits for the first. What no frame waits for stands back where
+cores are scarce.
 """
 
 from __future__ import annotations

@@ -69,7 +69,10 @@ class RGBDSequence(RGBDVideo):
 
     @abstractmethod
     def __getitem__(self, k: int) -> Frame:
-        """Frame k of the chosen ones, 0 <= k < len. Raises FrameError when that frame cannot be read."""
+        """Frame k of the chosen ones, 0 <= k < len. Raises FrameError when that frame cannot be read.
+
+        A run asks for one after the other in their order, from whatever thread.
+        """
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
@@ -96,9 +99,7 @@ class Detector(ABC):
     """Finds object instances in one image."""
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; known once the detector is built
-    concurrent: bool = (
-        False  # whether several threads may call `detect` at once, each of which it keeps about a core busy
-    )
+    concurrent: bool = False  # whether several threads may call `detect` at once; each then keeps about a core busy
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:

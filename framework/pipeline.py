@@ -46,7 +46,7 @@ class Pipeline:
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    ahead: int = 2  # frames that other threads read and detect in front of the mapping, 1 of a live video; 0 = none
+    ahead: int = 2  # frames that other threads read and detect meanwhile, 1 of a live video; 0 = no such thread
     viewer: Viewer = field(default_factory=Viewer)
 
     def __post_init__(self) -> None:
@@ -161,9 +161,9 @@ class Pipeline:
     ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
-        Frame k + 1 is read and detected while frame k is tracked and fused, and frame k + 2, too, by a detector that
-        takes several frames at once; the results of a recording do not depend on it. What comes of a live video
-        meanwhile is dropped, but for the newest frame.
+        Frame k + 1 is read and detected while frame k is tracked and fused, and those after it, too, up to `ahead`
+        frames at once by a detector that can; the results of a recording do not depend on it. What comes of a live
+        video meanwhile is dropped, but for the newest frame.
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
         ahead = self.ahead if stream.most_ahead is None else min(self.ahead, stream.most_ahead)

@@ -18,7 +18,7 @@ Outcome = TypeVar("Outcome")
 def map_ahead(
     function: Callable[[Item], Outcome], items: Iterable[Item], ahead: int, workers: int = 1
 ) -> Generator[Outcome]:
-    """`map(function, items)` by threads of its own, which stay at most `ahead` outcomes in front of the consumer.
+    """`map(function, items)` by so many `workers`, threads that stay at most `ahead` outcomes in front of the consumer.
 
     What a worker raises is raised here, in its place. Closing the generator ends the workers after the items in work.
     """

@@ -66,6 +66,7 @@ class CachedDetector(Detector):
     another video hits.
     Several processes may share a folder: entries are written whole, and two that write one write the same. A damaged
     entry is named in the log and computed again. Entries are never removed here; whoever needs the disk may delete any.
+    It takes one frame at a time, whatever `detector` can: of equal frames at once, each would count as a miss.
     """
 
     detector: Detector

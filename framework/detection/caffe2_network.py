@@ -72,10 +72,10 @@ class Quantisation(NamedTuple):
 
 
 @njit(cache=True, nogil=True)
-def _round(values, rounded, steps, zero_point):
-    """Fills rounded (N,) uint8 with values (N,) * steps + zero_point: in one pass, where torch makes five."""
+def _round(values, rounded, per_unit, zero_point):
+    """Fills rounded (N,) uint8 with values (N,) * per_unit + zero_point: in one pass, where torch makes five."""
     for i in range(values.shape[0]):
-        nearest = np.rint(values[i] * steps + zero_point)
+        nearest = np.rint(values[i] * per_unit + zero_point)
         rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MOST))))
 
 

@@ -29,11 +29,12 @@ def torch_device(device: str, name: str = "detector.device") -> torch.device:
 def one_torch_thread() -> Iterator[None]:
     """Has torch compute in the calling thread alone: what is short is done before others have woken up.
 
-    Several threads may be within at once. Torch keeps the number by thread, and threads that are new to it get the one
-    that was set last: so whoever leaves sets the one from before the first came.
+    Several threads may be within at once. Torch keeps the number by thread, and a thread gets the one that was set last
+    by any when it first asks: so each asks before it sets its own, and whoever leaves sets the one from before.
     """
     with _changing:
-        _before.append(_before[0] if _before else torch.get_num_threads())
+        asked = torch.get_num_threads()
+        _before.append(_before[0] if _before else asked)
         torch.set_num_threads(1)
     try:
         yield

@@ -27,7 +27,10 @@ def tight_boxes(masks: Bool) -> Float32:
 
 
 def mask_overlaps(masks: Bool, boxes: Float32) -> Float64:
-    """The (N, N) numbers of pixels that masks (N, H, W) in tight boxes (N, 4) share; on the diagonal their areas."""
+    """The (N, N) numbers of pixels that masks (N, H, W) share; on the diagonal their areas.
+
+    boxes (N, 4) are `tight_boxes` of the masks, which is not checked.
+    """
     return np.asarray(_shared(masks.view(np.uint8), boxes.astype(np.int64)), np.float64)
 
 
@@ -82,7 +85,7 @@ def _bounds(masks):
 
 @njit(cache=True, nogil=True)
 def _shared(masks, bounds):
-    """Counts the pixels of two masks where their bounds (N, 4) meet: most masks are small, and few meet."""
+    """Counts the pixels of two masks where their bounds (N, 4) meet: quick where most masks are small, and few meet."""
     n = len(masks)
     shared = np.zeros((n, n), np.int64)
     for i in range(n):
@@ -91,8 +94,8 @@ def _shared(masks, bounds):
             x2, y2 = min(bounds[i, 2], bounds[j, 2]), min(bounds[i, 3], bounds[j, 3])
             for v in range(y1, y2 + 1):
                 count = np.int32(0)
-                for u in range(np.uint64(x1), np.uint64(max(x2 + 1, x1))):
-                    count += np.int32(masks[i, v, u] & masks[j, v, u])
+                for u in range(np.uint64(x1), np.uint64(max(x2 + 1, x1))):  # what may be negative is no vector's index
+                    count = np.int32(count + np.int32(masks[i, v, u] & masks[j, v, u]))  # numba would add in 64 bits
                 shared[i, j] += count
             shared[j, i] = shared[i, j]
     return shared

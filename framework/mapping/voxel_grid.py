@@ -11,7 +11,8 @@ voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
 Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block. Beside its voxels a block takes 49 (neighbors 32,
 coordinates 12, label row 4, solid 1), and its region 2 KiB of block numbers, 12 of coordinates and 24 to 48 of the hash
 table for up to 512 blocks: measured 117 blocks a region in a dense room and 73 in a real kitchen, so 18 and 29 a block.
-Together 8.15 bytes a voxel. Labels take 84 more in each that has some, and 4 in the others of its block (evidence.py).
+Together 8.15 bytes a voxel. Labels take 84 more in each that has some, and 4 in the others of its block: see
+evidence_rows.py.
 """
 
 from __future__ import annotations

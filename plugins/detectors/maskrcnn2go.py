@@ -51,9 +51,9 @@ log = logging.getLogger(__name__)
 class MaskRCNN2Go(Detector):
     """Mask R-CNN 2Go (Facebook, Apache-2.0; COCO 2014 minival mask AP 20.9 as published), on the CPU or with CUDA.
 
-    The published network computes in 8-bit integers, and does so here on x86 CPUs with VNNI (those since about 2020),
-    in one thread; elsewhere in float, with the same weights. Each detection carries the box head's softmax over its
-    80 object classes, renormalised without the background; its score is the probability of its own class with the
+    The published network computes in 8-bit integers, and does so here on x86 CPUs with VNNI (those since about 2020), a
+    frame in one thread; elsewhere in float, with the same weights. Each detection carries the box head's softmax over
+    its 80 object classes, renormalised without the background; its score is the probability of its own class with the
     background counted. Non-maximum suppression within a class is the network's own; `agnostic_nms` then lets a mask
     fall to a better one of whatever class, so that an object that could be a chair or a couch comes back once, with
     both in its distribution, and does not start two map instances.
@@ -121,7 +121,7 @@ class MaskRCNN2Go(Detector):
 
     @torch.inference_mode()
     def detect(self, frame: Frame) -> Detections:
-        with one_torch_thread() if self._integers else nullcontext():  # the map is built on the other cores
+        with one_torch_thread() if self._integers else nullcontext():  # the others are the map's, and other frames'
             return self._detect(frame)
 
     def _detect(self, frame: Frame) -> Detections:

@@ -116,8 +116,9 @@ class LiveRoom(LiveVideo):
 
 @dataclass
 class SphereDetector(Detector):
-    """Finds both spheres where they really are."""
+    """Finds both spheres where they really are, in several frames at once."""
 
+    concurrent = True
     broken_at: int = -1  # raises FrameError at this frame
 
     def __post_init__(self) -> None:

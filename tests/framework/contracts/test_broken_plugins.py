@@ -95,7 +95,7 @@ class Backwards(CornerRoom):
     ("contract", "plugin", "test"),
     [
         (DetectorContract, Forgetful(), "test_detector_gives_the_same_for_the_same_frame_in_any_order"),
-        (DetectorContract, Sharing(), "test_detector_that_says_so_takes_several_frames_at_once"),
+        (DetectorContract, Sharing(), "test_detector_gives_the_same_in_another_thread_and_in_several_where_it_says_so"),
         (RefinerContract, Shifting(), "test_refiner_invents_no_points"),
         (RefinerContract, Dropping(), "test_refiner_invents_no_points"),
         (TrackerContract, Writing(writes=True), "test_tracker_returns_a_pose_and_leaves_the_map_alone"),
