@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numba import njit
 from torch import Tensor
 from torch.nn import functional
 
 from framework.data import Array
+from framework.detection.rounding import MOST, round_to_bytes
 from framework.errors import DataError
 
 Operator = Mapping[str, Any]  # type, inputs (blobs, then weights), outputs (one blob), args
@@ -27,7 +27,6 @@ Run = Callable[..., Tensor]  # from an operator's blobs (N, C, H, W) to its outp
 
 CONVOLUTIONS = ("Int8Conv", "Int8ConvRelu")
 MOST_OF_WEIGHTS = 127  # of int8, which oneDNN wants to be symmetric about 0
-MOST = 255  # of uint8
 
 
 class Step(NamedTuple):
@@ -64,19 +63,11 @@ class Quantisation(NamedTuple):
         channels_last = x.permute(0, 2, 3, 1).contiguous()
         rounded = torch.empty_like(channels_last, dtype=torch.uint8)
         flat = channels_last.numpy().reshape(-1), rounded.numpy().reshape(-1)
-        _round(*flat, np.float32(1 / self.scale), np.float32(self.zero_point))
+        round_to_bytes(*flat, np.float32(1 / self.scale), np.float32(self.zero_point))
         return rounded.permute(0, 3, 1, 2)
 
     def real(self, q: Tensor) -> Tensor:
         return (q.float() - self.zero_point) * self.scale
-
-
-@njit(cache=True, nogil=True)
-def _round(values, rounded, per_unit, zero_point):
-    """Fills rounded (N,) uint8 with values (N,) * per_unit + zero_point: in one pass, where torch makes five."""
-    for i in range(values.shape[0]):
-        nearest = np.rint(values[i] * per_unit + zero_point)
-        rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MOST))))
 
 
 def dequantised(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
