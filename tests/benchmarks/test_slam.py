@@ -32,7 +32,10 @@ from tests.benchmarks.slam_loop import RENDERING, SlamLoop, seconds
 VOXEL_SIZES = (0.01, 0.02)  # m
 TURN = 10  # frames
 FIRST, LAST = 20, 80  # frames in [FIRST, LAST) count: at first the map is small, and pages and caches are cold
-TARGETS = {"whole loop": ">= 5", "integrate": ">= 3", "render full image": ">= 3"}  # times as fast as Open3D ...
+TARGETS = {  # times as fast as Open3D ...
+    "redkitchen": {"whole loop": ">= 6", "integrate": ">= 3.5", "render full image": ">= 3"},
+    "synthetic room": {"whole loop": ">= 5", "integrate": ">= 4", "render full image": ">= 3"},
+}
 TARGETS_AT = 0.01  # m, ... at this voxel size
 WALK = 2000  # frames
 WARM = 10  # frames, after which none may be late
@@ -79,7 +82,7 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
                 ms(o),
                 ms(t),
                 times(t, o),
-                TARGETS.get(row, NOTHING) if voxel_size == TARGETS_AT else NOTHING,
+                TARGETS[name].get(row, NOTHING) if voxel_size == TARGETS_AT else NOTHING,
                 times(quick_t, quick_o),
             ]
             for (row, (o, t)), (quick_o, quick_t) in zip(medians.items(), duel.quantiles(0.1).values(), strict=True)
