@@ -13,17 +13,17 @@ from PIL import Image
 from tqdm import tqdm
 
 from framework.api import pipeline_of
-from framework.configs import composed
+from framework.config.composition import composed
 from framework.data import Int32
 from framework.interfaces import RGBDSequence
-from framework.journal import Journal
-from framework.records.run_record import LIKELY
 from framework.registry import build
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import instance_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import best_view
-from framework.settings import Settings
+from framework.runs.run_directory import LIKELY
+from framework.runtime.process_settings import Settings
+from framework.runtime.run_log import Journal
 
 EVERY = 2  # frames between two pictures
 WIDTH, HEIGHT = 600, 500  # px of each of the two views

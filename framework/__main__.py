@@ -35,6 +35,14 @@ COMMANDS = {
 }
 """What each does."""
 
+FOLDERS = {
+    "running": ("run", "detect", "show-refinement"),
+    "results": ("tables", "ranks", "figures", "report", "diff", "export", "query", "evaluate"),
+    "recordings": ("import", "check", "synthesize", "convert-oni"),
+    "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "train-words", "convert-weights"),
+}
+"""The folder of framework.commands that contains the module of each command."""
+
 PRINTING = (
     "tables",
     "ranks",
@@ -70,8 +78,10 @@ RERUN = "--experimental-rerun"  # Hydra's: it reads a pickle, which may bring co
 
 
 def module_of(command: str) -> str:
-    """That of framework.commands with its name; a module named `import` could not be imported by a statement."""
-    return f"framework.commands.{'import_recording' if command == 'import' else command.replace('-', '_')}"
+    """Return the module of framework.commands that implements a command."""
+    name = {"import": "import_recording"}.get(command, command.replace("-", "_"))  # `import` is a keyword
+    folder = next(folder for folder, commands in FOLDERS.items() if command in commands)
+    return f"framework.commands.{folder}.{name}"
 
 
 def leave_working_folder(arguments: list[str]) -> None:

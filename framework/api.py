@@ -11,7 +11,9 @@ from weakref import finalize
 from hydra.core.override_parser.types import Quote, QuotedString
 from omegaconf import DictConfig
 
-from framework.configs import composed
+from framework.compilation.catalog import compile_for_run
+from framework.config.composition import composed
+from framework.config.validation import checked_path
 from framework.data import (
     Camera,
     Detections,
@@ -25,9 +27,9 @@ from framework.data import (
     UInt8,
     View,
 )
-from framework.datasets.recording import FRAME_RATE
-from framework.detection.cache import with_cache
+from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.detection.domain import warn_outside_domain
+from framework.detection.stored.cache import with_cache
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, MapFullError
 from framework.interfaces import (
     ClusterRefiner,
@@ -39,16 +41,14 @@ from framework.interfaces import (
     SceneMap,
     Viewer,
 )
-from framework.journal import Journal
-from framework.kernels import compile_for_run
-from framework.object_queries import Map
-from framework.object_search import Answer, Found, Question, search
-from framework.parameters import checked_path
 from framework.pipeline import Pipeline
-from framework.records.stored_runs import MAP, PLACES
+from framework.queries.map_queries import Map
+from framework.queries.text_search import Answer, Found, Question, search
 from framework.registry import build
-from framework.settings import Settings
-from framework.tracking.places_file import read_places
+from framework.runs.stored_runs import MAP, PLACES
+from framework.runtime.process_settings import Settings
+from framework.runtime.run_log import Journal
+from framework.tracking.keyframes_file import read_places
 
 __all__ = [
     "Added",
@@ -297,7 +297,7 @@ def export(
     what the run does not tell. Raises ConfigError for a word that there is not, DataError for a run that cannot be
     exported.
     """
-    from framework.exporting import export as exports
+    from framework.exporting import exports
 
     kinds = [exports.one_of(exports.Format, "a format", one) for one in formats]
     chosen = exports.Chosen.named(objects, **choices)
@@ -322,9 +322,9 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
 
 def load_scene(path: Path | str) -> SceneMap:
     """The same as `load_map`, for who goes on with the map itself."""
+    from framework.baselines import object_map, open3d_map, semantic_map
     from framework.mapping import instance_map
-    from framework.mapping.map_file import read_format
-    from framework.rivals import object_map, open3d_map, semantic_map
+    from framework.mapping.storage.map_file import read_format
 
     kinds: dict[str, type[SceneMap]] = {
         str(instance_map.FORMAT): instance_map.InstanceMap,

@@ -257,7 +257,7 @@ class Viewer:
     """Shows a run while it goes on. This one shows nothing; a viewer has the verbs that it needs.
 
     All are called by the loop, which waits for them: what takes time belongs into a thread of its own
-    (`framework.viewing.background`). The map may be read within a call, as nobody writes it then, and not after it.
+    (`framework.live_view.drawing_thread`). Read the map only within a call, while it is not being written.
     Whatever a viewer does, it changes no result.
     """
 

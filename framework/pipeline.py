@@ -12,12 +12,9 @@ from itertools import count
 from pathlib import Path
 from typing import cast
 
-from framework.core_sharing import CoreSharing
 from framework.data import Array, Detections, Frame, Pose
 from framework.detection.domain import warn_outside_domain
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
-from framework.frame_stream import FrameStream, stream_of
-from framework.geometry import lift
 from framework.interfaces import (
     ClusterRefiner,
     Detector,
@@ -29,11 +26,14 @@ from framework.interfaces import (
     SceneMap,
     Viewer,
 )
-from framework.interruption import Interruption, signals_deferred
-from framework.journal import Journal, RunResult, StageTime
+from framework.live_view.guarded_viewer import GuardedViewer
+from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
-from framework.viewing.guarded_viewer import GuardedViewer
-from framework.working_ahead import Turns, map_ahead
+from framework.runtime.cpu_budget import CoreSharing
+from framework.runtime.frame_stream import FrameStream, stream_of
+from framework.runtime.prefetch import Turns, map_ahead
+from framework.runtime.run_log import Journal, RunResult, StageTime
+from framework.runtime.signals import Interruption, signals_deferred
 
 WITHOUT_POSES = "add the sequence's poses, or choose a tracker that needs none, tracker=voxel_hashing_icp"
 

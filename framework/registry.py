@@ -23,7 +23,7 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.configs import config_directory
+from framework.config.composition import config_directory
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF, PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
@@ -50,9 +50,9 @@ def build(interface: type[Plugin], node: DictConfig | None) -> Plugin:
 
     The class must be one that an option of the stage names: those of this project, of installed packages and, in a run,
     of --config-dir; where no Hydra with our configs runs (from Python, or when a stored run is evaluated anew), also
-    those of `framework.configs.add_config_dir`. Only then is its module imported, and the class refused unless it is a
-    concrete dataclass that implements `interface`: a config brings no code that nobody registered. Interpolations in
-    the node are resolved against the config that it belongs to.
+    those of `framework.config.composition.add_config_dir`. Only then is its module imported. A class that is not a
+    concrete dataclass implementing `interface` is rejected, so a config cannot run unregistered code. Interpolations
+    in the node are resolved against the config that it belongs to.
 
     Raises:
         ConfigError: the class or a parameter is wrong; one line that names the stage, the plugin and what is wrong.

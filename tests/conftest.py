@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-import tests.cores  # noqa: F401  # isort: skip; before numba is loaded, which reads what it sets
+import tests.support.cores  # noqa: F401  # isort: skip; before numba is loaded, which reads what it sets
 
-pytest.register_assert_rewrite("framework.contracts")  # before they are loaded
+pytest.register_assert_rewrite("framework.testing")  # before they are loaded
 
-from framework import configs  # noqa: E402
-from tests.scenes.corner_room import CornerRoom  # noqa: E402
+from framework.config import composition  # noqa: E402
+from tests.support.scenes.corner_room import CornerRoom  # noqa: E402
 
 os.environ.setdefault("INSTANCEMAP_OFFLINE", "1")  # no test downloads 180 MB because the machine could
 CHECKOUT = Path(__file__).resolve().parent.parent
@@ -57,7 +57,7 @@ def shared_data(shared: Path) -> Path:
 @pytest.fixture(scope="session")
 def ready(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str, str], Any]:
     """Builds an option with what only a user has. Skips where a package is not there, and only there."""
-    from tests import option_files, registered
+    from tests.support import option_files, registered
 
     made = functools.cache(lambda *option: option_files.overrides(*option, tmp_path_factory.mktemp(option[1])))
 
@@ -75,5 +75,5 @@ def room() -> CornerRoom:
 
 @pytest.fixture
 def fakes_registered(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The stages of tests/fake_conf may be built here, as with --config-dir tests/fake_conf."""
-    monkeypatch.setattr(configs, "_added", [CHECKOUT / "tests" / "fake_conf"])
+    """The stages of tests/support/fake_conf may be built here, as with --config-dir tests/support/fake_conf."""
+    monkeypatch.setattr(composition, "_added", [CHECKOUT / "tests" / "support" / "fake_conf"])

@@ -16,7 +16,7 @@ from sphinx.application import Sphinx
 from sphinx.util.docutils import SphinxDirective
 
 from framework.__main__ import COMMANDS
-from framework.commands.plugins import COMMENTED_KEY, Option, registered
+from framework.commands.installation.plugins import COMMENTED_KEY, Option, registered
 from framework.files.search_paths import CONF
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from framework.checking.finding import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair
 from framework.data import Float64
-from framework.datasets.reading import CameraAxes, PoseKind, PoseReading, QuaternionOrder
+from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
 from framework.geometry import inverse, project, transform
 
 UNSEEN = 1.0  # of the image's width: the error of a point that a reading moves behind the camera, or farther than this

@@ -16,8 +16,8 @@ from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgement
 from framework.checking.registration import Agreement, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
-from framework.datasets.reading import PoseReading
-from framework.datasets.recording import Recording
+from framework.datasets.frames.conventions import PoseReading
+from framework.datasets.frames.sequence_reader import Recording
 from framework.errors import DataError, FrameError
 from framework.interfaces import RGBDSequence, RGBDVideo
 

@@ -20,9 +20,9 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.configs import add_config_dir, one_line
+from framework.config.composition import add_config_dir, one_line
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
-from framework.interruption import Interrupted
+from framework.runtime.signals import Interrupted
 
 log = logging.getLogger(__name__)
 

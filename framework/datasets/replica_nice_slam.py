@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from framework.data import Camera
-from framework.datasets.camera_json import camera_of, read_json_object
-from framework.datasets.recording import FRAME_RATE, Contents, Recording, numbered_images
-from framework.datasets.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.calibration.camera_json import camera_of, read_json_object
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording, numbered_images
+from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import DataError
 from framework.files.matrix_file import PrintedMatrix, read_matrix_lines
 

@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64, FrameTruth, Int32, SceneTruth
-from framework.datasets.camera_json import (
+from framework.datasets.calibration.camera_json import (
     CAMERA_KEYS,
     DISTORTION,
     camera_of,
@@ -34,16 +34,16 @@ from framework.datasets.camera_json import (
     distortion_of,
     read_json_object,
 )
-from framework.datasets.recording import FRAME_RATE, Contents, Recording, numbered_images
-from framework.datasets.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
-from framework.datasets.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording, numbered_images
+from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
+from framework.files.atomic_write import is_there
 from framework.files.gravity_file import read_gravity
 from framework.files.image_files import read_uint16
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import TumLine, read_tum_lines
-from framework.files.whole_files import is_there
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 
 LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16
 MOST_DIGITS = 10  # of an id, zeros in front among them

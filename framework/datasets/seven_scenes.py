@@ -18,9 +18,9 @@ import numpy as np
 from numba import njit
 
 from framework.data import Camera, Float64, UInt8, UInt16
-from framework.datasets.calibration import NO_READING
-from framework.datasets.recording import FRAME_RATE, Contents, Recording
-from framework.datasets.stored_frames import RecordedFrame
+from framework.datasets.calibration.raw_images import NO_READING
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording
+from framework.datasets.frames.stored_frames import RecordedFrame
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import read_matrix

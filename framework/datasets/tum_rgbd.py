@@ -25,8 +25,9 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.config.validation import require
 from framework.data import Camera, Float64
-from framework.datasets.camera_json import (
+from framework.datasets.calibration.camera_json import (
     CAMERA_KEYS,
     DISTORTION,
     camera_of,
@@ -34,15 +35,14 @@ from framework.datasets.camera_json import (
     distortion_of,
     read_json_object,
 )
-from framework.datasets.recording import Contents, Recording
-from framework.datasets.stored_frames import ImageFiles, RecordedFrame
-from framework.datasets.undistortion import Distortion
+from framework.datasets.calibration.undistortion import Distortion
+from framework.datasets.frames.sequence_reader import Contents, Recording
+from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import ConfigError, DataError
+from framework.files.atomic_write import is_there
 from framework.files.number_lines import SHOWN, read_lines
 from framework.files.tum_trajectory import TumLine, read_tum_lines
-from framework.files.whole_files import is_there
 from framework.geometry import interpolate
-from framework.parameters import require
 
 DEPTH_SCALE = 5000.0  # units a metre
 LONGEST_NAME = 255  # characters of an image's

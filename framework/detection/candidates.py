@@ -12,8 +12,8 @@ from enum import Enum
 import numpy as np
 
 from framework.data import Float32, Int32
-from framework.detection.boxes import LARGEST_LOG_SCALE
-from framework.detection.nms import suppress_boxes
+from framework.detection.masks.boxes import LARGEST_LOG_SCALE
+from framework.detection.masks.nms import suppress_boxes
 from framework.errors import DataError
 
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows

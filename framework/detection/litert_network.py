@@ -14,9 +14,16 @@ import cv2
 import numpy as np
 
 from framework.data import Array
-from framework.detection.export_metadata import ExportMetadata
-from framework.detection.network_outputs import Outputs, finite_outputs, one_line
-from framework.detection.weights_file import Shape, checked_hash, find_file, image_input, input_shape, is_channels_last
+from framework.detection.hub.weights_file import (
+    Shape,
+    checked_hash,
+    find_file,
+    image_input,
+    input_shape,
+    is_channels_last,
+)
+from framework.detection.runtimes.export_metadata import ExportMetadata
+from framework.detection.runtimes.network_outputs import Outputs, finite_outputs, one_line
 from framework.errors import ConfigError, DataError
 
 if TYPE_CHECKING:

@@ -17,14 +17,14 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 from torch.nn import functional
 
-from framework.color_names import COLOR_NAMES
 from framework.data import Float32, UInt8
-from framework.detection.image_text import ImageTextModel, unit_rows
+from framework.detection.embeddings.image_text import ImageTextModel, unit_rows
 from framework.errors import DataError, in_one_line
+from framework.files.atomic_write import check_regular, written_whole
 from framework.files.hashing import path_hash
 from framework.files.json_file import parse_json
-from framework.files.whole_files import check_regular, written_whole
-from framework.object_words import object_words
+from framework.vocabulary.color_names import COLOR_NAMES
+from framework.vocabulary.text_queries import object_words
 
 SIDE = 64  # px
 CHANNELS = (24, 48, 64, 96)

@@ -11,7 +11,7 @@ from typing import Any
 
 import framework
 from framework.doctor import machine, networks, trial
-from framework.doctor.finding import Finding, Section, State, anonymous, section
+from framework.doctor.check_result import Finding, Section, State, anonymous, section
 
 LATER = ("torch", "gpu()", "integers()")  # what takes as long as all others: one process tries these, another the rest
 
@@ -34,7 +34,7 @@ def examined() -> list[Section]:
 
 def _code() -> Iterator[Finding]:
     yield Finding("version", State.THERE, framework.__version__)
-    from framework.records.provenance import UNKNOWN, code_version
+    from framework.runs.provenance import UNKNOWN, code_version
 
     found = code_version()
     changed = ", and files differ from it" if found["git_dirty"] is True else ""

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from framework.doctor.finding import Finding, State, anonymous
+from framework.doctor.check_result import Finding, State, anonymous
 
 LITTLE_ROOM = 2.0  # GB; a run leaves 20 to 200 MB, a benchmark of rooms gigabytes
 LITTLE_MEMORY = 2.0  # GiB; a run of the demo takes 1.2

@@ -11,7 +11,7 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from framework.doctor.finding import Finding, State, anonymous
+from framework.doctor.check_result import Finding, State, anonymous
 from framework.files.search_paths import CONF, PROJECT_ROOT
 
 SHIPPED = "plugins/"  # how the paths of what comes with the project begin
@@ -57,7 +57,7 @@ def downloaded() -> Iterator[Finding]:
 
 def from_hugging_face() -> Iterator[Finding]:
     """Those that huggingface.co's own client keeps."""
-    from framework.detection.hub_model import forbidden_by
+    from framework.detection.hub.hub_model import forbidden_by
 
     folder = _hub_cache()
     variable = forbidden_by()

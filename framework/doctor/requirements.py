@@ -12,7 +12,7 @@ from packaging.requirements import Requirement
 from packaging.specifiers import SpecifierSet
 from packaging.utils import canonicalize_name
 
-from framework.doctor.finding import Finding, State
+from framework.doctor.check_result import Finding, State
 
 PROJECT = "instancemap"
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"

@@ -18,7 +18,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from framework.doctor.finding import reason
+from framework.doctor.check_result import reason
 
 PATIENCE = 120.0  # s, for all that one process tries
 ROOT = Path(__file__).resolve().parents[2]
@@ -82,13 +82,13 @@ def _gpu() -> dict[str, Any]:
 
 
 def _integers() -> dict[str, Any]:
-    from framework.detection.caffe2_network import has_int8_kernels
+    from framework.detection.runtimes.caffe2_network import has_int8_kernels
 
     return {"there": has_int8_kernels()}
 
 
 def _kernels() -> dict[str, Any]:
-    from framework.kernels import DEFAULT, OTHERS, listed
+    from framework.compilation.catalog import DEFAULT, OTHERS, listed
 
     counted: dict[str, Any] = {}
     for section, name in ((DEFAULT, "default"), (OTHERS, "others")):

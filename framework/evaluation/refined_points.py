@@ -11,8 +11,8 @@ import numpy as np
 from scipy.sparse import csr_array
 
 from framework.data import Bool, Detections, Float64, Frame, FrameTruth, Int32, PointClusters, Pose
-from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
+from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
 TIMED = 5  # calls, of which the median counts; the one before them may have to compile

@@ -17,8 +17,8 @@ from matplotlib.transforms import Bbox
 from framework.data import UInt8
 from framework.exporting.geojson import outline
 from framework.exporting.occupancy import Plan
-from framework.exporting.room import Room, RoomObject
-from framework.files.whole_files import written_whole
+from framework.exporting.upright_room import Room, RoomObject
+from framework.files.atomic_write import written_whole
 from framework.rendering.palette import FAINT_INK, INK, PAPER
 
 UNSEEN, FLOOR, FREE, OCCUPIED, WALL = (214, 216, 218), (240, 232, 206), PAPER, (150, 154, 160), INK

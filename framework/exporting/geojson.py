@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from framework.data import Float64
-from framework.exporting.room import Room, RoomObject
+from framework.exporting.upright_room import Room, RoomObject
 from framework.files.json_file import write_json
 
 COORDINATES = "metres in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."

@@ -13,9 +13,9 @@ from framework.data import InstanceMesh
 from framework.exporting.coloring import Coloring, part_colors
 from framework.exporting.object_meshes import Part
 from framework.exporting.submeshes import joined
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 from framework.geometry import transform
-from framework.records.mesh_file import write_mesh
+from framework.runs.mesh_file import write_mesh
 
 DIGITS = 5  # of an OBJ file's numbers behind the point: 0.01 mm
 

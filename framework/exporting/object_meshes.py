@@ -9,10 +9,10 @@ import numpy as np
 
 from framework.data import Float64, InstanceMesh
 from framework.exporting.decimation import decimated
-from framework.exporting.room import Room, RoomObject
 from framework.exporting.submeshes import corners_of, submesh
+from framework.exporting.upright_room import Room, RoomObject
 from framework.geometry import inverse, transform
-from framework.progress import Progress
+from framework.runtime.progress import Progress
 
 REST = "room"  # the name of what is of no object
 

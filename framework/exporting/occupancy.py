@@ -22,10 +22,10 @@ import numpy as np
 
 from framework.data import Bool, Float64, Int32, Int64
 from framework.errors import DataError
-from framework.exporting.room import Room
 from framework.exporting.surface_points import SurfacePoints, surface_points
+from framework.exporting.upright_room import Room
 from framework.geometry import inverse, project, transform
-from framework.object_changes import EYE, LOOKS
+from framework.queries.changes import EYE, LOOKS
 from framework.rendering.rasterizer import Rasterizer
 
 CLEARANCE = 0.08  # m above the floor, below which nothing counts: floors are noisy by some cm

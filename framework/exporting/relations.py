@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 
 from framework.data import Bool, Float32, Float64, Int64
 from framework.exporting.occupancy import Plan
-from framework.exporting.room import Room, RoomObject
 from framework.exporting.surface_points import surface_points
+from framework.exporting.upright_room import Room, RoomObject
 
 SPACING = 0.02  # m, of the points that stand for a surface
 CELL = 0.03  # m, of footprints

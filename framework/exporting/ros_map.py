@@ -9,7 +9,7 @@ from PIL import Image
 
 from framework.data import UInt8
 from framework.exporting.occupancy import Plan
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 
 OCCUPIED, FREE, UNKNOWN = 0, 254, 205  # levels of grey, as map_saver writes them
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196  # of (255 - level) / 255: 205 is just above the second one

@@ -9,8 +9,8 @@ import numpy as np
 
 from framework.exporting.occupancy import Plan
 from framework.exporting.relations import Relation, relations
-from framework.exporting.room import Room, RoomObject
 from framework.exporting.rooms import Rooms, rooms
+from framework.exporting.upright_room import Room, RoomObject
 from framework.files.json_file import write_json
 
 DIGITS = 4  # behind the point, of metres

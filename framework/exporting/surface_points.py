@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.errors import DataError
-from framework.exporting.room import Room
+from framework.exporting.upright_room import Room
 
 MOST_POINTS = 2**24  # of a room; one of 100 m^2 of surface has 4 million, a voxel of 1 cm giving 2 triangles
 LEVEL = float(np.cos(np.radians(30.0)))  # z of a normal, from which on a surface is one that things may stand on

@@ -24,7 +24,7 @@ from framework.data import Float32, Int32, UInt8
 from framework.errors import DataError
 from framework.exporting.coloring import Coloring, linear, part_colors
 from framework.exporting.object_meshes import Part
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 
 MISSING = "USD files need the package usd-core: pip install instancemap[usd]"
 NOT_WRITTEN = "USD could not write it"

@@ -16,8 +16,8 @@ from framework.checking.pose_fit import PoseFit, PoseJudgement, motion_of
 from framework.checking.recording_check import RecordingCheck
 from framework.checking.registration import depth_edges
 from framework.data import Float64, Frame, UInt8
-from framework.datasets.reading import CameraAxes, PoseKind, PoseReading, QuaternionOrder
-from framework.files.whole_files import written_whole
+from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading, QuaternionOrder
+from framework.files.atomic_write import written_whole
 from framework.geometry import back_project, project, transform
 
 SIZE_IN, DPI = (15.0, 9.4), 100

@@ -10,6 +10,7 @@ from typing import TypeVar
 
 from tqdm import tqdm
 
+from framework.config.validation import checked_rows
 from framework.data import SceneTruth
 from framework.errors import DataError, InstanceMapError
 from framework.figures.figure_choice import FigureChoice
@@ -17,13 +18,12 @@ from framework.figures.figure_page import Page
 from framework.figures.map_figure import CaptionedLine, map_figure, panel_size
 from framework.figures.map_panels import panel_line
 from framework.figures.stage_times import WINDOW, MeanTimes, stage_times_figure
-from framework.parameters import checked_rows
-from framework.records.reevaluation import Truth
-from framework.records.rows import Row, Run, natural, rows_of
-from framework.records.stored_map import StoredMap
-from framework.records.stored_runs import Incomplete, Record, find_records, read_yaml
-from framework.records.sweep_file import SWEEP
-from framework.records.timings_file import StageTimes, read_timings
+from framework.runs.reevaluation import Truth
+from framework.runs.run_rows import Row, Run, natural, rows_of
+from framework.runs.stored_map import StoredMap
+from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
+from framework.runs.sweep_file import SWEEP
+from framework.runs.timings_file import StageTimes, read_timings
 from framework.tables.table_notes import counted, machine
 
 NAME = "figure"  # of the files, and of the block in the experiment's config

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+from framework.config.validation import checked_block
 from framework.errors import ConfigError
-from framework.parameters import checked_block
-from framework.records.rows import Row
+from framework.runs.run_rows import Row
 
 KINDS = ("stage_times", "maps")
 

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
 from matplotlib.textpath import text_to_path
 
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 
 COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of a journal's column, and of two
 TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0

@@ -9,12 +9,12 @@ import cv2
 import numpy as np
 
 from framework.data import Camera, Float64, Int32, SceneTruth, UInt8
-from framework.records.stored_map import StoredMap
 from framework.rendering.camera_path import CameraPath
 from framework.rendering.lit_view import LitView
 from framework.rendering.object_colors import ObjectColors, relabeled
 from framework.rendering.surface import FrontSides, Surface
 from framework.rendering.viewpoint import best_view, fitted
+from framework.runs.stored_map import StoredMap
 
 ZOOM = 2.5  # how much larger the place is shown in which the columns differ most
 

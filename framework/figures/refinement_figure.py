@@ -25,7 +25,7 @@ from framework.figures.drawing import (
     shortened,
 )
 from framework.figures.side_view import SideView, side_panel
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 from framework.rendering.palette import FAINT_INK, INK, PAPER
 
 TITLE_HEIGHT, FIGURES_HEIGHT, ROW_HEIGHT = 52, 46, 30  # px

@@ -15,7 +15,7 @@ from scipy.optimize import isotonic_regression
 
 from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, say_inside
-from framework.records.timings_file import StageTimes
+from framework.runs.timings_file import StageTimes
 
 WINDOW = 9  # frames, of the running median: single slow frames, such as the first, are no trend
 SUM = "sum"

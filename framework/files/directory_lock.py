@@ -12,7 +12,7 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 
 from framework.errors import DataError
-from framework.files.whole_files import read_text, written_whole
+from framework.files.atomic_write import read_text, written_whole
 
 LOCK, HOLDER = ".lock", ".lock_holder"  # what is locked, and who has it: on Windows a locked file cannot be read
 

@@ -14,9 +14,9 @@ import numpy as np
 
 from framework.data import Float64
 from framework.errors import DataError
+from framework.files.atomic_write import written_whole
 from framework.files.number_lines import numbers, read_lines
 from framework.files.tum_trajectory import COMMENT
-from framework.files.whole_files import written_whole
 
 COLUMNS = "x y z"
 SHORTEST, LONGEST = 1e-6, 1e6  # in whatever unit, that a direction is

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Array
-from framework.files.whole_files import check_regular
+from framework.files.atomic_write import check_regular
 
 
 def add_values(digest: hashlib._Hash, array: Array) -> None:

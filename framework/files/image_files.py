@@ -19,7 +19,7 @@ from PIL.PngImagePlugin import PngImageFile
 
 from framework.data import MOST_PIXELS, Array, UInt8, UInt16
 from framework.errors import DataError, FrameError, in_one_line
-from framework.files.whole_files import read_bytes
+from framework.files.atomic_write import read_bytes
 
 PNG_START, PNG_END = b"\x89PNG\r\n\x1a\n", b"\0\0\0\0IEND\xaeB`\x82"
 JPEG_START, JPEG_END = b"\xff\xd8", b"\xff\xd9"

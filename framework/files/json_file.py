@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.errors import DataError, in_one_line
-from framework.files.whole_files import MOST_TEXT, read_bytes, written_whole
+from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 
 DEEPEST = 50  # objects and lists in each other
 TOO_DEEP = f"it is not valid JSON for us: lists and objects more than {DEEPEST} deep"

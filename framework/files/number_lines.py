@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from framework.errors import DataError
-from framework.files.whole_files import read_text
+from framework.files.atomic_write import read_text
 
 SHOWN = 60  # characters of what a file holds that an error repeats
 

@@ -15,11 +15,11 @@ import numpy.typing as npt
 
 from framework.data import Array, Float32, Int32, Int64
 from framework.errors import DataError
+from framework.files.atomic_write import read_bytes, written_whole
 from framework.files.ply_binary import BinaryBody
 from framework.files.ply_header import TYPES, parse_header
 from framework.files.ply_rows import Body, Rows
 from framework.files.ply_text import TextBody
-from framework.files.whole_files import read_bytes, written_whole
 
 LARGEST_FILE = 2**32  # bytes; the mesh of a room has some 2^26
 AXES = ("x", "y", "z")

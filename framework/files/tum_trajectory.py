@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
+from framework.files.atomic_write import written_whole
 from framework.files.number_lines import numbers, read_lines
-from framework.files.whole_files import written_whole
 
 COMMENT = re.compile(r"(?<!1\.)#.*")  # 1.#IND is what Microsoft's C library prints for NaN
 COLUMNS = "timestamp tx ty tz qx qy qz qw"

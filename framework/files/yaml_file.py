@@ -12,7 +12,7 @@ from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.errors import DataError, in_one_line
-from framework.files.whole_files import read_text
+from framework.files.atomic_write import read_text
 
 LARGEST_FILE = 2**22  # bytes; the config of a run has 3 KB, that of a sweep 20
 DEEPEST = 50  # mappings and lists in each other

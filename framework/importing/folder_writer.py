@@ -11,18 +11,18 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from framework.config.validation import require
 from framework.data import MOST_PIXELS, Array, Camera, Float32, Float64, UInt16
-from framework.datasets.camera_json import DISTORTION
-from framework.datasets.color_registration import ColorRegistration
+from framework.datasets.calibration.camera_json import DISTORTION
+from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError
+from framework.files.atomic_write import written_whole
 from framework.files.gravity_file import write_gravity
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
-from framework.files.whole_files import written_whole
-from framework.importing.depth_upsampling import upsampled
+from framework.importing.depth.depth_upsampling import upsampled
+from framework.importing.phones.image_rotation import QUARTER, Turn
 from framework.importing.source import SURE, UNSURE, DeviceFrame, Source, StoredFrame
-from framework.importing.turning import QUARTER, Turn
-from framework.parameters import require
 
 DEPTH_SCALE = 1000.0  # units a metre
 LONGER_SIDE = 640  # px, of the images that are written by default: what trackers and detectors are tuned for

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from framework.errors import ConfigError, DataError
-from framework.importing import polycam, record3d, ros_bag, scanner_app, stray_scanner
-from framework.importing.ros_topics import Topics
+from framework.importing.bags import ros_bag
+from framework.importing.bags.ros_topics import Topics
+from framework.importing.phones import polycam, record3d, scanner_app, stray_scanner
 from framework.importing.source import Source
 
 ZIP = ".zip"

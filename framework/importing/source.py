@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, UInt8
-from framework.datasets.reading import CameraAxes, PoseReading
-from framework.datasets.undistortion import Distortion
+from framework.datasets.calibration.undistortion import Distortion
+from framework.datasets.frames.conventions import CameraAxes, PoseReading
 from framework.errors import DataError, FrameError
 from framework.geometry import nearest_rigid
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from framework.data import UNIT_TOLERANCE, Float32, Float64, Int32
 from framework.errors import DataError
-from framework.mapping.map_header import MapHeader
+from framework.mapping.storage.map_header import MapHeader
 
 MOST_FRAMES = 1e9  # of a map
 AGREED = 0.95  # length of the mean of sensors' unit vectors, at least: so they are 18 degrees off it, or less

@@ -11,12 +11,14 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
-from framework.mapping.association import agreed_classes, look_up_instances
-from framework.mapping.evidence import Combine, Evidence
-from framework.mapping.evidence_rows import EvidenceRows, Storage
-from framework.mapping.instance_list import Confirmation, list_instances
-from framework.mapping.instance_table import InstanceTable
-from framework.mapping.map_file import (
+from framework.mapping.instances.association import agreed_classes, look_up_instances
+from framework.mapping.instances.instance_list import Confirmation, list_instances
+from framework.mapping.instances.instance_table import InstanceTable
+from framework.mapping.labels.class_slots import NO_CLASS
+from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
+from framework.mapping.labels.label_evidence import Combine, Evidence
+from framework.mapping.labels.vertex_labels import vertex_labels
+from framework.mapping.storage.map_file import (
     check_known,
     check_like,
     check_numbers,
@@ -27,12 +29,10 @@ from framework.mapping.map_file import (
     table_of,
     write_map,
 )
-from framework.mapping.meshing import Surface
-from framework.mapping.raycasting import render
-from framework.mapping.sensor import pinhole
-from framework.mapping.slot_vectors import NO_CLASS
-from framework.mapping.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
-from framework.mapping.vertex_labels import vertex_labels
+from framework.mapping.voxels.integration_parameters import pinhole
+from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.raycasting import render
+from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 
 FORMAT = 7  # of the saved file; a change of meaning counts it up
 

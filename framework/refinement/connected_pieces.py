@@ -11,7 +11,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Float32, Frame, Int32, Int64, PointClusters
 from framework.refinement.neighborhood import bounding_box, members, thread_shares
-from framework.refinement.union_find import root, unite
+from framework.refinement.segmentation.union_find import root, unite
 
 CELLS = 512  # that are looked at together
 STARTS, ENDS = 32, 256  # samples of a piece that may stay, and of one that does

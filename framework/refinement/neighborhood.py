@@ -13,8 +13,8 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
 
+from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Frame, Int32, Int64, PointClusters
-from framework.parameters import check_bounds
 
 Int16 = npt.NDArray[np.int16]
 

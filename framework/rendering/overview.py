@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from framework.data import Float64, InstanceMesh, Int32, UInt8
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 from framework.rendering.camera_path import CameraPath
 from framework.rendering.labels import draw_labels, place_labels, text_size
 from framework.rendering.lit_view import LitView

@@ -11,18 +11,18 @@ from typing import Any
 
 import numpy as np
 
-from framework.records.provenance import leaves
-from framework.records.run_record import LIKELY
-from framework.records.stored_runs import is_number
 from framework.registry import STAGES
-from framework.reporting.footage import Footage
 from framework.reporting.map_scene import MapScene
 from framework.reporting.markup import page, section, table, tag, words
 from framework.reporting.run_contents import RunContents
 from framework.reporting.run_page import lost_after, viewer
-from framework.reporting.sightings import NOT_CAMERA
+from framework.reporting.source_frames import Footage
 from framework.reporting.time_charts import stage_rows
 from framework.reporting.trajectory_chart import Way, top_view
+from framework.reporting.visibility import NOT_CAMERA
+from framework.runs.provenance import leaves
+from framework.runs.run_directory import LIKELY
+from framework.runs.stored_runs import is_number
 
 MOST_MAPS = 6  # runs whose maps are in the page: they share what one map may have
 RUN_COLORS = 6  # of report.css

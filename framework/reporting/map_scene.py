@@ -12,15 +12,15 @@ import numpy as np
 
 from framework.data import Camera, Float64, InstanceMesh, Int32, UInt8
 from framework.exporting.decimation import with_finer_objects
-from framework.records.instances_file import StoredInstance
-from framework.records.run_record import LIKELY
 from framework.rendering.palette import class_colors, object_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
-from framework.reporting.footage import Footage
 from framework.reporting.run_contents import RunContents
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
-from framework.reporting.sightings import Sightings, sightings, spread_out
+from framework.reporting.source_frames import Footage
+from framework.reporting.visibility import Sightings, sightings, spread_out
+from framework.runs.instances_file import StoredInstance
+from framework.runs.run_directory import LIKELY
 
 VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, whose proportions the first view is chosen for
 PATH_POINTS = 400  # of the camera's way

@@ -9,10 +9,10 @@ import numpy as np
 
 from framework.data import Float64
 from framework.evaluation.instances import Judgement, Outcome
-from framework.records.instances_file import StoredInstance
 from framework.reporting.markup import tag, words
 from framework.reporting.pictures import Picture
 from framework.reporting.run_contents import RunContents
+from framework.runs.instances_file import StoredInstance
 
 LIKELY_CLASSES = 6  # of an object's class distribution, that a page shows
 

@@ -15,7 +15,7 @@ from framework.data import Bool, Float64, InstanceMesh, Int32, UInt8
 from framework.rendering.lit_view import LitView
 from framework.rendering.rasterizer import Rasterizer
 from framework.rendering.surface import Surface
-from framework.reporting.footage import Footage
+from framework.reporting.source_frames import Footage
 
 WIDTH, HEIGHT = 264, 198  # px; shown half as large, or full in the panel
 MANY = 120  # objects from which on pictures are smaller, so that pages stay light

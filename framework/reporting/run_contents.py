@@ -9,12 +9,12 @@ import numpy as np
 
 from framework.data import UNIT_TOLERANCE, Float64, InstanceMesh, Int32
 from framework.errors import DataError
+from framework.files.atomic_write import is_there
 from framework.files.tum_trajectory import read_tum
-from framework.files.whole_files import is_there
-from framework.records.instances_file import StoredInstance, read_instances
-from framework.records.mesh_file import read_mesh
-from framework.records.stored_map import read_objects
-from framework.records.stored_runs import (
+from framework.runs.instances_file import StoredInstance, read_instances
+from framework.runs.mesh_file import read_mesh
+from framework.runs.stored_map import read_objects
+from framework.runs.stored_runs import (
     INSTANCES,
     MESH,
     METRICS,
@@ -25,7 +25,7 @@ from framework.records.stored_runs import (
     read_partial,
     read_record,
 )
-from framework.records.timings_file import StageTimes, read_timings
+from framework.runs.timings_file import StageTimes, read_timings
 
 
 @dataclass(frozen=True)

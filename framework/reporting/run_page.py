@@ -14,19 +14,15 @@ from PIL import Image
 from framework.data import Float64
 from framework.errors import FrameError
 from framework.files.image_files import read_color
-from framework.records.provenance import leaves
-from framework.records.run_record import LIKELY
-from framework.records.stored_runs import is_number
 from framework.registry import STAGES
-from framework.reporting.footage import Footage
-from framework.reporting.growth_pictures import GrowthPicture, growth_pictures
 from framework.reporting.map_scene import MapScene, colors_by_id, hex_color, likely_ids
 from framework.reporting.markup import figure, page, section, table, tag, words
 from framework.reporting.object_table import object_data, object_table
 from framework.reporting.pictures import Photographer, Picture, webp_url
-from framework.reporting.recording import Recording, TruePath
+from framework.reporting.progress_pictures import GrowthPicture, growth_pictures
 from framework.reporting.run_contents import RunContents
-from framework.reporting.sightings import NOT_CAMERA, spread_out
+from framework.reporting.run_source import Recording, TruePath
+from framework.reporting.source_frames import Footage
 from framework.reporting.time_charts import growth, stage_areas, stage_rows
 from framework.reporting.trajectory_chart import (
     FLAT_HEIGHT,
@@ -39,6 +35,10 @@ from framework.reporting.trajectory_chart import (
 )
 from framework.reporting.truth_check import TruthCheck
 from framework.reporting.truth_section import truth_section
+from framework.reporting.visibility import NOT_CAMERA, spread_out
+from framework.runs.provenance import leaves
+from framework.runs.run_directory import LIKELY
+from framework.runs.stored_runs import is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the picture for browsers without WebGL
 

@@ -10,8 +10,8 @@ from framework.data import Float32, Float64, InstanceMesh
 from framework.exporting.decimation import clustered, triangle_labels
 from framework.exporting.glb import T_GLTF_ROOM, Node, glb_of
 from framework.exporting.object_meshes import REST
-from framework.exporting.room import plain_name, upright
 from framework.exporting.submeshes import corners_of, submesh
+from framework.exporting.upright_room import plain_name, upright
 
 MOST_BYTES = 9_500_000  # of the file; browsers of phones still turn it
 BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # place, colour, first sight; three indices

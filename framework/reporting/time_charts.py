@@ -9,9 +9,9 @@ import numpy as np
 
 from framework.data import Float64
 from framework.figures.stage_times import STAGES, WINDOW, running_median
-from framework.records.timings_file import StageTimes
 from framework.reporting import svg
 from framework.reporting.trajectory_chart import BOTTOM, LEFT, RIGHT, TOP, frame_axis
+from framework.runs.timings_file import StageTimes
 
 WIDTH, HEIGHT, GROWTH_HEIGHT = 560.0, 240.0, 390.0
 MOST_POINTS = 240  # of a line: twice as many as it has pixels would not be seen

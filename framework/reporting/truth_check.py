@@ -15,11 +15,11 @@ from framework.evaluation.instances import (
     judge,
     transfer_labels,
 )
-from framework.reporting.footage import Footage
 from framework.reporting.map_scene import MapScene
 from framework.reporting.pictures import Photographer, Picture
 from framework.reporting.run_contents import RunContents
-from framework.reporting.sightings import sightings
+from framework.reporting.source_frames import Footage
+from framework.reporting.visibility import sightings
 
 TRUE_COLOR = (255, 196, 0)  # the outline of what was missed
 

@@ -6,13 +6,13 @@ from collections.abc import Mapping
 from typing import Any
 
 from framework.evaluation.instances import Judgement, Outcome
-from framework.records.instances_file import StoredInstance
-from framework.records.stored_runs import is_number
 from framework.reporting.markup import section, table, tag, words
 from framework.reporting.object_table import image, meter
 from framework.reporting.pictures import Picture
 from framework.reporting.run_contents import RunContents
 from framework.reporting.truth_check import Missed, TruthCheck
+from framework.runs.instances_file import StoredInstance
+from framework.runs.stored_runs import is_number
 
 MAIN = {
     "instances.ap50": "AP50",

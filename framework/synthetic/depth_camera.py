@@ -1,6 +1,6 @@
 """The depth errors of a structured-light camera of the Kinect v1's kind.
 
-- Axial noise grows with the square of depth and towards grazing angles: see `framework.sensor_noise`.
+- Axial noise grows with the square of depth and towards grazing angles: see `framework.sensors.noise_models`.
 - Disparity is quantised to 1/8 px, so depth comes in steps of 2.9e-3 z^2: Khoshelham and Oude Elberink, "Accuracy and
   Resolution of Kinect Depth Data for Indoor Mapping Applications", Sensors 12(2), 2012.
 - A reading belongs to a place up to about a pixel aside (lateral noise, Nguyen et al.; applied as Handa et al.,
@@ -21,7 +21,7 @@ import numpy as np
 from numba import njit
 
 from framework.data import Bool, Camera, Float32, UInt8, UInt16
-from framework.sensor_noise import axial_sigma_at_angle
+from framework.sensors.noise_models import axial_sigma_at_angle
 
 BASELINE = 0.075  # m, between projector and camera
 DISPARITY_STEPS = 8.0  # per px

@@ -28,8 +28,8 @@ from tqdm import tqdm
 from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.datasets.scenenn.scenenn import MADE_BY
 from framework.errors import ConfigError, DataError
+from framework.files.atomic_write import written_whole
 from framework.files.json_file import read_json
-from framework.files.whole_files import written_whole
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
 

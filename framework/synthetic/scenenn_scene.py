@@ -16,16 +16,16 @@ from framework.data import Array, Box, Camera, Float32, Int32
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.datasets.scenenn.trajectory_log import write_trajectory_log
 from framework.errors import ConfigError
+from framework.files.atomic_write import written_whole
 from framework.files.ply import write_ply
-from framework.files.whole_files import written_whole
 from framework.geometry import transform
-from framework.label_spaces import SCENENN_TO_COCO
 from framework.synthetic.benchmark import SceneSpec, plan_scene
 from framework.synthetic.depth_camera import MIN_RANGE, DepthSensor, noisy_color
 from framework.synthetic.motion_blur import blurred
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.room_mesh import visible_mesh
 from framework.synthetic.walk import FRAME_RATE
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 GENERATION = 3  # of the rooms that this code makes: raise it when they change, so that none are mixed
 ASUS = Camera(640, 480, 544.47329, 544.47329, 320.0, 240.0)  # SceneNN's intrinsic/asus.ini

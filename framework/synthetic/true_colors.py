@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.color_names import COLOR_NAMES, nearest_names
 from framework.data import Float32, Int32
 from framework.synthetic.textures import PAINTING, SCREEN, SKY
+from framework.vocabulary.color_names import COLOR_NAMES, nearest_names
 
 NO_NAME = -1
 """Of a material that is a picture: it has all colours."""

@@ -10,12 +10,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from framework.config.validation import checked_block
 from framework.errors import ConfigError, DataError
-from framework.parameters import checked_block
-from framework.records.metrics import is_evaluation
-from framework.records.rows import CHOICE, Row, Run, natural, rows_of
-from framework.records.stored_runs import Incomplete, Record, find_records, read_yaml
-from framework.records.sweep_file import SWEEP, asked_runs, sweep_rows
+from framework.runs.metrics import is_evaluation
+from framework.runs.run_rows import CHOICE, Row, Run, natural, rows_of
+from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
+from framework.runs.sweep_file import SWEEP, asked_runs, sweep_rows
 from framework.tables.published import (
     DATASET,
     MADE_UP,

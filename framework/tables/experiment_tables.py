@@ -8,7 +8,7 @@ import math
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 from framework.tables.comparison import Comparison
 from framework.tables.grid import Grid, latex_grid, markdown_grid
 from framework.tables.layouts import difference_grid, row_grid

@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from framework.label_spaces import SCENENN_TO_COCO
-from framework.records.rows import Mean
+from framework.runs.run_rows import Mean
 from framework.tables.comparison import Comparison
 from framework.tables.grid import Grid, decimals, figure
 from framework.tables.published import NOT_KNOWN, Key, PublishedRow
 from framework.tables.sequences import mean_difference
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 NOTHING = "–"  # a figure that is not defined, such as the AP of a class that is not there
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from framework.data import Float64
 from framework.errors import DataError
-from framework.files.whole_files import written_whole
-from framework.records.rows import CHOICE, CONFIDENCE, Row, Run
+from framework.files.atomic_write import written_whole
+from framework.runs.run_rows import CHOICE, CONFIDENCE, Row, Run
 from framework.tables.comparison import Comparison
 from framework.tables.grid import Grid, decimals, figure, markdown_grid
 from framework.tables.layouts import NOTHING, head

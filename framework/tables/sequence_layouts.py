@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from framework.records.rows import Mean, Row
+from framework.runs.run_rows import Mean, Row
 from framework.tables.comparison import Comparison
 from framework.tables.grid import Grid, decimals, figure
 from framework.tables.layouts import NOTHING, head, published_cell, published_name

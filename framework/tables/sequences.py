@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from framework.records.rows import Mean, Run
+from framework.runs.run_rows import Mean, Run
 
 
 @dataclass(frozen=True)

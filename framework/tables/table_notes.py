@@ -7,10 +7,10 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 
 from framework.evaluation.instances import MAX_DISTANCE
-from framework.records.metrics import is_evaluation
-from framework.records.rows import CHOICE, CONFIDENCE, Run, following
-from framework.records.stored_runs import Record
 from framework.registry import STAGES
+from framework.runs.metrics import is_evaluation
+from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
+from framework.runs.stored_runs import Record
 from framework.tables.comparison import Comparison
 from framework.tables.layouts import head
 from framework.tables.sequences import mean_by_sequence

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import pycolmap
 
+from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
-from framework.parameters import check_bounds
 
 COLMAP_PIXEL_CENTER = 0.5  # COLMAP's center of the first pixel; ours is at 0
 CONFIDENCE = 0.9999  # of having found the best pose when RANSAC stops

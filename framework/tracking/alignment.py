@@ -23,8 +23,8 @@ import numpy.typing as npt
 from numba import njit, prange
 
 from framework.data import Camera, Float32, Float64, SurfaceView
-from framework.mapping.voxel_grid import device, one_more
-from framework.sensor_noise import axial_sigma_single
+from framework.mapping.voxels.voxel_grid import device, one_more
+from framework.sensors.noise_models import axial_sigma_single
 from framework.tracking.pyramid import PyramidLevel
 
 CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads

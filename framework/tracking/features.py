@@ -17,8 +17,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Float32, Frame, Int32, UInt8
-from framework.parameters import check_bounds
 
 DESCRIPTOR_LENGTH = 128
 DESCRIPTOR_NORM = 512.0  # of a RootSIFT descriptor before it is rounded: entries then fit into a byte

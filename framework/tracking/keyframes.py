@@ -13,11 +13,11 @@ from typing import Any
 
 import numpy as np
 
-from framework.core_sharing import stand_back
+from framework.config.validation import check_bounds
 from framework.data import Array, Float32, Float64, Frame, UInt8, check_array, check_rigid
 from framework.errors import ConfigError, DataError
 from framework.geometry import back_project, transform
-from framework.parameters import check_bounds
+from framework.runtime.cpu_budget import stand_back
 from framework.tracking.absolute_pose import AbsolutePose, AbsolutePoseEstimator
 from framework.tracking.features import DESCRIPTOR_LENGTH, FeatureExtractor, Features, match
 from framework.tracking.visual_words import VisualWords, similarity

@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Camera, Float32, SurfaceView, UInt8
-from framework.sensor_noise import GROWTH, LEAST, NEAR
+from framework.sensors.noise_models import GROWTH, LEAST, NEAR
 
 DEPTH_GAP = 0.05  # of the depth: readings farther apart than this do not belong to one surface and are not averaged
 SAMPLED = 4  # px: every so manieth reading tells in what steps depth comes

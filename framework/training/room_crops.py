@@ -13,14 +13,14 @@ import cv2
 import numpy as np
 
 from framework.data import Float32, Int32, UInt8
-from framework.detection.crops import square_crops
+from framework.detection.embeddings.crops import square_crops
 from framework.errors import DataError
-from framework.files.whole_files import written_whole
-from framework.label_spaces import COCO
+from framework.files.atomic_write import written_whole
 from framework.synthetic.depth_camera import noisy_color
 from framework.synthetic.renderer import Renderer
 from framework.synthetic.true_colors import NO_NAME, color_counts, color_of_materials, one_color
 from framework.training.room_pictures import each_in_a_process, random_room, random_views
+from framework.vocabulary.label_spaces import COCO
 
 STREAM = 0x776F_7264  # apart from the streams of all datasets and of room_pictures
 SIDE = 64  # px

@@ -20,23 +20,23 @@ import torch
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
+from framework.config.validation import require
 from framework.data import Bool, Camera, Detections, Frame
-from framework.detection.device import torch_device
 from framework.detection.domain import RENDERED_ROOMS
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import Fact, load_network, save_network
 from framework.detection.mask_rcnn.resnet import DEPTHS, ResNetShape
+from framework.detection.runtimes.device import torch_device
 from framework.errors import ConfigError
 from framework.evaluation.mask_ap import MaskAp, mask_ap
-from framework.files.whole_files import written_whole
+from framework.files.atomic_write import written_whole
 from framework.interfaces import Detector
-from framework.label_spaces import COCO, SCENENN_TO_COCO
-from framework.parameters import require
 from framework.registry import build
-from framework.settings import Settings, available_cores
+from framework.runtime.process_settings import Settings, available_cores
 from framework.training.augmentation import SMALLEST
 from framework.training.room_pictures import HEIGHT, WIDTH, RoomPictures, render_rooms
 from framework.training.trainer import Schedule, Trainer
+from framework.vocabulary.label_spaces import COCO, SCENENN_TO_COCO
 
 log = logging.getLogger(__name__)
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import platformdirs
 from omegaconf import DictConfig
 
-from framework.detection.device import torch_device
 from framework.detection.domain import RENDERED_ROOMS
 from framework.detection.room_words import Fact, load_room_words, save_room_words
-from framework.files.whole_files import written_whole
-from framework.settings import Settings, available_cores
+from framework.detection.runtimes.device import torch_device
+from framework.files.atomic_write import written_whole
+from framework.runtime.process_settings import Settings, available_cores
 from framework.training.room_crops import read_crops, render_crops
 from framework.training.word_trainer import WordSchedule, recall, train_words
 

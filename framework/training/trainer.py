@@ -17,11 +17,11 @@ import torch
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
+from framework.config.validation import require
 from framework.detection.mask_rcnn.network import MaskRCNN
-from framework.detection.masks import tight_boxes
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import DataError, in_one_line
-from framework.files.whole_files import written_whole
-from framework.parameters import require
+from framework.files.atomic_write import written_whole
 from framework.training.augmentation import augmented
 from framework.training.losses import Budget, Objects, losses
 from framework.training.room_pictures import Example, RoomPictures

@@ -18,11 +18,11 @@ from torch import Tensor
 from torch.nn import functional
 from tqdm import tqdm
 
-from framework.color_names import COLOR_NAMES
+from framework.config.validation import require
 from framework.detection.room_words import RoomWordsNetwork, as_pictures, bags_of
-from framework.label_spaces import COCO
-from framework.parameters import require
 from framework.training.room_crops import Crops
+from framework.vocabulary.color_names import COLOR_NAMES
+from framework.vocabulary.label_spaces import COCO
 
 CROP_BATCH = 256  # pictures that are evaluated at once
 BRIGHTNESS = 0.25  # by how much a picture may be brighter or darker, as a logarithm

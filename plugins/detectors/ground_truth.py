@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from framework.config.validation import require
 from framework.data import Detections, Frame
-from framework.detection.masks import tight_boxes
-from framework.detection.truth import true_instances
+from framework.detection.masks.binary_masks import tight_boxes
+from framework.detection.true_instances import true_instances
 from framework.interfaces import Detector
-from framework.label_spaces import COCO
-from framework.parameters import require
+from framework.vocabulary.label_spaces import COCO
 
 
 @dataclass

@@ -10,17 +10,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 from framework.data import Detections, Float32, Frame, Int32
-from framework.detection.boxes import to_original_image
-from framework.detection.device import torch_device
-from framework.detection.fusion import fuse_batch_norms
+from framework.detection.mask_rcnn.batch_norm_folding import fuse_batch_norms
 from framework.detection.mask_rcnn.checkpoint import domain_of_network, read_network
 from framework.detection.mask_rcnn.network import select
 from framework.detection.mask_rcnn.published_weights import find_network
-from framework.detection.masks import paste_masks, without_duplicates
+from framework.detection.masks.binary_masks import paste_masks, without_duplicates
+from framework.detection.masks.boxes import to_original_image
+from framework.detection.runtimes.device import torch_device
 from framework.errors import DataError
 from framework.interfaces import Detector
-from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 
 
 @dataclass

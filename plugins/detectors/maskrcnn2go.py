@@ -18,20 +18,26 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 from framework.data import Detections, Float32, Frame, Int32
-from framework.detection.boxes import anchor_grid, clip, decode, to_original_image
-from framework.detection.caffe2_network import Operator, dequantised, float_network, has_int8_kernels, int8_network
-from framework.detection.device import one_torch_thread, torch_device
-from framework.detection.fingerprint import fingerprint
 from framework.detection.mask_rcnn.roi_align import roi_align
-from framework.detection.masks import paste_masks, without_duplicates
-from framework.detection.nms import suppress_boxes
+from framework.detection.masks.binary_masks import paste_masks, without_duplicates
+from framework.detection.masks.boxes import anchor_grid, clip, decode, to_original_image
+from framework.detection.masks.nms import suppress_boxes
+from framework.detection.runtimes.caffe2_network import (
+    Operator,
+    dequantised,
+    float_network,
+    has_int8_kernels,
+    int8_network,
+)
+from framework.detection.runtimes.device import one_torch_thread, torch_device
+from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import DataError
+from framework.files.atomic_write import read_bytes
 from framework.files.search_paths import candidates
-from framework.files.whole_files import read_bytes
 from framework.interfaces import Detector
-from framework.label_spaces import COCO
-from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
+from framework.vocabulary.label_spaces import COCO
 
 LARGEST_FILE = 2**26  # bytes; the published ones have 3 MB
 SHA256 = {

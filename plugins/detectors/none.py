@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from framework.data import Detections, Frame
 from framework.interfaces import Detector
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 
 
 @dataclass

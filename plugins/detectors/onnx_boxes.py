@@ -6,15 +6,15 @@ import logging
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from framework.config.validation import MOST_DETECTIONS, check_count, require
 from framework.data import Bool, Detections, Frame
-from framework.detection.box_masks import masks_in_boxes
 from framework.detection.candidates import Layout, decode
-from framework.detection.image_network import ImageNetwork
-from framework.detection.letterbox import Placement
-from framework.detection.masks import without_duplicates
+from framework.detection.masks.binary_masks import without_duplicates
+from framework.detection.masks.letterbox import Placement
+from framework.detection.masks.masks_from_boxes import masks_in_boxes
+from framework.detection.runtimes.image_network import ImageNetwork
 from framework.interfaces import Detector
-from framework.label_spaces import read_labels, to_coco
-from framework.parameters import MOST_DETECTIONS, check_count, require
+from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 
@@ -27,7 +27,7 @@ class OnnxBoxes(Detector):
 
     The class distribution of a detection is its class scores, times the objectness, divided by their sum; its score is
     the largest of them before the division. A mask is what stands in front in the box and holds together there, see
-    `framework.detection.box_masks`; a box with too little depth for that is dropped, and counted in
+    `framework.detection.masks.masks_from_boxes`; a box with too little depth for that is dropped, and counted in
     `boxes_without_depth`. The network is the user's; the defaults are those of Megvii's YOLOX.
     """
 

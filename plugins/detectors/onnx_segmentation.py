@@ -6,16 +6,16 @@ import logging
 from dataclasses import dataclass
 from pathlib import Path
 
+from framework.config.validation import MOST_DETECTIONS, check_count, require
 from framework.data import Detections, Frame
-from framework.detection.image_network import ImageNetwork
-from framework.detection.letterbox import Placement
-from framework.detection.masks import without_duplicates
-from framework.detection.one_label import spread_rest
-from framework.detection.prototype_masks import masks_from_prototypes
+from framework.detection.class_distributions import spread_rest
+from framework.detection.masks.binary_masks import without_duplicates
+from framework.detection.masks.letterbox import Placement
+from framework.detection.masks.prototype_masks import masks_from_prototypes
+from framework.detection.runtimes.image_network import ImageNetwork
 from framework.detection.segmentation_output import BoxKind, recognise
 from framework.interfaces import Detector
-from framework.label_spaces import read_labels, to_coco
-from framework.parameters import MOST_DETECTIONS, check_count, require
+from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 

@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.config.validation import MOST_DETECTIONS, check_count, require
 from framework.data import Bool, Detections, Float32, Frame
-from framework.detection.box_masks import masks_in_boxes
-from framework.detection.box_prompted_masks import BoxPromptedMasks
-from framework.detection.device import torch_device
-from framework.detection.fingerprint import fingerprint
-from framework.detection.masks import without_duplicates
-from framework.detection.nms import suppress_boxes
-from framework.detection.word_boxes import WordBoxes
+from framework.detection.hub.box_prompted_masks import BoxPromptedMasks
+from framework.detection.hub.text_boxes import WordBoxes
+from framework.detection.masks.binary_masks import without_duplicates
+from framework.detection.masks.masks_from_boxes import masks_in_boxes
+from framework.detection.masks.nms import suppress_boxes
+from framework.detection.runtimes.device import torch_device
+from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
-from framework.parameters import MOST_DETECTIONS, check_count, require
 
 SOMETHING_ELSE = "something else"
 MOST_WORDS = 500

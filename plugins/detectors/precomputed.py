@@ -11,17 +11,17 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Bool, Detections, Float32, Frame
-from framework.detection.coco_results import CategoryIds, read_results
-from framework.detection.fingerprint import fingerprint
-from framework.detection.mask_folder import read_mask_folder
-from framework.detection.masks import tight_boxes
-from framework.detection.one_label import spread_rest
-from framework.detection.stored_detection import StoredDetection
+from framework.detection.class_distributions import spread_rest
+from framework.detection.masks.binary_masks import tight_boxes
+from framework.detection.stored.coco_results import CategoryIds, read_results
+from framework.detection.stored.fingerprint import fingerprint
+from framework.detection.stored.mask_folder import read_mask_folder
+from framework.detection.stored.stored_detection import StoredDetection
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
-from framework.label_spaces import read_labels, to_coco
-from framework.parameters import check_bounds
+from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 

@@ -10,13 +10,13 @@ import cv2
 import numpy as np
 from numba import njit
 
+from framework.config.validation import MOST_DETECTIONS, require
 from framework.data import Bool, Detections, Float32, Float64, Frame, Int32
-from framework.detection.ghost_places import ghost_places
-from framework.detection.masks import paste_masks, tight_boxes
-from framework.detection.truth import TrueInstances, true_instances
+from framework.detection.masks.binary_masks import paste_masks, tight_boxes
+from framework.detection.recurring_false_positives import ghost_places
+from framework.detection.true_instances import TrueInstances, true_instances
 from framework.interfaces import Detector
-from framework.label_spaces import COCO
-from framework.parameters import MOST_DETECTIONS, require
+from framework.vocabulary.label_spaces import COCO
 
 # fmt: off
 LOOKALIKES = (

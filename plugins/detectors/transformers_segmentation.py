@@ -13,16 +13,16 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, check_count, require
 from framework.data import Detections, Float32, Frame, UInt8
-from framework.detection.device import torch_device
-from framework.detection.fingerprint import fingerprint
-from framework.detection.hub_model import PREPROCESSING, find_model
-from framework.detection.masks import without_duplicates
+from framework.detection.hub.hub_model import PREPROCESSING, find_model
+from framework.detection.masks.binary_masks import without_duplicates
+from framework.detection.runtimes.device import torch_device
+from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import ConfigError, DataError, in_one_line
 from framework.files.json_file import read_json
 from framework.interfaces import Detector
-from framework.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
-from framework.parameters import LONGEST_SIDE, MOST_DETECTIONS, check_count, require
+from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what the files leave out by default
 RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers, as the files have them
@@ -71,8 +71,8 @@ class TransformersSegmentation(Detector):
 
     A model id that is not in the cache of huggingface_hub is downloaded into it; with HF_HUB_OFFLINE=1 it never is.
     Choose a checkpoint for instance or panoptic segmentation: one for semantic segmentation has one mask for all chairs
-    of an image. The classes are those COCO names that the model's labels mean (framework/label_spaces.yaml); what it
-    takes for a wall or another label without such a name is no detection.
+    of an image. The classes are those COCO names that the model's labels mean (framework/vocabulary/label_spaces.yaml);
+    what it takes for a wall or another label without such a name is no detection.
 
     A detection's class probabilities are the softmax over the labels' logits without the no-object one. For a head of
     softmaxes that is its distribution given that there is an object; for a head of independent sigmoids p_c it is their

@@ -6,14 +6,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Detections, Float32, Frame, UInt8
-from framework.detection.cache import FRAME_FIELDS, ReadsFields, identity_of
-from framework.detection.crops import square_crops
 from framework.detection.domain import RENDERED_ROOMS, domain_of
-from framework.detection.fingerprint import fingerprint
-from framework.detection.image_text import ROOM_WORDS_SUFFIX, open_image_text
+from framework.detection.embeddings.crops import square_crops
+from framework.detection.embeddings.image_text import ROOM_WORDS_SUFFIX, open_image_text
+from framework.detection.stored.cache import FRAME_FIELDS, ReadsFields, identity_of
+from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
-from framework.parameters import check_bounds
 
 
 @dataclass

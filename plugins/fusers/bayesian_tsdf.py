@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters, Pose
 from framework.interfaces import MapFuser, SceneMap
-from framework.mapping.association import Association
-from framework.mapping.evidence import Combine
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
-from framework.mapping.pixel_lists import list_points_by_pixel
-from framework.parameters import check_bounds
+from framework.mapping.instances.association import Association
+from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_rule import DetectionEvidence, LabeledVoxels, LabelRule, floored_log
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
 
 RULE = LabelRule(Combine.SUM, logarithmic=True)
 

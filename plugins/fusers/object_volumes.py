@@ -6,16 +6,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.baselines.object_map import ObjectMap
+from framework.config.validation import check_bounds
 from framework.data import Bool, Float64, Frame, Int32, PointClusters, Pose
 from framework.geometry import require_pixels_inside
 from framework.interfaces import MapFuser
-from framework.mapping.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
-from framework.mapping.instance_list import Confirmation
-from framework.mapping.instance_table import InstanceRecord
-from framework.mapping.pixel_lists import list_points_by_pixel
-from framework.mapping.tsdf import VoxelHashing
-from framework.parameters import check_bounds
-from framework.rivals.object_map import ObjectMap
+from framework.mapping.instances.association import Matches, OverlapRule, Overlaps, count_overlaps, observe, vote_stride
+from framework.mapping.instances.instance_list import Confirmation
+from framework.mapping.instances.instance_table import InstanceRecord
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
+from framework.mapping.voxels.tsdf import VoxelHashing
 
 
 def existence(record: InstanceRecord) -> float:
@@ -31,7 +31,7 @@ class ObjectVolumes(MapFuser):
 
     A detection belongs to the object that it overlaps most with, several may belong to one, and an object's masks of a
     frame are taken together. The defaults are Fusion++'s rule; MaskFusion's is `overlap_rule=CLUSTER overlap=0.05
-    same_class=true`. How the maps differ from the originals': framework/rivals/object_map.py.
+    same_class=true`. How the maps differ from the originals': framework/baselines/object_map.py.
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)

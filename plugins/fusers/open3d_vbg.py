@@ -7,17 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, Int32, PointClusters, Pose
 from framework.interfaces import MapFuser
-from framework.mapping.association import Association
-from framework.mapping.instance_list import Confirmation
-from framework.mapping.label_rule import floored_log
-from framework.mapping.pixel_lists import list_points_by_pixel
-from framework.mapping.tsdf import Tsdf
-from framework.parameters import check_bounds
+from framework.mapping.instances.association import Association
+from framework.mapping.instances.instance_list import Confirmation
+from framework.mapping.labels.label_rule import floored_log
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
+from framework.mapping.voxels.tsdf import Tsdf
 
 if TYPE_CHECKING:
-    from framework.rivals.open3d_map import Open3DMap
+    from framework.baselines.open3d_map import Open3DMap
 
 
 @dataclass
@@ -33,8 +33,8 @@ class Open3DVoxelBlockGrid(MapFuser):
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
 
     def __post_init__(self) -> None:
-        from framework.rivals.open3d_grid import BlockGridSettings
-        from framework.rivals.open3d_map import Open3DMap
+        from framework.baselines.open3d_grid import BlockGridSettings
+        from framework.baselines.open3d_map import Open3DMap
 
         check_bounds(self, class_floor=(1e-6, 0.999))
         settings = BlockGridSettings(

@@ -6,13 +6,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.baselines.class_evidence import mask_classes
+from framework.baselines.semantic_map import AREA, MISSED, SemanticMap
+from framework.config.validation import check_bounds
 from framework.data import Float64, Frame, PointClusters, Pose
 from framework.interfaces import MapFuser
-from framework.mapping.pixel_lists import list_points_by_pixel
-from framework.mapping.tsdf import VoxelHashing
-from framework.parameters import check_bounds
-from framework.rivals.class_evidence import mask_classes
-from framework.rivals.semantic_map import AREA, MISSED, SemanticMap
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
+from framework.mapping.voxels.tsdf import VoxelHashing
 
 
 @dataclass

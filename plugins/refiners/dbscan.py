@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
 from framework.refinement.density_clustering import in_densest_piece
 from framework.refinement.selection import keep_points
 

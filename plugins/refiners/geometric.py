@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
-from framework.refinement.convexity import Limits, segments
-from framework.refinement.segment_owners import owned_segments
+from framework.refinement.segmentation.convexity import Limits, segments
+from framework.refinement.segmentation.segment_owners import owned_segments
 
 
 @dataclass

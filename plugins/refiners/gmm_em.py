@@ -6,12 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
-from framework.refinement import mixture
-from framework.refinement.mask_evidence import mask_log_odds
-from framework.refinement.mixture_start import start_labels
+from framework.refinement.mixtures import mixture
+from framework.refinement.mixtures.initialization import start_labels
+from framework.refinement.mixtures.mask_evidence import mask_log_odds
 from framework.refinement.neighborhood import Ring, surroundings
 from framework.refinement.selection import keep_points
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
-from framework.refinement import mixture_tree
-from framework.refinement.mask_evidence import mask_log_odds
+from framework.refinement.mixtures import mixture_tree
+from framework.refinement.mixtures.mask_evidence import mask_log_odds
+from framework.refinement.mixtures.tree_evidence import claimed, object_shares
 from framework.refinement.neighborhood import Ring, surroundings
 from framework.refinement.selection import keep_points
-from framework.refinement.tree_evidence import claimed, object_shares
 
 
 @dataclass

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
-from framework.refinement import lloyd
-from framework.refinement.mixture_start import start_centers
+from framework.refinement.mixtures import lloyd_iterations
+from framework.refinement.mixtures.initialization import start_centers
 from framework.refinement.neighborhood import Ring, surroundings
 from framework.refinement.selection import keep_points
 
@@ -42,8 +42,8 @@ class KMeans(ClusterRefiner):
         around = surroundings(clusters, frame, self.ring)
         sample = around.sampled(self.ring.max_points)
         start = start_centers(sample, self.object_centers, self.background_centers)
-        _, centers = lloyd.cluster(sample.points_camera, sample.starts, start, self.max_iterations)
+        _, centers = lloyd_iterations.cluster(sample.points_camera, sample.starts, start, self.max_iterations)
         own, judged = around.own(), around.of_at_least(self.ring.min_points)
         ends = own.starts[:-1] + np.where(judged, own.mask_counts, 0)
-        labels = lloyd.nearest_centers(own.points_camera, own.starts[:-1], ends, centers)
+        labels = lloyd_iterations.nearest_centers(own.points_camera, own.starts[:-1], ends, centers)
         return keep_points(clusters, around.kept(labels < self.object_centers, judged))

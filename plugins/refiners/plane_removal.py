@@ -6,22 +6,22 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
-from framework.refinement.planes import Planes, find_planes, plane_image
+from framework.refinement.segmentation.plane_points import off_planes
+from framework.refinement.segmentation.planes import Planes, find_planes, plane_image
 from framework.refinement.selection import keep_points
-from framework.refinement.structure import off_planes
 
 
 @dataclass
 class PlaneRemoval(ClusterRefiner):
     """Drops the points that lie on the floor, a wall or another plane that bounds the scene.
 
-    Planes are found in the depth of the whole frame (see `framework.refinement.planes`); which way is down need not be
-    known. One counts as structure when it is large (`min_area`, `min_share`) and the frame shows nearly nothing behind
-    it (`max_behind`): below a table top, behind a screen there is a room, below a floor there is none. A cluster
-    loses such a plane only if it holds at most `max_own` of the plane's points in the frame: the top of a table that
+    Planes are found in the depth of the whole frame (see `framework.refinement.segmentation.planes`); the gravity
+    direction is not needed. One counts as structure when it is large (`min_area`, `min_share`) and the frame shows
+    nearly nothing behind it (`max_behind`): there is a room below a table top or behind a screen, but nothing below a
+    floor. A cluster loses such a plane only if it holds at most `max_own` of the plane's points in the frame: the top of a table that
     fills the image is the table's. A dropped point leaves the arrays, clusters keep their index. The refined clusters
     know the planes as `structure`, where a mask's border needs no further doubt.
     """

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Array, Camera, Float32, Float64, Frame, Pose, UInt8
 from framework.geometry import nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
-from framework.parameters import check_bounds
 
 if TYPE_CHECKING:
     import open3d as o3d

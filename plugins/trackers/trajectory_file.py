@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.config.validation import check_bounds
 from framework.data import Array, Float64, Frame, Pose
 from framework.errors import DataError, NoPoseError
 from framework.files.tum_trajectory import read_tum
 from framework.geometry import inverse
 from framework.interfaces import PoseTracker, SceneMap
-from framework.parameters import check_bounds
 
 
 class World(Enum):

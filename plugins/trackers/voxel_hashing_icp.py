@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from framework.config.validation import check_bounds, require
 from framework.data import Array, Float64, Frame, Pose
 from framework.errors import DataError
 from framework.geometry import exp_se3, inverse, nearest_rotation, rotation_angle
 from framework.interfaces import PoseTracker, SceneMap
-from framework.parameters import check_bounds, require
 from framework.tracking.absolute_pose import AbsolutePose
 from framework.tracking.alignment import NormalEquations, Weights, linearize, model_view, smoothed
 from framework.tracking.features import FrameFeatures

@@ -16,13 +16,13 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
+from framework.config.validation import check_bounds, require
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, in_one_line
 from framework.interfaces import SceneMap, Viewer
-from framework.parameters import check_bounds, require
-from framework.viewing.background import Background
-from framework.viewing.rerun_program import HERE, open_window
-from framework.viewing.sealed_page import SealedPage
+from framework.live_view.drawing_thread import Background
+from framework.live_view.rerun_program import HERE, open_window
+from framework.live_view.sealed_page import SealedPage
 
 log = logging.getLogger(__name__)
 
@@ -80,8 +80,8 @@ class RerunViewer(Viewer):
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
         import rerun as rr
 
-        from framework.viewing.rerun_drawing import RerunDrawing
-        from framework.viewing.rerun_layout import layout
+        from framework.live_view.rerun_drawing import RerunDrawing
+        from framework.live_view.rerun_layout import layout
 
         batches = rr.ChunkBatcherConfig(flush_tick=FLUSH_S)
         recording = rr.RecordingStream("instancemap", recording_id=uuid4(), batcher_config=batches)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from typing import Any
 
 from framework.data import Detections, Frame, Pose
-from framework.geometry import lift
 from framework.interfaces import MapFuser, PoseTracker
+from framework.refinement.lifting import lift
 
 RENDERING = "render for tracking"  # a part of track
 

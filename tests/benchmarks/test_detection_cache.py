@@ -11,9 +11,9 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from framework.data import Camera, Detections, Frame, FrameTruth
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.detection.cache import FRAME_FIELDS, CachedDetector, frame_hash, pack, unpack
-from framework.detection.masks import tight_boxes
-from framework.label_spaces import COCO
+from framework.detection.masks.binary_masks import tight_boxes
+from framework.detection.stored.cache import FRAME_FIELDS, CachedDetector, frame_hash, pack, unpack
+from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.maskrcnn2go import MaskRCNN2Go
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)

@@ -26,10 +26,10 @@ from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import save_network
 from framework.detection.mask_rcnn.resnet import ResNetShape
 from framework.errors import ConfigError, DataError
-from framework.label_spaces import COCO
 from framework.synthetic.sequence import Synthetic
-from tests import registered
+from framework.vocabulary.label_spaces import COCO
 from tests.benchmarks.comparison import Table
+from tests.support import registered
 
 THREADS = 2
 FRAMES = 8

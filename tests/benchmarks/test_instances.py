@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from framework.data import Frame, PointClusters, Pose
-from framework.label_spaces import COCO
-from framework.mapping.pixel_lists import list_points_by_pixel
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
+from framework.vocabulary.label_spaces import COCO
 from plugins.fusers.bayesian_tsdf import RULE, BayesianTsdf
 from tests.benchmarks.test_refiners import MASKS, ten_masks
 

@@ -14,9 +14,9 @@ import pytest
 
 from framework.data import Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
-from framework.geometry import lift
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.voxel_grid import BLOCK_SIDE, UNSEEN
+from framework.mapping.voxels.voxel_grid import BLOCK_SIDE, UNSEEN
+from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf

@@ -13,9 +13,9 @@ import pytest
 from sklearn.mixture import GaussianMixture
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
-from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
-from framework.refinement import mixture, mixture_tree
+from framework.refinement.lifting import lift
+from framework.refinement.mixtures import mixture, mixture_tree
 from framework.refinement.neighborhood import Ring, surroundings
 from plugins.refiners.chain import Chain
 from plugins.refiners.connected import Connected
@@ -28,7 +28,7 @@ from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
 from plugins.refiners.plane_removal import PlaneRemoval
 from plugins.refiners.rank_order import RankOrder
-from tests.tree_densities import leaves, log_likelihoods
+from tests.support.tree_densities import leaves, log_likelihoods
 
 MASKS = 10
 CAMERA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from framework.detection.image_text import ImageTextModel, open_image_text
-from framework.object_search import by_embedding, by_names
-from tests.word_rooms import Ask, AskedRoom, asked_room
+from framework.detection.embeddings.image_text import ImageTextModel, open_image_text
+from framework.queries.text_search import by_embedding, by_names
+from tests.support.word_rooms import Ask, AskedRoom, asked_room
 
 ROOMS = ("words0", "words1", "words2")
 WEIGHTS = Path(__file__).resolve().parents[2] / "plugins" / "detectors" / "room_words.safetensors"

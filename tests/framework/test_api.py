@@ -17,17 +17,17 @@ from hydra import compose, initialize_config_dir
 
 import instancemap
 from framework.api import Mapper, load_map
-from framework.configs import composed
+from framework.config.composition import composed
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
-from framework.geometry import lift
 from framework.interfaces import MapFuser
 from framework.pipeline import Pipeline
-from framework.records.metrics import room_metrics
+from framework.refinement.lifting import lift
 from framework.registry import build
-from tests import registered
-from tests.scenes.analytic_scene import Scene
-from tests.scenes.corner_room import CornerRoom, pose_at
+from framework.runs.metrics import room_metrics
+from tests.support import registered
+from tests.support.scenes.analytic_scene import Scene
+from tests.support.scenes.corner_room import CornerRoom, pose_at
 
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
 

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from framework.configs import one_line
+from framework.config.composition import one_line
 from framework.errors import ConfigError, DataError, FrameError, InstanceMapError, printable
 
 

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from framework import geometry
 from framework.data import Camera, Detections, Frame, Pose
 from framework.errors import DataError
-from tests.scenes.corner_room import CornerRoom, pose_at
+from tests.support.scenes.corner_room import CornerRoom, pose_at
 
 twists = arrays(np.float64, 6, elements=st.floats(-3, 3, width=32))
 CAMERA = Camera(64, 48, 50.0, 52.0, 30.5, 24.25)

@@ -16,7 +16,7 @@ import pytest
 
 from framework.__main__ import COMMANDS, leave_working_folder, main, module_of
 from framework.files.search_paths import CONF
-from framework.records.provenance import config_hash
+from framework.runs.provenance import config_hash
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
@@ -24,7 +24,7 @@ RECORD = {"config.yaml", "metrics.json", "instances.json", "mesh.ply", "trajecto
 
 
 def command(*arguments: str) -> list[str]:
-    fakes = ["--config-dir", str(CHECKOUT / "tests" / "fake_conf")]
+    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf")]
     return [sys.executable, "-m", "framework", *fakes, *FAKES, *arguments]
 
 

@@ -20,11 +20,11 @@ from tqdm import TMonitor
 from framework.data import Array, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, FrameError, MapFullError
 from framework.interfaces import SceneMap, Viewer
-from framework.journal import RunResult
 from framework.pipeline import Pipeline
 from framework.registry import assemble
+from framework.runtime.run_log import RunResult
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.scenes.corner_room import (
+from tests.support.scenes.corner_room import (
     CornerRoom,
     FaultyDetector,
     GivenPose,

@@ -15,12 +15,12 @@ import pytest
 from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
-from framework import configs
-from framework.configs import add_config_dir, config_directory
+from framework.config import composition
+from framework.config.composition import add_config_dir, config_directory
+from framework.config.validation import check_bounds
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker, RGBDSequence, RGBDVideo
-from framework.parameters import check_bounds
 from framework.registry import GROUPS, STAGES, assemble, build, find_class, parameter_fields
 
 CHECKOUT = Path(__file__).resolve().parents[2]
@@ -102,7 +102,7 @@ def register(monkeypatch: pytest.MonkeyPatch, folder: Path, stage: str, *targets
     (folder / stage).mkdir(exist_ok=True)
     for target in targets:
         (folder / stage / f"{target.replace('.', '_').lower()}.yaml").write_text(f"_target_: {target}\n")
-    monkeypatch.setattr(configs, "_added", [])
+    monkeypatch.setattr(composition, "_added", [])
     add_config_dir(folder)
 
 
@@ -237,7 +237,7 @@ def test_what_no_option_registers_is_not_imported(
     target: str, said: str, hydra_runs: bool, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The options are those of Hydra's search path, also where a stored config is read and no Hydra runs."""
-    monkeypatch.setattr(configs, "_added", [])
+    monkeypatch.setattr(composition, "_added", [])
     with config_directory() if hydra_runs else nullcontext():
         assert said in fault(_target_=target)
         assert build(Detector, OmegaConf.create({"_target_": "plugins.detectors.none.NoDetections"})).classes
@@ -270,7 +270,7 @@ def test_every_stage_has_its_interface() -> None:
 
 def test_a_video_of_the_wrong_kind_is_named() -> None:
     """`check` and `detect` want frames in any order; a run takes a live video as well."""
-    live = "tests.scenes.corner_room.LiveRoom"
+    live = "tests.support.scenes.corner_room.LiveRoom"
     assert find_class(RGBDVideo, live).__name__ == "LiveRoom"  # type: ignore[type-abstract]
     with pytest.raises(ConfigError, match=r"LiveRoom: here it must be of the kind RGBDSequence \(A recorded or"):
         find_class(RGBDSequence, live)  # type: ignore[type-abstract]

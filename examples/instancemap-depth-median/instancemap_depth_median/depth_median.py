@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.parameters import check_bounds
 from framework.refinement.selection import keep_points
 
 

@@ -24,10 +24,11 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Array, Camera
-from framework.datasets.color_registration import ColorRegistration, RegisteredImages
-from framework.datasets.labeled_mesh import LabeledMesh
-from framework.datasets.labeled_recording import LabeledRecording, mesh_of
-from framework.datasets.recording import FRAME_RATE, Contents, numbered_images
+from framework.datasets.calibration.color_registration import ColorRegistration, RegisteredImages
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, numbered_images
+from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
+from framework.datasets.ground_truth.labeled_recording import LabeledRecording, mesh_of
 from framework.datasets.scannet.scannet_annotation import (
     FIRST_LABEL_TABLE,
     LABEL_TABLE,
@@ -35,11 +36,10 @@ from framework.datasets.scannet.scannet_annotation import (
     read_labeled_mesh,
 )
 from framework.datasets.scannet.sens_file import SensFile, open_sens
-from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.errors import DataError, FrameError
+from framework.files.atomic_write import is_there
 from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import PrintedMatrix, read_matrix
-from framework.files.whole_files import is_there
 from framework.geometry import inverse, rotation_angle
 
 MESH, SEGMENTS, OBJECTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"

@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from framework.data import Int64
-from framework.datasets.camera_json import read_json_object
-from framework.datasets.labeled_mesh import LabeledMesh
+from framework.datasets.calibration.camera_json import read_json_object
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.errors import DataError
+from framework.files.atomic_write import read_text
 from framework.files.ply import read_ply
-from framework.files.whole_files import read_text
-from framework.label_spaces import MEANINGS
+from framework.vocabulary.label_spaces import MEANINGS
 
 LARGEST_FILE = 2**24  # bytes; the largest room's segments take 5 MB, and JSON takes up to 30 times as much memory
 MOST_OBJECT_ID = np.iinfo(np.int32).max - 2  # one is added, and one more id is given to what nobody labelled

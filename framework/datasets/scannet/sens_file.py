@@ -26,11 +26,11 @@ from typing import BinaryIO
 import numpy as np
 
 from framework.data import MOST_PIXELS, Camera, Float64, UInt8, UInt16
-from framework.datasets.reading import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
 from framework.errors import DataError, FrameError
+from framework.files.atomic_write import check_regular
 from framework.files.image_files import decode_color
 from framework.files.matrix_file import PrintedMatrix
-from framework.files.whole_files import check_regular
 
 VERSION = 4
 LONGEST_NAME = 1024  # bytes, of the sensor: "StructureSensor" has 15

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from framework.data import Camera
 from framework.errors import DataError
-from framework.files.whole_files import read_bytes, written_whole
+from framework.files.atomic_write import read_bytes, written_whole
 
 KEYS = ("fx", "fy", "cx", "cy")  # px
 SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px, whose middle is the centre where the file has none

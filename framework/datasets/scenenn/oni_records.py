@@ -16,7 +16,7 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 from framework.errors import DataError
-from framework.files.whole_files import check_regular
+from framework.files.atomic_write import check_regular
 
 FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), largest time, largest node
 FILE_MAGIC = b"NI10"

@@ -23,19 +23,19 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera
-from framework.datasets.labeled_mesh import LabeledMesh
-from framework.datasets.labeled_recording import LabeledRecording, mesh_of
-from framework.datasets.recording import FRAME_RATE, Contents, numbered_images
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, numbered_images
+from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
+from framework.datasets.ground_truth.labeled_recording import LabeledRecording, mesh_of
 from framework.datasets.scenenn.intrinsics import read_intrinsics
 from framework.datasets.scenenn.scenenn_annotation import Annotated, read_annotation
 from framework.datasets.scenenn.timestamps import read_timestamps
 from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
-from framework.datasets.stored_frames import ImageFiles, RecordedFrame
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError, FrameError
+from framework.files.atomic_write import is_there, read_text
 from framework.files.ply import read_ply
-from framework.files.whole_files import is_there, read_text
-from framework.label_spaces import SCENENN_TO_COCO
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 DEPTH_SCALE = 1000.0  # units a metre
 MOST_ID = np.iinfo(np.int32).max

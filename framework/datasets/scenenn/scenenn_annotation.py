@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Box, Float64
 from framework.errors import DataError
-from framework.files.whole_files import read_bytes, written_whole
+from framework.files.atomic_write import read_bytes, written_whole
 
 LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 9 s and 0.5 GB
 LARGEST_ID = int(np.iinfo(np.int32).max)  # what a label of the mesh can be

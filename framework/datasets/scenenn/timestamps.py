@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from framework.errors import DataError
+from framework.files.atomic_write import written_whole
 from framework.files.number_lines import SHOWN, read_lines
-from framework.files.whole_files import written_whole
 
 MICROSECONDS = 1e6  # a second
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
+from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 from framework.files.number_lines import number
-from framework.files.whole_files import MOST_TEXT, read_bytes, written_whole
 from framework.geometry import nearest_rigid
 
 LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well

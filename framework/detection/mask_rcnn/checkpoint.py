@@ -14,7 +14,7 @@ from framework.detection.mask_rcnn.network import MaskRCNN
 from framework.detection.mask_rcnn.network_file import describe_network, load_network
 from framework.detection.mask_rcnn.torchvision_checkpoint import from_torchvision, is_torchvision
 from framework.errors import DataError
-from framework.files.whole_files import check_regular
+from framework.files.atomic_write import check_regular
 
 
 class CheckpointKind(Enum):

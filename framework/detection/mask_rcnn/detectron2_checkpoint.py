@@ -21,8 +21,8 @@ from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import filled
 from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
 from framework.errors import DataError, in_one_line
-from framework.files.whole_files import check_regular
-from framework.label_spaces import COCO
+from framework.files.atomic_write import check_regular
+from framework.vocabulary.label_spaces import COCO
 
 PIXEL_MEAN = (123.675, 116.28, 103.53)  # RGB
 PIXEL_STD = (1.0, 1.0, 1.0)

@@ -4,7 +4,7 @@
 
 The network is described by an Architecture, which is stored with its weights; what a user may change between two
 runs (thresholds, the number of proposals) is given to `propose` and `detect`. Boxes are x1 y1 x2 y2 px of the network's
-input, by the newer convention (framework.detection.boxes, extent 0), and class 0 is the background.
+input, by the newer convention (framework.detection.masks.boxes, extent 0), and class 0 is the background.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from framework.data import Float32, Int32
-from framework.detection.boxes import anchor_grid, clip, decode
 from framework.detection.mask_rcnn.resnet import ResNet, ResNetShape
 from framework.detection.mask_rcnn.roi_align import roi_align
-from framework.detection.nms import suppress_boxes
+from framework.detection.masks.boxes import anchor_grid, clip, decode
+from framework.detection.masks.nms import suppress_boxes
 
 STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
 POOLED_LEVELS = 4  # P2 to P5; P6 only proposes

@@ -23,8 +23,8 @@ from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.errors import DataError, in_one_line
+from framework.files.atomic_write import written_whole
 from framework.files.json_file import parse_json
-from framework.files.whole_files import written_whole
 
 Fact = str | int | float | bool | None
 COUNTERS = ".num_batches_tracked"  # of the batch normalization; only a running training needs them

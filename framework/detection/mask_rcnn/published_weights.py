@@ -15,8 +15,8 @@ import platformdirs
 from tqdm import tqdm
 
 from framework.errors import DataError, in_one_line
+from framework.files.atomic_write import written_whole
 from framework.files.search_paths import candidates
-from framework.files.whole_files import written_whole
 
 OFFLINE = "INSTANCEMAP_OFFLINE"
 """An environment variable: set to anything, nothing is downloaded."""

@@ -12,7 +12,7 @@ from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
 from framework.detection.mask_rcnn.network_file import filled
 from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
 from framework.errors import DataError
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 
 COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
 """Categories that COCO numbers, up to 90, and never labelled."""

@@ -11,7 +11,7 @@ from framework.checking.matched_pairs import MatchedPair
 from framework.checking.pose_delay import LONGEST_DELAY, PoseDelay, delayed, find_delay
 from framework.checking.pose_fit import PoseFit, motion_of
 from framework.data import Camera, Float64, Frame
-from framework.datasets.reading import CameraAxes, PoseReading
+from framework.datasets.frames.conventions import CameraAxes, PoseReading
 from framework.geometry import exp_se3, inverse, project, transform
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)

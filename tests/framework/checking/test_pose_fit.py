@@ -13,7 +13,7 @@ from framework.checking.finding import Verdict
 from framework.checking.matched_pairs import MatchedPair
 from framework.checking.pose_fit import fit, judge, motion_of, readings
 from framework.data import Camera, Float64, Frame
-from framework.datasets.reading import CameraAxes, PoseKind, PoseReading
+from framework.datasets.frames.conventions import CameraAxes, PoseKind, PoseReading
 from framework.geometry import inverse, project, transform
 
 CAMERA = Camera(320, 240, 260.0, 260.0, 159.5, 119.5)

@@ -18,8 +18,8 @@ from scipy.spatial.transform import Rotation
 from framework.checking.finding import Finding, Verdict
 from framework.checking.recording_check import check, warn_of_poses
 from framework.data import Float64, Frame
-from framework.datasets.reading import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
-from framework.datasets.recording import Recording
+from framework.datasets.frames.conventions import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
+from framework.datasets.frames.sequence_reader import Recording
 from framework.datasets.replica_nice_slam import ReplicaNiceSlam
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.datasets.scannet.scannet import ScanNet
@@ -28,7 +28,7 @@ from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import DataError, FrameError
 from framework.geometry import inverse
 from framework.interfaces import RGBDSequence
-from tests.framework.checking.damaged import write_damaged
+from tests.support.recordings.damaged import write_damaged
 
 FARTHEST = 5.0  # m, that is mapped
 DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")

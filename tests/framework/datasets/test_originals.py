@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from framework.api import pipeline_of
-from framework.commands.convert_oni import convert
-from framework.configs import composed
+from framework.commands.recordings.convert_oni import convert
+from framework.config.composition import composed
 from framework.data import Camera
 from framework.datasets.scannet.scannet import ScanNet
 from framework.datasets.scannet.scannet_annotation import read_aggregation
@@ -23,14 +23,14 @@ from framework.datasets.seven_scenes import BASELINE, COLOR_CAMERA, SevenScenes,
 from framework.datasets.tum_rgbd import CAMERAS, Intrinsics, TumRgbd
 from framework.errors import DataError, FrameError
 from framework.interfaces import PoseTracker, RGBDSequence
-from framework.journal import RunResult
 from framework.pipeline import Pipeline
 from framework.registry import build
+from framework.runtime.run_log import RunResult
 from plugins.detectors.none import NoDetections
 from plugins.trackers.ground_truth import GroundTruth
 from plugins.trackers.trajectory_file import TrajectoryFile
 from tests.framework.datasets.scenenn.test_oni import played
-from tests.scenes.corner_room import GridFuser, KeepAll
+from tests.support.scenes.corner_room import GridFuser, KeepAll
 
 VGA = (480, 640)
 KINECT = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # OpenNI's
@@ -296,7 +296,7 @@ def test_frames_in_the_gap_of_motion_capture_are_skipped_whoever_gives_the_poses
         assert (result.frames, result.frames_skipped, result.frames_lost) == (len(times), 2, 0)
         assert [tracked.timestamp for tracked in result.tracked] == [time for time in times if time not in GAP]
         results[type(tracker)] = result
-    said = [record.message for record in caplog.records if record.name == "framework.journal"]
+    said = [record.message for record in caplog.records if record.name == "framework.runtime.run_log"]
     told = f"2 of {len(times)} frames skipped, as no pose is given for them; the first: frame {times.index(GAP[0])}"
     assert [message.startswith(told) for message in said] == [True, True]
     for ours, theirs in zip(results[GroundTruth].tracked, results[TrajectoryFile].tracked, strict=True):

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from framework.data import Camera
 from framework.datasets.replica_nice_slam import ReplicaNiceSlam
 from framework.errors import DataError
-from tests.recordings import fault_of, mapped, opened, write_color, write_depth
+from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 CAMERA = {"w": 24, "h": 16, "fx": 12.0, "fy": 12.0, "cx": 11.5, "cy": 7.5, "scale": 6553.5}
 SHAPE = (16, 24)

@@ -13,7 +13,7 @@ from framework.data import Camera
 from framework.datasets.seven_scenes import BASELINE, COLOR_CAMERA, DEPTH_CAMERA, SevenScenes, register
 from framework.errors import DataError
 from framework.geometry import back_project, inverse, project, transform
-from tests.recordings import fault_of, mapped, opened, write_color, write_depth
+from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 FRAMES = 3
 

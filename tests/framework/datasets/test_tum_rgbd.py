@@ -13,10 +13,10 @@ import pytest
 from scipy.spatial.transform import Rotation, Slerp
 
 from framework.data import Camera
+from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.tum_rgbd import CAMERAS, Intrinsics, TumRgbd, associate
-from framework.datasets.undistortion import Distortion
 from framework.errors import ConfigError, DataError
-from tests.recordings import fault_of, mapped, opened, write_color, write_depth
+from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 START = 1305031102.175304  # s
 DEPTH_DELAY = 0.0151  # s, of each depth image after its colour image

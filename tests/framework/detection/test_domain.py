@@ -11,16 +11,16 @@ from typing import Any
 import pytest
 
 from framework.api import Mapper
-from framework.commands.detect import write_detections
-from framework.commands.show_refinement import detected
+from framework.commands.running.detect import write_detections
+from framework.commands.running.show_refinement import detected
 from framework.datasets.scenenn.scenenn import MADE_BY, SceneNN
-from framework.detection.cache import CachedDetector
 from framework.detection.domain import RENDERED_ROOMS, domain_of
+from framework.detection.stored.cache import CachedDetector
 from framework.interfaces import Detector, RGBDSequence
 from framework.pipeline import Pipeline
 from framework.synthetic.sequence import Synthetic
-from tests import option_files, registered
-from tests.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
+from tests.support import option_files, registered
+from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
 SAID = "trained on rendered rooms alone"
 

@@ -11,7 +11,7 @@ from framework.detection.litert_network import LitertNetwork
 from framework.errors import ConfigError, DataError
 
 pytest.importorskip("ai_edge_litert")
-from tests.tiny_litert import Graph, constant_litert_network, doubling_litert_network
+from tests.support.networks.tiny_litert import Graph, constant_litert_network, doubling_litert_network
 
 IMAGE = np.random.default_rng(1).random((4, 6, 3)).astype(np.float32)
 

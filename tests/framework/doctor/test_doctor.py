@@ -15,10 +15,10 @@ import pytest
 import yaml
 from packaging.requirements import Requirement
 
+from framework.compilation.catalog import DEFAULT, listed
 from framework.detection.mask_rcnn.published_weights import PUBLISHED
 from framework.doctor import machine, networks, requirements, trial
-from framework.doctor.finding import Finding, State, anonymous, section
-from framework.kernels import DEFAULT, listed
+from framework.doctor.check_result import Finding, State, anonymous, section
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 LOOKS = (networks.shipped, networks.downloaded, networks.from_hugging_face)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, FrameTruth
-from framework.detection.masks import tight_boxes
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.evaluation.detection_faults import DetectionFaults, overlaps
 
 CLASSES = ("chair", "bed")

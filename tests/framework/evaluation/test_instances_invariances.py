@@ -19,7 +19,7 @@ from framework.evaluation.instances import (
     Transfer,
     evaluate,
 )
-from tests.slow_evaluation import slow_metrics
+from tests.support.slow_evaluation import slow_metrics
 
 MIN_POINTS = 12  # of a true instance: scenes are small
 CLASSES = ("chair", "bed", "couch")

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from framework.data import Detections
-from framework.detection.masks import tight_boxes
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.evaluation.mask_ap import mask_ap
 
 CLASSES = ("chair", "bed")

@@ -10,7 +10,7 @@ import pytest
 from framework.data import Camera, Detections, Frame, FrameTruth, PointClusters
 from framework.evaluation.refined_points import Refinement, true_fit
 from framework.interfaces import ClusterRefiner
-from tests.scenes.corner_room import CornerRoom, SphereDetector
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 SIZE = 10  # px
 

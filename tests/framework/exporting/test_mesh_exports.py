@@ -23,16 +23,16 @@ from framework.data import Box
 from framework.errors import DataError
 from framework.exporting.coloring import Coloring, linear
 from framework.exporting.decimation import decimated
-from framework.exporting.export import Chosen, Format, export
+from framework.exporting.exports import Chosen, Format, export
 from framework.exporting.glb import glb
 from framework.exporting.object_meshes import parts
-from framework.exporting.room import Room, facing, objects_of, read_room
 from framework.exporting.surface_points import surface_points
+from framework.exporting.upright_room import Room, facing, objects_of, read_room
 from framework.exporting.usd import Collision, convex_hull
-from framework.records.instances_file import StoredInstance
-from framework.records.mesh_file import read_mesh, write_mesh
 from framework.rendering.palette import instance_colors
-from tests.scenes.exported_room import Y_UP, ExportedRoom
+from framework.runs.instances_file import StoredInstance
+from framework.runs.mesh_file import read_mesh, write_mesh
+from tests.support.scenes.exported_room import Y_UP, ExportedRoom
 
 TURNED = ExportedRoom(R_world_room=Y_UP, shift=(0.5, -1.25, 2.0))
 TABLE_SIZE, CUBE_SIZE = (1.2, 0.8, 0.75), (0.2, 0.2, 0.2)

@@ -14,15 +14,15 @@ from PIL import Image
 
 from framework.errors import DataError
 from framework.exporting import occupancy, scene_graph
-from framework.exporting.export import Chosen, Format, export
+from framework.exporting.exports import Chosen, Format, export
 from framework.exporting.occupancy import Plan, looked_through, plan
 from framework.exporting.relations import relations
-from framework.exporting.room import Room, read_room
 from framework.exporting.rooms import rooms
 from framework.exporting.ros_map import FREE, OCCUPIED, UNKNOWN, levels
 from framework.exporting.surface_points import middles, surface_points
+from framework.exporting.upright_room import Room, read_room
 from framework.rendering.viewpoint import looking
-from tests.scenes.exported_room import CUBE, TABLE, Y_UP, Block, ExportedRoom
+from tests.support.scenes.exported_room import CUBE, TABLE, Y_UP, Block, ExportedRoom
 
 SCHEMA = json.loads((Path(scene_graph.__file__).parent / "scene_graph.schema.json").read_text())
 RESOLUTION = 0.1

@@ -14,16 +14,16 @@ import pytest
 from omegaconf import OmegaConf
 from PIL import Image
 
-from framework.commands import figures
-from framework.commands.sweep import sweep_in
+from framework.commands.results import figures
+from framework.commands.running.sweep import sweep_in
 from framework.errors import ConfigError, DataError, InstanceMapError
 from framework.figures import map_figure
 from framework.figures.experiment_figure import DRAWN, Pictured, write_figure
 from framework.figures.figure_choice import FigureChoice
 from framework.files.tum_trajectory import write_tum
-from framework.records.mesh_file import write_mesh
-from framework.records.provenance import config_hash
-from tests.scenes.boxes_room import furnished, walk
+from framework.runs.mesh_file import write_mesh
+from framework.runs.provenance import config_hash
+from tests.support.scenes.boxes_room import furnished, walk
 
 pytestmark = pytest.mark.usefixtures("fakes_registered")
 ROWS = {"part": ["dataset.stop=8"], "whole": []}
@@ -48,7 +48,7 @@ def run(root: Path, row: str, scene: str, frames: int = 20) -> Path:
     """The record of a run that found both boxes."""
     directory = root / f"dataset.scene={scene},row={row},seed=0"
     directory.mkdir(parents=True)
-    room = {"_target_": "tests.scenes.boxes_room.BoxesRoom", "scene": scene}
+    room = {"_target_": "tests.support.scenes.boxes_room.BoxesRoom", "scene": scene}
     config = {"row": row, "seed": 0, "dataset": room}
     (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
     mesh, poses = furnished(), walk()[:frames]

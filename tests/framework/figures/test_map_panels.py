@@ -12,9 +12,9 @@ import pytest
 from framework.data import Camera, SceneTruth
 from framework.figures.map_panels import Panel, PanelLine, Window, panel_line
 from framework.geometry import project
-from framework.records.stored_map import StoredMap
-from framework.records.stored_runs import Record
-from tests.scenes.boxes_room import BoxesRoom, furnished, walk
+from framework.runs.stored_map import StoredMap
+from framework.runs.stored_runs import Record
+from tests.support.scenes.boxes_room import BoxesRoom, furnished, walk
 
 SIZE = (160, 120)
 

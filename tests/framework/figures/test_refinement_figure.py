@@ -16,9 +16,10 @@ from framework.figures.cluster_image import _free_place, image_panel
 from framework.figures.cluster_marks import ClusterMarks
 from framework.figures.refinement_figure import refinement_picture, write_refinement
 from framework.figures.side_view import SideView, side_panel
-from framework.geometry import exp_se3, lift
+from framework.geometry import exp_se3
+from framework.refinement.lifting import lift
 from framework.refinement.selection import keep_points
-from tests.scenes.corner_room import CornerRoom, SphereDetector
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 Masks = list[np.ndarray]
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from framework.figures.stage_times import COLORS, SUM, MeanTimes, running_median, spread, stage_times_figure
-from framework.records.timings_file import StageTimes
+from framework.runs.timings_file import StageTimes
 
 STAGES = [stage for stage in COLORS if stage != SUM]
 

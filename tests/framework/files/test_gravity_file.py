@@ -12,7 +12,7 @@ from hypothesis import settings as examples
 from framework.data import UNIT_TOLERANCE
 from framework.errors import DataError
 from framework.files.gravity_file import read_gravity, write_gravity
-from tests.damaged_files import EXAMPLES, damaged
+from tests.support.recordings.damaged_files import EXAMPLES, damaged
 
 UPS = [np.array([0.0, -1.0, 0.0]), None, np.array([0.6, 0.0, -0.8])]
 CONTENT = b"# x y z\n0 -1 0\nnan nan nan\n0.6 0.0 -0.8\n"

@@ -12,7 +12,7 @@ import pytest
 from framework.data import Array, SceneTruth
 from framework.evaluation.instances import PredictedInstances
 from framework.files.hashing import add_array, add_values, path_hash
-from framework.records.metrics import evaluation_metrics
+from framework.runs.metrics import evaluation_metrics
 
 NUMBERS = np.arange(6, dtype=np.int16).reshape(2, 3)
 

@@ -14,7 +14,7 @@ from framework.errors import ConfigError, DataError, FrameError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
 from framework.importing.source import DeviceFrame, Source
-from tests.phone_exports import room_frames, write_scanner_app
+from tests.support.recordings.phone_exports import room_frames, write_scanner_app
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 

@@ -15,8 +15,8 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import DataError
 from framework.importing.folder_writer import Writing, write_folder
 from framework.importing.formats import open_source
-from tests.damaged_files import EXAMPLES, damaged
-from tests.phone_exports import (
+from tests.support.recordings.damaged_files import EXAMPLES, damaged
+from tests.support.recordings.phone_exports import (
     room_frames,
     write_polycam,
     write_r3d,

@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from framework.data import Float32, Float64, Int32
 from framework.errors import DataError
 from framework.mapping.gravity import Gravity, faces, floor_height, half_sphere
-from framework.mapping.instance_list import box_around, upright_box
-from framework.mapping.map_header import MapHeader
+from framework.mapping.instances.instance_list import box_around, upright_box
+from framework.mapping.storage.map_header import MapHeader
 
 
 def rectangle(origin: Float64, a: Float64, b: Float64, cells: int = 12) -> tuple[Float32, Int32]:

@@ -10,12 +10,12 @@ import pytest
 
 from framework.data import Detections, Frame, Pose
 from framework.errors import DataError
-from framework.geometry import lift
-from framework.mapping.instance_list import oriented_box
 from framework.mapping.instance_map import FORMAT, InstanceMap
+from framework.mapping.instances.instance_list import oriented_box
+from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.scenes.analytic_scene import Scene, room, walk
+from tests.support.scenes.analytic_scene import Scene, room, walk
 
 CLASSES = ("chair", "bed")
 

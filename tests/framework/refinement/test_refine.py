@@ -9,8 +9,8 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import DataError
-from framework.geometry import lift
 from framework.interfaces import ClusterRefiner
+from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
 CAMERA = Camera(5, 4, 4.0, 4.0, 2.0, 1.5)

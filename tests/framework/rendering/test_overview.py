@@ -15,7 +15,7 @@ from framework.rendering.ambient_occlusion import openness
 from framework.rendering.palette import instance_colors
 from framework.rendering.surface import FrontSides, Surface
 from framework.rendering.viewpoint import _visible, best_view, fitted, looking, upward
-from tests.scenes.boxes_room import Z_UP, furnished, walk
+from tests.support.scenes.boxes_room import Z_UP, furnished, walk
 
 RNG = np.random.default_rng(0)
 Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from framework.data import Box
-from framework.records.timings_file import StageTimes
 from framework.reporting.time_charts import growth, stage_areas, stage_rows
 from framework.reporting.trajectory_chart import (
     HEIGHT,
@@ -20,6 +19,7 @@ from framework.reporting.trajectory_chart import (
     error_over_time,
     top_view,
 )
+from framework.runs.timings_file import StageTimes
 
 UP = np.array([0.0, 0.0, 1.0])
 

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from framework import configs
-from framework.commands.report import write_reports
-from tests.reported_run import FAKES, rename_class, write_run
+from framework.commands.results.report import write_reports
+from framework.config import composition
+from tests.support.reported_run import FAKES, rename_class, write_run
 
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
@@ -48,7 +48,7 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     second = Path(shutil.copytree(first, folder / "second"))
     rename_class(second, HOSTILE)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(configs, "_added", [FAKES])
+        patched.setattr(composition, "_added", [FAKES])
         return write_reports([first, second])
 
 

@@ -8,7 +8,6 @@ from itertools import combinations, pairwise
 import numpy as np
 import pytest
 
-from framework.label_spaces import SCENENN_TO_COCO
 from framework.synthetic.benchmark import SCENES, SceneSpec, furnish_scene, plan_scene
 from framework.synthetic.furniture.cluttered_groups import (
     TOUCHING,
@@ -25,6 +24,7 @@ from framework.synthetic.furniture.small_things import ON_FLOORS, book_row, some
 from framework.synthetic.layout import WALK_RADIUS, arrange
 from framework.synthetic.strewing import CONTACT, strew
 from framework.synthetic.textures import Texture
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 SEEDS = range(3)
 ROOMS = [

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.sensor_noise import axial_sigma_at_angle
+from framework.sensors.noise_models import axial_sigma_at_angle
 from framework.synthetic.depth_camera import (
     PATCH,
     DepthSensor,

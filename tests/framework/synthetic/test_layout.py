@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from framework.synthetic.room import RoomKind, furnish
-from tests.scenes.labeled_furniture import LABELED
+from tests.support.scenes.labeled_furniture import LABELED
 
 
 @pytest.mark.parametrize(("kind", "seed"), [(RoomKind.STUDIO, 0), (RoomKind.STUDIO, 1), *((k, 2) for k in RoomKind)])

@@ -16,7 +16,6 @@ from framework.errors import ConfigError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.ply import PlyMesh, read_ply
 from framework.geometry import inverse
-from framework.label_spaces import SCENENN_TO_COCO, SPACES
 from framework.rendering.rasterizer import NO_TRIANGLE
 from framework.synthetic import scenenn_scene
 from framework.synthetic.benchmark import SceneSpec
@@ -33,6 +32,7 @@ from framework.synthetic.scenenn_scene import (
     frame_files,
     trajectory_file,
 )
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO, SPACES
 
 SPEC = SceneSpec("bathroom", (toilet_group, lambda rng: chair_row(rng, 2)), {"toilet": 1, "chair": 2})
 RECORDING = Recording(seed=3, frames=9, width=160)

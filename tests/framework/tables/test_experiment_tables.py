@@ -13,7 +13,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from framework.errors import DataError
-from framework.records.provenance import config_hash
+from framework.runs.provenance import config_hash
 from framework.synthetic.scenenn_scene import Recording
 from framework.tables.experiment_tables import write_tables
 from framework.tables.layouts import head

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from framework.errors import ConfigError
-from framework.label_spaces import SCENENN_TO_COCO
 from framework.tables.published import read_published
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 SEQUENCES = ("011", "016", "030", "061", "078", "086", "096", "206", "223", "255")
 

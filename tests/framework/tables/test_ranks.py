@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 from scipy.stats import spearmanr
 
 from framework.errors import DataError
-from framework.records.provenance import config_hash
+from framework.runs.provenance import config_hash
 from framework.tables.comparison import Comparison
 from framework.tables.ranks import Agreement, Ranking, ranks, spearman, write_ranks
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from omegaconf import OmegaConf
 
-from framework.records.provenance import config_hash
+from framework.runs.provenance import config_hash
 from framework.tables.experiment_tables import write_tables
 
 AP50 = "instances.ap50"

@@ -11,7 +11,7 @@ from framework.geometry import exp_se3, inverse
 from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize, smoothed
 from framework.tracking.pyramid import build_pyramid, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
-from tests.scenes.analytic_scene import CAMERA, Scene, pose
+from tests.support.scenes.analytic_scene import CAMERA, Scene, pose
 
 WALL = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
 COLOR = Weights(*map(np.float32, (0.1, 0.05, 0.7, 4.0, 4.0, 0.05, 1.0, 0.0)))

@@ -8,9 +8,9 @@ import cv2
 import numpy as np
 import pytest
 
-from framework.label_spaces import SCENENN_TO_COCO
 from framework.training import room_pictures
 from framework.training.room_pictures import RoomPictures, pictures, render_room, room_folder
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
 
 @pytest.fixture(scope="module")

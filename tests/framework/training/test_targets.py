@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from framework.detection.boxes import decode
+from framework.detection.masks.boxes import decode
 from framework.training.targets import BACKGROUND, IGNORED, box_iou, encode, mask_targets, match, sample
 
 

@@ -15,7 +15,7 @@ from framework.errors import ConfigError, DataError
 from framework.training.losses import Budget
 from framework.training.room_pictures import RoomPictures
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY, Schedule, Trainer
-from tests.tiny_rooms import write_room
+from tests.support.tiny_rooms import write_room
 
 TINY = Architecture(
     classes=("chair", "bed"),

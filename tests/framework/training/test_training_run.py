@@ -14,7 +14,7 @@ from framework.errors import ConfigError
 from framework.files.search_paths import CONF
 from framework.training.train import HELD_OUT, NETWORK, PRECISION, architecture, train
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY
-from tests.tiny_rooms import PICTURES, write_room
+from tests.support.tiny_rooms import PICTURES, write_room
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 ROOMS = CHECKOUT / "plugins" / "detectors" / "mask_rcnn_rooms.safetensors"

@@ -13,7 +13,6 @@ import torch
 from hydra import compose, initialize_config_dir
 from omegaconf import DictConfig
 
-from framework.color_names import COLOR_NAMES, nearest_names
 from framework.detection.room_words import (
     SIDE,
     RoomWords,
@@ -24,10 +23,11 @@ from framework.detection.room_words import (
 )
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import CONF
-from framework.label_spaces import COCO
 from framework.training.room_crops import Crops, crops_file, read_crops, room_crops
 from framework.training.train_words import HELD_OUT, NETWORK, RECALL, train
 from framework.training.word_trainer import WordSchedule, captions, contrast, recall, train_words
+from framework.vocabulary.color_names import COLOR_NAMES, nearest_names
+from framework.vocabulary.label_spaces import COCO
 
 CPU = torch.device("cpu")
 PAINTS = {"red": (200, 30, 35), "blue": (40, 80, 190), "green": (50, 140, 60)}

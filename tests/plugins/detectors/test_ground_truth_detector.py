@@ -3,7 +3,7 @@ import pytest
 
 from framework.data import Camera, Frame, FrameTruth
 from framework.errors import ConfigError, DataError
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.none import NoDetections
 

@@ -10,10 +10,10 @@ import torch
 from framework.data import Camera, Frame
 from framework.detection.mask_rcnn import network as steps
 from framework.detection.mask_rcnn.network_file import save_network
-from framework.detection.masks import mask_overlaps, tight_boxes
+from framework.detection.masks.binary_masks import mask_overlaps, tight_boxes
 from framework.errors import ConfigError, DataError
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
-from tests.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
+from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
 
 
 def picture(color):

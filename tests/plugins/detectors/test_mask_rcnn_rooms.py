@@ -10,11 +10,11 @@ import pytest
 from framework.data import Camera, Frame
 from framework.detection.mask_rcnn.network_file import describe_network
 from framework.evaluation.mask_ap import mask_ap
-from framework.label_spaces import SCENENN_TO_COCO
 from framework.training.augmentation import SMALLEST
 from framework.training.room_pictures import RoomPictures, render_rooms
+from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
-from tests import registered
+from tests.support import registered
 
 ROOMS = 2_000_000  # neither trained on nor held out in training
 MOST_BYTES = 20 << 20

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 from framework.data import Camera, Frame
-from framework.detection.caffe2_network import float_network, has_int8_kernels
-from framework.detection.masks import mask_overlaps, tight_boxes
+from framework.detection.masks.binary_masks import mask_overlaps, tight_boxes
+from framework.detection.runtimes.caffe2_network import float_network, has_int8_kernels
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import PROJECT_ROOT
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 from plugins.detectors import maskrcnn2go
 from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go, _read_network
 

@@ -9,13 +9,13 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.detection.candidates import Layout
-from framework.detection.letterbox import Placement
-from framework.detection.masks import tight_boxes
+from framework.detection.masks.binary_masks import tight_boxes
+from framework.detection.masks.letterbox import Placement
 from framework.errors import ConfigError, DataError
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.onnx_boxes import OnnxBoxes
-from tests import registered
-from tests.tiny_networks import constant_network
+from tests.support import registered
+from tests.support.networks.tiny_networks import constant_network
 
 WEIGHTS = Path("weights") / "yolox_nano" / "yolox_nano.onnx"
 

@@ -5,13 +5,13 @@ import numpy as np
 import onnx
 import pytest
 
-from framework.contracts.detector import DetectorContract
 from framework.data import Camera, Frame
-from framework.detection.masks import tight_boxes
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import ConfigError, DataError
+from framework.testing.detector import DetectorContract
 from plugins.detectors.onnx_segmentation import OnnxSegmentation
-from tests.rewritten_exports import LAYOUTS, rewritten
-from tests.tiny_networks import constant_network
+from tests.support.networks.tiny_networks import constant_network
+from tests.support.recordings.rewritten_exports import LAYOUTS, rewritten
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 V, U = np.indices((120, 160))
@@ -75,7 +75,7 @@ def check_cup_and_chair(found):
 def test_a_tflite_file_as_tensorflow_writes_it(tmp_path):
     """Channels last, and boxes in 0..1."""
     pytest.importorskip("ai_edge_litert")
-    from tests.tiny_litert import constant_litert_network
+    from tests.support.networks.tiny_litert import constant_litert_network
 
     table, prototypes = outputs().values()
     table[:, :4] /= SIZE

@@ -12,13 +12,13 @@ import pytest
 import torch
 
 from framework.data import Camera, Frame
-from framework.detection.box_prompted_masks import BoxPromptedMasks
-from framework.detection.word_boxes import WordBoxes
+from framework.detection.hub.box_prompted_masks import BoxPromptedMasks
+from framework.detection.hub.text_boxes import WordBoxes
 from framework.errors import ConfigError, DataError
 from plugins.detectors.open_vocabulary import SOMETHING_ELSE, OpenVocabulary, word_distributions
-from tests import registered
-from tests.tiny_image_text import write_image_text
-from tests.tiny_open_vocabulary import SIDE, write_owlv2, write_sam
+from tests.support import registered
+from tests.support.networks.tiny_image_text import write_image_text
+from tests.support.networks.tiny_open_vocabulary import SIDE, write_owlv2, write_sam
 
 pytest.importorskip("transformers")
 CPU = torch.device("cpu")

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from pycocotools import mask as coco
 
-from framework.commands.detect import write_detections, write_labels
+from framework.commands.running.detect import write_detections, write_labels
 from framework.data import Camera, Detections, Frame
-from framework.detection.coco_results import CategoryIds
+from framework.detection.stored.coco_results import CategoryIds
 from framework.errors import ConfigError, DataError, FrameError
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.precomputed import Precomputed
 from plugins.detectors.simulated import SimulatedDetector
-from tests.scenes.corner_room import CornerRoom, SphereDetector
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 CAMERA = Camera(8, 6, 10.0, 10.0, 3.5, 2.5)
 MASK = np.zeros(CAMERA.shape, np.bool_)
@@ -142,7 +142,7 @@ def test_the_best_come_first_and_the_weak_are_dropped(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.boxes[:, 2] - found.boxes[:, 0], 1)
 
 
-# What framework.commands.detect writes
+# What framework.commands.running.detect writes
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from framework.data import Camera, Frame
 from framework.errors import DataError
 from plugins.detectors.precomputed import Precomputed
-from tests.damaged_files import EXAMPLES, changed_json, check, damaged
+from tests.support.recordings.damaged_files import EXAMPLES, changed_json, check, damaged
 
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
 FRAME = Frame(0, 0.0, np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32), CAMERA)

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from framework.api import query as query_run
-from framework.color_names import COLOR_NAMES
-from framework.commands.query import main
-from framework.detection.image_text import open_image_text
+from framework.commands.results.query import main
+from framework.detection.embeddings.image_text import open_image_text
 from framework.files.search_paths import PROJECT_ROOT
-from framework.object_search import by_embedding
-from tests.word_rooms import AskedRoom, asked_room
+from framework.queries.text_search import by_embedding
+from framework.vocabulary.color_names import COLOR_NAMES
+from tests.support.word_rooms import AskedRoom, asked_room
 
 WEIGHTS = PROJECT_ROOT / "plugins" / "detectors" / "room_words.safetensors"
 SMALL = ("dataset.width=320", "dataset.height=240", "fuser.voxel_size=0.03", "detector.min_pixels=100")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame, FrameTruth
-from framework.detection.masks import tight_boxes
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.errors import ConfigError, DataError
-from framework.label_spaces import COCO
+from framework.vocabulary.label_spaces import COCO
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.detectors.simulated import (
     LOOKALIKES,

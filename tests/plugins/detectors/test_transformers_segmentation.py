@@ -10,11 +10,12 @@ import pytest
 import torch
 from torch.nn import functional
 
-# a detector that any config registers keeps these; here they run on the networks below
-from framework.contracts.detector import DetectorContract
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError
-from framework.label_spaces import COCO, COCO_BY_ID
+
+# a detector that any config registers keeps these; here they run on the networks below
+from framework.testing.detector import DetectorContract
+from framework.vocabulary.label_spaces import COCO, COCO_BY_ID
 from plugins.detectors.transformers_segmentation import (
     FAMILIES,
     Checkpoint,
@@ -23,7 +24,7 @@ from plugins.detectors.transformers_segmentation import (
     class_distributions,
     resample_masks,
 )
-from tests.tiny_transformers import FIXED, LABELS, MODELS, write_network
+from tests.support.networks.tiny_transformers import FIXED, LABELS, MODELS, write_network
 
 transformers = pytest.importorskip("transformers")
 

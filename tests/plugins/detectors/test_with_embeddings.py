@@ -10,15 +10,15 @@ import pytest
 import torch
 
 from framework.data import Camera, Detections, Frame
-from framework.detection.cache import identity_of
-from framework.detection.crops import square_crops
-from framework.detection.hub_image_text import HubImageText
+from framework.detection.embeddings.crops import square_crops
+from framework.detection.embeddings.hub_image_text import HubImageText
+from framework.detection.stored.cache import identity_of
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
 from plugins.detectors.with_embeddings import WithEmbeddings
-from tests import registered
-from tests.scenes.corner_room import CornerRoom, SphereDetector
-from tests.tiny_image_text import SIDE, write_image_text
+from tests.support import registered
+from tests.support.networks.tiny_image_text import SIDE, write_image_text
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 transformers = pytest.importorskip("transformers")
 CPU = torch.device("cpu")
@@ -177,7 +177,7 @@ def test_damaged_models_are_refused_in_one_line(change: str, fault: str, tmp_pat
 
 
 def test_a_model_that_is_none_of_both_is_refused(tmp_path: Path) -> None:
-    from tests.tiny_transformers import write_network
+    from tests.support.networks.tiny_transformers import write_network
 
     with pytest.raises(ConfigError, match=r"must be a CLIP or a SigLIP of a fixed size, found .*, a mask2former"):
         WithEmbeddings(Blocks(), str(write_network(tmp_path, "mask2former")), device="cpu")

@@ -9,15 +9,15 @@ import pytest
 
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
-from framework.geometry import lift
 from framework.interfaces import MapFuser
-from framework.mapping.association import OverlapRule
-from framework.mapping.label_rule import floored_log
+from framework.mapping.instances.association import OverlapRule
+from framework.mapping.labels.label_rule import floored_log
+from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
-from tests.scenes.analytic_scene import CAMERA, Scene, room, walk
-from tests.true_masks import fuse_masks, masks_of
+from tests.support.scenes.analytic_scene import CAMERA, Scene, room, walk
+from tests.support.true_masks import fuse_masks, masks_of
 
 NewFuser = Callable[..., MapFuser]
 

@@ -9,9 +9,9 @@ from framework.data import Frame
 from framework.errors import ConfigError, MapFullError
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from tests.scenes.analytic_scene import room, walk
-from tests.thread_counts import by_one_thread_and_two
-from tests.true_masks import fuse_masks, masks_of
+from tests.support.scenes.analytic_scene import room, walk
+from tests.support.thread_counts import by_one_thread_and_two
+from tests.support.true_masks import fuse_masks, masks_of
 
 
 def new_fuser(**parameters: object) -> BayesianTsdf:

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Pose
-from framework.geometry import lift
 from framework.interfaces import MapFuser
+from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.label_count import LabelCount
 from plugins.fusers.last_write import LastWrite
 from plugins.fusers.max_confidence import MaxConfidence
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
-from tests.scenes.analytic_scene import CAMERA, room, walk
+from tests.support.scenes.analytic_scene import CAMERA, room, walk
 
 SEEN = [(0.5, [0.6, 0.3, 0.1]), (0.9, [0.2, 0.1, 0.7]), (0.4, [0.6, 0.4, 0.0])]
 """Score and distribution over three classes, frame by frame."""

@@ -10,12 +10,12 @@ import pytest
 
 from framework.data import Frame, PointClusters, Pose
 from framework.errors import ConfigError, DataError, MapFullError
-from framework.geometry import lift
-from framework.mapping.association import OverlapRule
+from framework.mapping.instances.association import OverlapRule
+from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.object_volumes import ObjectVolumes, existence
-from tests.scenes.box_scene import CAMERA, BoxScene, bled, detected, look_from
-from tests.thread_counts import by_one_thread_and_two
+from tests.support.scenes.box_scene import CAMERA, BoxScene, bled, detected, look_from
+from tests.support.thread_counts import by_one_thread_and_two
 
 BOXES = BoxScene([[(-0.8, 0.2, 0.0, -0.2, 0.8, 0.6)], [(0.3, 0.2, 0.0, 0.9, 0.8, 0.6)]])
 VOXEL = 0.04  # m

@@ -6,16 +6,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from framework.baselines.open3d_grid import BlockGridSettings
+from framework.baselines.open3d_map import Open3DMap
 from framework.data import Camera, Frame
 from framework.errors import ConfigError, DataError, MapFullError
-from framework.mapping.instance_list import Confirmation
+from framework.mapping.instances.instance_list import Confirmation
 from framework.registry import assemble
-from framework.rivals.open3d_grid import BlockGridSettings
-from framework.rivals.open3d_map import Open3DMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
-from tests.scenes.analytic_scene import CAMERA, Scene, pose, room, walk
-from tests.true_masks import CLASSES, fuse_masks, masks_of
+from tests.support.scenes.analytic_scene import CAMERA, Scene, pose, room, walk
+from tests.support.true_masks import CLASSES, fuse_masks, masks_of
 
 SETTINGS = BlockGridSettings(
     voxel_size=0.02,
@@ -274,7 +274,7 @@ def test_an_instance_that_is_small_does_not_count(frames: list[Frame]) -> None:
 def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
     maps = []
     for first in (16, 5000):
-        monkeypatch.setattr("framework.rivals.open3d_grid.FIRST_BLOCKS", first)
+        monkeypatch.setattr("framework.baselines.open3d_grid.FIRST_BLOCKS", first)
         fuser = new_fuser()
         for frame in frames[:3]:
             fuse_masks(fuser, frame, masks_of(frame), [0.9, 0.8, 0.7])
@@ -286,7 +286,7 @@ def test_room_is_made_and_nothing_is_lost_by_it(frames: list[Frame], monkeypatch
 
 
 def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("framework.rivals.open3d_grid.FIRST_BLOCKS", 16)
+    monkeypatch.setattr("framework.baselines.open3d_grid.FIRST_BLOCKS", 16)
     first = new_fuser()
     fuse_masks(first, frames[0], [], [])
     budget = first.scene.grid.block_count

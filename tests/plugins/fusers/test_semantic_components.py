@@ -8,18 +8,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from framework.baselines.semantic_map import SemanticMap
 from framework.data import Detections, Frame, Pose
 from framework.errors import ConfigError, DataError
-from framework.geometry import lift
+from framework.refinement.lifting import lift
 from framework.registry import assemble
-from framework.rivals.semantic_map import SemanticMap
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.fusers.semantic_components import SemanticComponents
-from tests.scenes import box_scene
-from tests.scenes.analytic_scene import CAMERA, room, walk
-from tests.scenes.box_scene import BoxScene, look_from
-from tests.thread_counts import by_one_thread_and_two
-from tests.true_masks import CLASSES, PROBABILITIES, fuse_masks, masks_of
+from tests.support.scenes import box_scene
+from tests.support.scenes.analytic_scene import CAMERA, room, walk
+from tests.support.scenes.box_scene import BoxScene, look_from
+from tests.support.thread_counts import by_one_thread_and_two
+from tests.support.true_masks import CLASSES, PROBABILITIES, fuse_masks, masks_of
 
 VIEWS = [look_from(x, -1.5, 1.6, (0.0, 1.0, 0.3)) for x in (-1.0, -0.3, 0.4, 1.1)]
 LEFT, RIGHT = (-0.6, 0.8, 0.0, -0.1, 1.2, 0.5), (0.2, 0.8, 0.0, 0.7, 1.2, 0.5)

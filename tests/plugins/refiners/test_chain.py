@@ -15,7 +15,7 @@ from plugins.refiners.gmm_em import GmmEm
 from plugins.refiners.kmeans import KMeans
 from plugins.refiners.largest_component import LargestComponent
 from plugins.refiners.plane_removal import PlaneRemoval
-from tests import registered
+from tests.support import registered
 
 
 class Halving(LargestComponent):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from framework.data import Bool, Camera, Detections, Float32, Frame, PointClusters, Pose
-from framework.geometry import lift
+from framework.refinement.lifting import lift
 from plugins.refiners.connected import Connected
 from plugins.refiners.largest_component import LargestComponent
 

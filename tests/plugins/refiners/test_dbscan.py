@@ -12,7 +12,7 @@ from sklearn.cluster import DBSCAN
 from framework.data import Camera, Frame, PointClusters
 from framework.errors import ConfigError
 from plugins.refiners.dbscan import Dbscan
-from tests.thread_counts import by_one_thread_and_two
+from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(90, 60, 50.0, 50.0, 44.5, 29.5)
 FRAME = Frame(0, 0.0, np.zeros((60, 90, 3), np.uint8), np.full((60, 90), 2.0, np.float32), CAMERA)

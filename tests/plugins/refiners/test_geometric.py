@@ -7,9 +7,10 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
-from framework.geometry import exp_se3, lift
+from framework.geometry import exp_se3
+from framework.refinement.lifting import lift
 from plugins.refiners.geometric import Geometric
-from tests.thread_counts import by_one_thread_and_two
+from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 180.0, 180.0, 159.5, 119.5)
 POSE = Pose(exp_se3(np.array([0.3, -0.2, 1.0, 0.2, -0.4, 0.1])))

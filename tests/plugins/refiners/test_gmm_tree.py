@@ -7,10 +7,11 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
-from framework.geometry import exp_se3, lift
+from framework.geometry import exp_se3
+from framework.refinement.lifting import lift
 from plugins.refiners.gmm_tree import GmmTree
 from plugins.refiners.identity import Identity
-from tests.thread_counts import by_one_thread_and_two
+from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 

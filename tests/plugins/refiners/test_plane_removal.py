@@ -10,7 +10,8 @@ import pytest
 
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
-from framework.geometry import exp_se3, lift
+from framework.geometry import exp_se3
+from framework.refinement.lifting import lift
 from plugins.refiners.plane_removal import PlaneRemoval
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)

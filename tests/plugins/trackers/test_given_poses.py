@@ -13,11 +13,11 @@ from framework.errors import DataError
 from framework.files.tum_trajectory import write_tum
 from framework.interfaces import PoseTracker
 from framework.pipeline import Pipeline
-from framework.records.metrics import run_metrics, trajectory_metrics
+from framework.runs.metrics import run_metrics, trajectory_metrics
 from plugins.detectors.none import NoDetections
 from plugins.trackers.ground_truth import GroundTruth
 from plugins.trackers.trajectory_file import TrajectoryFile
-from tests.scenes.corner_room import CornerRoom, GridFuser, KeepAll, pose_at
+from tests.support.scenes.corner_room import CornerRoom, GridFuser, KeepAll, pose_at
 
 GAP = (0, 3, 4)
 FRAMES = 9

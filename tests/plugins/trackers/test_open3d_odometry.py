@@ -13,9 +13,9 @@ from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.open3d_odometry import Method, Open3dOdometry, Reference
-from tests import registered
-from tests.scenes.analytic_scene import NOTHING, walk
-from tests.scenes.papered_room import CAMERA, papered_frame
+from tests.support import registered
+from tests.support.scenes.analytic_scene import NOTHING, walk
+from tests.support.scenes.papered_room import CAMERA, papered_frame
 
 LOOKING_INTO_A_CORNER = exp_se3(np.array([0, 0, 0, 0.5, 0.6, 0]))
 BEST = [

@@ -14,8 +14,8 @@ from framework.errors import ConfigError
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import exp_se3, inverse, rotation_angle
 from plugins.trackers.pycolmap_pnp import PycolmapPnp
-from tests.scenes.corner_room import GridMap
-from tests.scenes.papered_room import CAMERA, papered_frame
+from tests.support.scenes.corner_room import GridMap
+from tests.support.scenes.papered_room import CAMERA, papered_frame
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"
 SCENE = GridMap()

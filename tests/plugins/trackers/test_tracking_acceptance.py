@@ -23,7 +23,7 @@ from framework.registry import assemble
 from framework.synthetic.sequence import Synthetic
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
-from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, pose
+from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, pose
 
 VOXEL = 0.02  # m, of the small images here
 WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as lost, is a lie

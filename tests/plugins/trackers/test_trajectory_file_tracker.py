@@ -12,8 +12,8 @@ from framework.errors import ConfigError, DataError, NoPoseError
 from framework.files.tum_trajectory import write_tum
 from framework.geometry import exp_se3
 from plugins.trackers.trajectory_file import TrajectoryFile, World
-from tests import registered
-from tests.scenes.corner_room import CornerRoom, GridMap, pose_at
+from tests.support import registered
+from tests.support.scenes.corner_room import CornerRoom, GridMap, pose_at
 
 SCENE = GridMap()
 T_FILE_WORLD = exp_se3(np.array([3.0, -2.0, 1.0, 0.4, -0.7, 0.2]))  # another system's world

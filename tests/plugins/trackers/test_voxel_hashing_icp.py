@@ -18,8 +18,8 @@ from framework.tracking.keyframes import Keyframe
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers import voxel_hashing_icp
 from plugins.trackers.voxel_hashing_icp import STEADY, Alignment, VoxelHashingIcp
-from tests.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
-from tests.scenes.papered_room import papered_frame
+from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
+from tests.support.scenes.papered_room import papered_frame
 
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:

@@ -23,14 +23,14 @@ from framework.api import Mapper
 from framework.data import Frame, Pose
 from framework.errors import ConfigError, FrameError
 from framework.interfaces import SceneMap
+from framework.live_view import rerun_program
+from framework.live_view.rerun_program import free_port
 from framework.pipeline import Pipeline
 from framework.registry import assemble
-from framework.viewing import rerun_program
-from framework.viewing.rerun_program import free_port
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.viewers.rerun import Mode, RerunViewer
-from tests import registered
-from tests.scenes.corner_room import CAMERA, CornerRoom, GivenPose, KeepAll, SphereDetector, pose_at
+from tests.support import registered
+from tests.support.scenes.corner_room import CAMERA, CornerRoom, GivenPose, KeepAll, SphereDetector, pose_at
 
 pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not installed")
 from pyarrow.types import is_temporal
@@ -184,7 +184,15 @@ def build_viewer(name: str, *overrides: str) -> Any:
 def test_a_killed_run_leaves_all_up_to_its_last_second(tmp_path: Path) -> None:
     """By the computer's clock, which rerun notes with everything, and by when the last frame was fused."""
     endless = ("dataset.frames=100000", "dataset.slow_s=0.03", "fuser.capacity=100000", "fuser.note=note")
-    line = [sys.executable, "-m", "framework", "--config-dir", str(CHECKOUT / "tests" / "fake_conf"), *FAKES, *endless]
+    line = [
+        sys.executable,
+        "-m",
+        "framework",
+        "--config-dir",
+        str(CHECKOUT / "tests" / "support" / "fake_conf"),
+        *FAKES,
+        *endless,
+    ]
     run = subprocess.Popen(
         [*line, "viewer=rerun", "hydra.run.dir=run"],
         cwd=tmp_path,

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 
-from framework.datasets.color_registration import ColorRegistration
+from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.datasets.scannet.scannet import ScanNet
 from framework.datasets.scannet.scannet_annotation import read_aggregation, read_label_table, read_labeled_mesh
 from framework.errors import DataError, FrameError
 from framework.files.ply import write_ply
 from framework.geometry import back_project, transform
-from tests.damaged_files import EXAMPLES, check, damaged
-from tests.recordings import fault_of, mapped, opened
-from tests.scannet_files import (
+from tests.support.recordings.damaged_files import EXAMPLES, check, damaged
+from tests.support.recordings.recordings import fault_of, mapped, opened
+from tests.support.recordings.scannet_files import (
     COLOR_CAMERA,
     DEPTH_CAMERA,
     NO_POSE,

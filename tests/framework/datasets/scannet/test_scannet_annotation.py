@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from framework.datasets.labeled_mesh import LabeledMesh
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
 from framework.datasets.scannet.scannet_annotation import (
     LARGEST_FILE,
     read_aggregation,
@@ -18,7 +18,7 @@ from framework.datasets.scannet.scannet_annotation import (
 )
 from framework.errors import DataError
 from framework.files.ply import write_ply
-from framework.label_spaces import MEANINGS
+from framework.vocabulary.label_spaces import MEANINGS
 
 SEGMENTS = [3, 3, 70, 70, 5, 5, 9, 9, 11, 12]  # of ten vertices in a row
 TABLE = """id\traw_category\tcategory\tnyu40class

@@ -12,7 +12,18 @@ import pytest
 
 from framework.datasets.scannet.sens_file import FRAME, MOST_FRAMES, SensFile, open_sens
 from framework.errors import DataError, FrameError
-from tests.scannet_files import COLOR_CAMERA, DEPTH_CAMERA, JPEG, OCCIPITAL, PNG, RAW, ZLIB, Shot, sens, shots
+from tests.support.recordings.scannet_files import (
+    COLOR_CAMERA,
+    DEPTH_CAMERA,
+    JPEG,
+    OCCIPITAL,
+    PNG,
+    RAW,
+    ZLIB,
+    Shot,
+    sens,
+    shots,
+)
 
 SIZES = 12 + 15 + 4 * 64  # byte of the header's part after the name and the matrices
 HEADER = SIZES + 36

@@ -23,7 +23,7 @@ from framework.datasets.scenenn.timestamps import read_timestamps
 from framework.datasets.scenenn.trajectory_log import read_trajectory_log
 from framework.files.image_files import read_color, read_uint16
 from framework.files.ply import read_ply
-from tests.damaged_files import EXAMPLES, check, damaged
+from tests.support.recordings.damaged_files import EXAMPLES, check, damaged
 
 PLACE = re.compile(r"(line|byte) \d+")
 

@@ -11,7 +11,7 @@ from framework.datasets.scenenn.oni import LARGEST_TIME_DIFFERENCE, WAITING, pai
 from framework.datasets.scenenn.oni_records import Images, Stream, read_contents
 from framework.datasets.scenenn.openni import LIBRARIES, OniImage
 from framework.errors import ConfigError, DataError
-from tests.oni_file import COLOR, DEPTH, YUV422, Node, OniFile, crash
+from tests.support.recordings.oni_file import COLOR, DEPTH, YUV422, Node, OniFile, crash
 
 TIMES = [33_333, 66_666, 100_000, 133_333]
 

@@ -9,7 +9,7 @@ import pytest
 
 from framework.datasets.scenenn.oni_records import Stream, playable, read_contents
 from framework.errors import DataError
-from tests.oni_file import COLOR, DEPTH, OPENNI_1_END_NODE, Node, OniFile
+from tests.support.recordings.oni_file import COLOR, DEPTH, OPENNI_1_END_NODE, Node, OniFile
 
 TIMES = [33_000, 66_000, 99_000]
 

@@ -13,12 +13,12 @@ import pytest
 import torch
 from torch.nn import functional
 
-from framework.detection.boxes import decode
 from framework.detection.mask_rcnn.checkpoint import CheckpointKind, read_network
 from framework.detection.mask_rcnn.detectron2_checkpoint import from_detectron2, read_pickle
+from framework.detection.masks.boxes import decode
 from framework.errors import DataError
-from framework.label_spaces import COCO
-from tests.roi_align_loops import roi_align_loops
+from framework.vocabulary.label_spaces import COCO
+from tests.support.networks.roi_align_loops import roi_align_loops
 
 STEM, CHANNELS, FEATURES = 4, 6, 10
 BLOCKS = {"resnet50": (3, 4, 6, 3), "resnet101": (3, 4, 23, 3)}

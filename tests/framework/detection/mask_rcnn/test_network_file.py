@@ -9,7 +9,7 @@ from safetensors.torch import load_file, save_file
 
 from framework.detection.mask_rcnn.network_file import describe_network, filled, load_network, save_network
 from framework.errors import DataError
-from tests.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
+from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
 
 
 def rewritten(path, tensors=None, **metadata):

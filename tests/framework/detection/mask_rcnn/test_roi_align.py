@@ -8,7 +8,7 @@ import torch
 
 from framework.detection.mask_rcnn import roi_align as module
 from framework.detection.mask_rcnn.roi_align import roi_align
-from tests.roi_align_loops import roi_align_loops
+from tests.support.networks.roi_align_loops import roi_align_loops
 
 
 @pytest.fixture(params=["products", "sums"])

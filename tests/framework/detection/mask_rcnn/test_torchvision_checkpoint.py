@@ -9,8 +9,8 @@ import torch
 from framework.detection.mask_rcnn.resnet import ResNetShape
 from framework.detection.mask_rcnn.torchvision_checkpoint import COCO_GAPS, from_torchvision
 from framework.errors import DataError
-from framework.label_spaces import COCO
-from tests.tiny_mask_rcnn import TINY, tiny_network
+from framework.vocabulary.label_spaces import COCO
+from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network
 
 # fmt: off
 COCO_NUMBERS = (  # of the 80 classes, as in COCO's annotation files

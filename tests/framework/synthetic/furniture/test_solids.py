@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.synthetic.furniture.solids import Section, cushion, cylinder, loft, panel, rounded_box, tube
-from tests.scenes.labeled_furniture import LABELED
+from tests.support.scenes.labeled_furniture import LABELED
 
 
 def volume(solid):

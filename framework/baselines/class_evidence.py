@@ -1,0 +1,272 @@
+"""Class evidence alone in the voxels: what a semantic map keeps, background included, and how a frame changes it.
+
+After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] of the paper with one distribution a pixel:
+
+    P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
+
+In log space it is a sum, from a uniform start. Only ratios matter, so a voxel stores each class's sum relative to the
+background's: the background wins where no class is above 0. A pixel under a mask has the mask's distribution. A pixel
+under none is evidence for the background, the same at each such pixel, so that there a count of frames says all. It is
+kept for every block; what the masks said takes rows of 512 voxels in the blocks that were under one, 5 bytes a class
+slot and 14 beside, so at most 94 a voxel.
+
+A voxel tells the CLASS_SLOTS best of its classes apart and drops the least likely one when another is named (an
+eviction, counted). The other classes share one sum, `rest`, with which a class enters that is named for the first time.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
+from framework.errors import DataError
+from framework.mapping.labels.class_slots import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
+from framework.mapping.labels.label_evidence import best_first, named_classes
+from framework.mapping.labels.pixel_lists import PixelLists
+from framework.mapping.storage.map_file import check_known, check_like
+from framework.mapping.voxels.integration import SeenBlocks
+from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
+
+MOST_EXPONENT = 700.0  # of a ratio that float64 can hold
+MOST_FRAMES = np.uint16(65535)  # that a voxel counts
+
+
+class ClassEvidence(NamedTuple):
+    """What speaks for each class. The best class of a voxel is always in slot 0."""
+
+    unmasked: UInt16  # (B, 512) frames that saw the voxel under no mask; B as in the grid
+    class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
+    log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames that saw it under a mask
+    rest: Float32  # (R, 512) the same of each class without a slot
+    masked: UInt16  # (R, 512) the number of these frames
+    first_frame: Int32  # (R, 512) the first and the last one of them, -1 = none
+    last_frame: Int32  # (R, 512)
+
+
+ROW_ARRAYS = ClassEvidence._fields[1:]
+
+
+class MaskClasses(NamedTuple):
+    """What one frame's N masks say of C classes."""
+
+    cluster: Int32  # (H * W,) the cluster with the best score of those over each pixel, -1 = none
+    log_ratio: Float32  # (N, C) log P(class) / P(background)
+    rest: Float32  # (N,) the same of the mean of the classes that a cluster does not name
+    named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
+    named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 of the classes that it does not name
+    frame: int  # its index
+
+
+def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
+    """What the clusters of a frame say, log P(class) / P(background) (N, C), as the voxels take it."""
+    above_rest, named, bits = named_classes(log_ratio, logarithmic=True)
+    best = _best_clusters(points.first, points.cluster, clusters.scores)
+    return MaskClasses(
+        best[points.of_pixel.ravel()],
+        log_ratio.astype(np.float32),
+        (log_ratio - above_rest)[:, :1].sum(axis=1).astype(np.float32),
+        named,
+        bits,
+        frame,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _best_clusters(first, cluster, scores):
+    """(L,) the cluster of each list with the best score, of equal ones the first, -1 = there is none."""
+    best = np.full(first.shape[0] - 1, -1, np.int32)
+    for i in range(best.shape[0]):
+        for place in range(first[i], first[i + 1]):
+            k, found = cluster[place], best[i]
+            if found < 0 or scores[k] > scores[found] or (scores[k] == scores[found] and k < found):
+                best[i] = k
+    return best
+
+
+@device
+def best_class(grid, evidence, log_missed, block, n):
+    """The likeliest class of a voxel, -1 when that is the background; a tie is the background's.
+
+    `log_missed` is what each frame that saw the voxel under no mask says for every class over the background.
+    """
+    row = grid.label_row[block]
+    if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
+        return np.int32(-1)
+    above = evidence.log_ratio[row, n, 0] + log_missed * np.float32(evidence.unmasked[block, n])
+    return np.int32(evidence.class_ids[row, n, 0]) if above > 0 else np.int32(-1)
+
+
+@device
+def _add_class(labels, sums, label, total):
+    """Gives a class its slot, the least likely one's if none is free. Returns 1 when a class was dropped."""
+    least = 0
+    for s in range(len(labels)):
+        if labels[s] == NO_CLASS:
+            labels[s] = label
+            sums[s] = total
+            return 0
+        if sums[s] < sums[least]:
+            least = s
+    if total > sums[least]:
+        labels[least] = label
+        sums[least] = total
+    return 1
+
+
+@device
+def observe_mask(evidence, row, n, masks, k):
+    """One step of the recursion for a voxel that a frame sees under cluster k. Returns the number of evictions."""
+    labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
+    known = 0  # bits of the named classes that have a slot
+    for s in range(len(labels)):
+        if labels[s] == NO_CLASS:
+            break  # slots are filled from the front
+        sums[s] += masks.log_ratio[k, labels[s]]
+        known |= masks.named_bit[k, labels[s]]
+    evicted = 0
+    for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
+        label = masks.named_classes[k, m]
+        if m > 0 and label == masks.named_classes[k, 0]:
+            break
+        if not (known >> m) & 1:
+            evicted += _add_class(labels, sums, label, evidence.rest[row, n] + masks.log_ratio[k, label])
+    evidence.rest[row, n] += masks.rest[k]
+    best_first(labels, sums, NO_CLASS)
+    if evidence.masked[row, n] < MOST_FRAMES:
+        evidence.masked[row, n] += 1
+    if evidence.first_frame[row, n] < 0:
+        evidence.first_frame[row, n] = masks.frame
+    evidence.last_frame[row, n] = masks.frame
+    return evicted
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _find_blocks_under_masks(grid, seen, cluster, wants_row):
+    """Notes in wants_row (A,) the blocks without a row that have a voxel under some mask."""
+    for a in prange(seen.blocks.shape[0]):
+        wants_row[a] = False
+        first = seen.near_first[a]
+        if grid.label_row[seen.blocks[a]] < 0:
+            for i in range(first, first + seen.near_count[a]):
+                if cluster[seen.near_pixel[i]] >= 0:
+                    wants_row[a] = True
+                    break
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _update(grid, seen, evidence, masks, evicted):
+    """Updates the near voxels of the seen blocks; evicted (A,) counts slots given away."""
+    unmasked = evidence.unmasked  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
+    for a in prange(seen.blocks.shape[0]):
+        evicted[a] = 0
+        block = seen.blocks[a]
+        row = grid.label_row[block]
+        first = seen.near_first[a]
+        for i in range(first, first + seen.near_count[a]):
+            n = seen.near_voxel[i]
+            k = masks.cluster[seen.near_pixel[i]]
+            if k >= 0:
+                evicted[a] += observe_mask(evidence, row, n, masks, k)
+            elif unmasked[block, n] < MOST_FRAMES:
+                unmasked[block, n] += 1
+
+
+class ClassRows:
+    """Owns the class evidence of a grid's blocks and makes it grow. The kernels work on `self.evidence`."""
+
+    def __init__(self, voxels: VoxelGrid) -> None:
+        self.voxels = voxels
+        self.row_count = 0
+        self.evicted = 0  # slots given to another class so far
+        self.evidence = _free_rows(0)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved."""
+        unmasked = self.evidence.unmasked[: self.voxels.block_count]
+        return {**vars(self), "evidence": self.evidence._replace(unmasked=unmasked)}
+
+    @property
+    def byte_count(self) -> int:
+        """Of what is in use."""
+        return sum(array.nbytes for array in self.saved().values())
+
+    def begin(self, classes: int) -> None:
+        """Says how many classes there are, before the first update. Raises DataError when they are too many."""
+        if classes > NO_CLASS:
+            raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
+        self.evidence = _free_rows(min(classes, CLASS_SLOTS))
+
+    def update(self, seen: SeenBlocks, masks: MaskClasses) -> None:
+        """Updates the voxels near the measured surface of the blocks that a frame has seen."""
+        capacity = len(self.voxels.grid.block_coords)
+        if len(self.evidence.unmasked) < capacity:
+            self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
+        wants_row = np.empty(len(seen.blocks), np.bool_)
+        evicted = np.empty(len(seen.blocks), np.int32)
+        _find_blocks_under_masks(self.voxels.grid, seen, masks.cluster, wants_row)
+        self._add_rows(seen.blocks[wants_row])
+        _update(self.voxels.grid, seen, self.evidence, masks, evicted)
+        self.evicted += int(evicted.sum())
+
+    def saved(self) -> dict[str, npt.NDArray[Any]]:
+        """The arrays in use, by name."""
+        rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
+        return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
+
+    def fill(self, arrays: dict[str, npt.NDArray[Any]], classes: int) -> None:
+        """Takes the arrays that `saved` gave, of a map with so many classes. Raises DataError where they do not fit."""
+        free = self.evidence._asdict()
+        check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
+        check_like(arrays, free, len(arrays["rest"]))
+        check_known("class_ids", arrays["class_ids"], [*range(classes), NO_CLASS])
+        if len(arrays["rest"]) and not classes:
+            raise DataError("rest has rows, and the map no class")
+        _check_order(arrays["class_ids"], arrays["log_ratio"], arrays["rest"], classes)
+        self.evidence = ClassEvidence(**{name: arrays[name] for name in ClassEvidence._fields})
+        self.row_count = len(self.evidence.rest)
+
+    def _add_rows(self, blocks: Int32) -> None:
+        """Gives each of these blocks a row, in the order given."""
+        needed = self.row_count + len(blocks)
+        if needed > len(self.evidence.rest):
+            capacity = max(needed, 2 * len(self.evidence.rest))
+            self.evidence = self.evidence._replace(
+                **{name: grown(getattr(self.evidence, name), capacity) for name in ROW_ARRAYS}
+            )
+        new = slice(self.row_count, needed)
+        self.evidence.class_ids[new] = NO_CLASS
+        for array in (self.evidence.log_ratio, self.evidence.rest, self.evidence.masked):
+            array[new] = 0
+        self.evidence.first_frame[new] = -1
+        self.evidence.last_frame[new] = -1
+        self.voxels.grid.label_row[blocks] = np.arange(self.row_count, needed, dtype=np.int32)
+        self.row_count = needed
+
+
+def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
+    """Raises DataError unless the best class is in slot 0, and `rest` far from above all where it stands for none."""
+    named = class_ids != NO_CLASS
+    ratios = np.where(named, log_ratio, np.float32(-np.inf))
+    best = ratios.max(axis=-1, initial=-np.inf)
+    if (ratios[..., :1] < best[..., None]).any():
+        raise DataError("log_ratio must have the best class of each voxel in slot 0")
+    if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MOST_EXPONENT)).any():
+        raise DataError("rest is too large in a voxel that names all classes")
+
+
+def _free_rows(class_slots: int) -> ClassEvidence:
+    """No evidence for any block yet."""
+    voxels = (0, BLOCK_VOXELS)
+    return ClassEvidence(
+        unmasked=np.empty(voxels, np.uint16),
+        class_ids=np.empty((*voxels, class_slots), np.uint8),
+        log_ratio=np.empty((*voxels, class_slots), np.float32),
+        rest=np.empty(voxels, np.float32),
+        masked=np.empty(voxels, np.uint16),
+        first_frame=np.empty(voxels, np.int32),
+        last_frame=np.empty(voxels, np.int32),
+    )

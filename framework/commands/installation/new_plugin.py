@@ -1,0 +1,176 @@
+"""`python -m framework new-plugin STAGE NAME`: a repository of one's own with a plugin that works, to begin from.
+
+What it writes stands in framework/templates: a folder for each stage and for viewers, and what all have in common.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import keyword
+import os
+import re
+import tempfile
+from pathlib import Path
+from string import Template
+
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+import framework
+from framework.commands.command_line import arguments, one_line_errors
+from framework.commands.installation.plugins import options_of
+from framework.data import Camera, Detections, Frame, Instance, PointClusters, Pose, SurfaceView
+from framework.errors import ConfigError, DataError
+from framework.registry import GROUPS
+
+TEMPLATES = Path(framework.__file__).with_name("templates")
+PLACES = {  # of each template in the new repository; the first ones are those of the stage
+    "plugin.py": "$package/$name.py",
+    "option.yaml": "$package/conf/$stage/$name.yaml",
+    "test.py": "tests/test_$name.py",
+    "init.py": "$package/__init__.py",
+    "conftest.py": "tests/conftest.py",
+    "search_path.py": "hydra_plugins/${package}_search_path.py",
+    "pyproject.toml": "pyproject.toml",
+    "README.md": "README.md",
+    "LICENSE": "LICENSE",
+    "gitignore": ".gitignore",
+    "test.yml": ".github/workflows/test.yml",
+}
+LONGEST_NAME = 30  # characters; lines of the templates stay within 120
+FOLDERS = ("conf", "tests")  # of the repository and the package, that a module would stand in the way of
+SMALL = "dataset=synthetic dataset.frames=30 dataset.width=320 dataset.height=240"
+FIRST = "hydra.sweep.dir=outputs/first_sweep"
+TRIES = {  # by stage: how a new plugin is compared with ours; a viewer changes no result, and is looked at
+    "detector": f"instancemap -m detector=mask_rcnn_rooms,$name {SMALL} {FIRST}",
+    "tracker": f"instancemap -m tracker=voxel_hashing_icp,$name detector=simulated {SMALL} {FIRST}",
+    "refiner": f"instancemap -m refiner=gmm_em,$name detector=simulated {SMALL} {FIRST}",
+    "fuser": f"instancemap -m fuser=bayesian_tsdf,$name detector=simulated {SMALL} {FIRST}",
+    "dataset": f"instancemap -m refiner=identity,gmm_em dataset=$name dataset.root=DIR {FIRST}",
+    "viewer": f"instancemap viewer=$name detector=simulated {SMALL} hydra.run.dir=outputs/first_run",
+}
+SWEPT = """\
+sweeps, and ends with a table, which is also in `outputs/first_sweep/table.md`; each run's `overview.png` is its map.
+Without `dataset.frames` and the like it takes longer, and is enough to compare."""
+WATCHED = """\
+maps thirty frames of a made-up room with it: `outputs/first_run/frames.jsonl` has a line for each of them.
+`instancemap dataset=desk viewer=$name` maps a real video."""
+DATA: dict[str, tuple[type, ...]] = {  # by stage: what its methods get and give
+    "detector": (Frame, Camera, Detections),
+    "tracker": (Frame, Camera, SurfaceView, Pose),
+    "refiner": (PointClusters, Frame, Camera),
+    "fuser": (Frame, Camera, Pose, PointClusters, Instance),
+    "dataset": (Frame, Camera),
+    "viewer": (Frame, Camera, Detections, Pose, Instance),
+}
+VARIANTS = {  # by stage: a parameter for an option that inherits
+    "detector": "tolerance: 30",
+    "tracker": "max_distance: 0.2",
+    "refiner": "reach: 0.6",
+    "fuser": "least: 0.3",
+    "dataset": "stride: 2",
+    "viewer": "min_score: 0.6",
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="Writes a repository with a plugin of your own, which works at once: package, option, tests, CI.",
+    )
+    parser.add_argument("stage", metavar="STAGE", choices=GROUPS, help=", ".join(GROUPS))
+    parser.add_argument("name", metavar="NAME", help="of the option, such as my_refiner: refiner=my_refiner")
+    parser.add_argument(
+        "--in", dest="folder", metavar="DIR", type=Path, default=Path(), help="where to write it; else here"
+    )
+    asked = arguments(parser)
+    with one_line_errors():
+        made = write_repository(asked.stage, asked.name, asked.folder)
+        names = names_of(asked.stage, asked.name)
+        print(f"written: {made}; the method is in {names['package']}/{asked.name}.py")
+        print(f"  cd {made} && pip install -e '.[test]' && pytest")
+        print(f"  {names['try']}")
+
+
+def write_repository(stage: str, name: str, folder: Path) -> Path:
+    """The new folder in `folder`, written whole or not at all.
+
+    Raises ConfigError for a name that cannot be one or is taken, DataError where the folder cannot be written.
+    """
+    check_name(stage, name)
+    if not folder.is_dir():
+        raise ConfigError(f"--in: there is no folder {folder}")
+    place = folder / names_of(stage, name)["distribution"]
+    if os.path.lexists(place):
+        raise ConfigError(f"{place} is there already; choose another name, or another folder with --in")
+    try:
+        with tempfile.TemporaryDirectory(prefix=".new-plugin-", dir=folder) as temporary:
+            half = Path(temporary, "repository")
+            for path, text in files_of(stage, name).items():
+                (half / path).parent.mkdir(parents=True, exist_ok=True)
+                (half / path).write_text(text, encoding="utf-8", newline="\n")
+            half.rename(place)
+    except OSError as error:
+        raise DataError(f"{place} could not be written: {error.strerror or error}") from error
+    return place
+
+
+def check_name(stage: str, name: str) -> None:
+    """Raises ConfigError for a name that cannot be that of a module and of a new option of the stage."""
+    if not re.fullmatch(r"[a-z][a-z0-9]*(_[a-z0-9]+)*", name) or len(name) > LONGEST_NAME:
+        raise ConfigError(
+            f"NAME must be words of a-z and 0-9 with _ between them, like my_{stage}, at most {LONGEST_NAME} "
+            f"characters; found {name!r}"
+        )
+    if is_value(name):
+        raise ConfigError(f"NAME {name} is a value and no name on a command line or in YAML; choose another, my_{name}")
+    if keyword.iskeyword(name) or name in FOLDERS:
+        raise ConfigError(f"NAME {name} means something else in a Python package; choose another, like my_{name}")
+    if name in options_of(stage):
+        raise ConfigError(f"there is a {stage}={name} already: `instancemap plugins {stage} {name}` shows it")
+    class_name = names_of(stage, name)["class_name"]
+    if any(re.search(rf"\b{class_name}\b", _template(stage, template)) for template in ("plugin.py", "test.py")):
+        raise ConfigError(f"NAME {name}: its class {class_name} would have the name of another; choose a longer one")
+
+
+def is_value(name: str) -> bool:
+    """Whether Hydra, or a YAML file, takes the word for null, a truth value or a number."""
+    on_a_line = OverridesParser.create().parse_override(f"option={name}").value()
+    return not (isinstance(on_a_line, str) and isinstance(OmegaConf.create(f"option: {name}").option, str))
+
+
+def names_of(stage: str, name: str) -> dict[str, str]:
+    """What the templates' placeholders stand for."""
+    own = {
+        "stage": stage,
+        "name": name,
+        "class_name": "".join(map(str.capitalize, name.split("_"))),
+        "package": f"instancemap_{name}",
+        "distribution": f"instancemap-{name.replace('_', '-')}",
+        "version": framework.__version__,
+        "variant": VARIANTS[stage],
+        "data": "\n\n\n".join(map(fields_of, DATA[stage])),
+    }
+    aim, outcome = ("run", WATCHED) if stage == "viewer" else ("swept plugin", SWEPT)
+    texts = {"try": TRIES[stage], "outcome": outcome}
+    return own | {"aim": aim} | {key: Template(text).substitute(own) for key, text in texts.items()}
+
+
+def fields_of(data: type) -> str:
+    """The fields of a dataclass with their shapes, units and meanings, as its source has them."""
+    body = inspect.getsource(data).partition("\n    def ")[0]
+    return "\n".join([f"class {data.__name__}:", *re.findall(r"^    \w+: .*", body, re.MULTILINE)])
+
+
+def files_of(stage: str, name: str) -> dict[str, str]:
+    """The texts of the new repository's files, by path."""
+    names = names_of(stage, name)
+    return {
+        Template(place).substitute(names): Template(_template(stage, template)).substitute(names)
+        for template, place in PLACES.items()
+    }
+
+
+def _template(stage: str, name: str) -> str:
+    own = TEMPLATES / stage / f"{name}.template"
+    return (own if own.exists() else TEMPLATES / "every_stage" / own.name).read_text(encoding="utf-8")

@@ -1,0 +1,178 @@
+"""`python -m framework plugins [STAGE [NAME]]`: what is registered for each stage, with documentation and parameters.
+
+The options come from Hydra's own search path, so those of installed third-party packages are listed like any other, and
+with --config-dir those of a folder, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import atexit
+import dataclasses
+import gc
+import importlib.resources
+import inspect
+import re
+import textwrap
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hydra._internal.config_repository import CachingConfigRepository
+from hydra.core.global_hydra import GlobalHydra
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from framework.commands.command_line import arguments, one_line_errors
+from framework.config.composition import config_directory, one_line
+from framework.errors import ConfigError, DataError
+from framework.registry import (
+    GROUPS,
+    check_option,
+    composition,
+    find_class,
+    holds_one,
+    parameter_fields,
+    plugin_fields,
+)
+
+COMMENTED_KEY = re.compile(r"^(?P<key>\w+):[^#\n]*#[ ]*(?P<comment>.*\S)\s*$", re.MULTILINE)
+_HEAD = re.compile(r"\A# (?!@)(?P<comment>.*\S)\s*$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One field of a plugin, with what its option's YAML says about it."""
+
+    name: str
+    type: str
+    default: str
+    comment: str
+
+
+@dataclass(frozen=True)
+class Option:
+    """One choosable option of a stage: a YAML file that registers a class."""
+
+    stage: str
+    name: str
+    target: str
+    provider: str  # who put it on Hydra's search path: main, or the third-party package
+    documentation: str  # the class's first line, and what an option that inherits changes; why it cannot be used, if so
+    parameters: tuple[Parameter, ...]
+
+
+def registered(*stages: str, only: str | None = None) -> list[Option]:
+    """The options of these config groups, by stage and name, or those with the name that is asked for."""
+    with config_directory():
+        loader: Any = GlobalHydra.instance().config_loader()
+        files = CachingConfigRepository(loader.repository)  # of all options: they share most of what they are made of
+        return [
+            _option(files, stage, name)
+            for stage in stages
+            for name in loader.get_group_options(stage)
+            if only in (None, name)
+        ]
+
+
+def options_of(stage: str) -> list[str]:
+    """The names of the stage's options, whether they can be used or not."""
+    with config_directory():
+        return list(GlobalHydra.instance().config_loader().get_group_options(stage))
+
+
+def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
+    source = next(source for source in files.get_sources() if source.is_config(f"{stage}/{name}"))
+    target = ""
+    try:
+        own: Any = files.load_config(f"{stage}/{name}")
+        target = str(own.config.get("_target_"))
+        made_of = composition(files, stage, name)  # the option's own file, and those that it includes
+        texts, configs = [], []
+        for path in (path for path, package in made_of.items() if package == stage):
+            part: Any = files.load_config(path)
+            texts.append(_text(part.path, f"{path}.yaml"))
+            configs.append(part.config)
+        node: Any = OmegaConf.merge(*configs)
+        target = str(node.get("_target_"))
+        plugin_class = find_class(GROUPS[stage], target)
+        check_option(f"{stage} {target}", plugin_class, node)
+    except (ConfigError, DataError, HydraException, OmegaConfBaseException, OSError, ValueError) as error:
+        return Option(stage, name, target, source.provider, f"cannot be used: {one_line(error)}", ())
+    given: Any = OmegaConf.to_container(node, resolve=False)
+    nested = {name: _nested(made_of, f"{stage}.{name}", plugin_class) for name in plugin_fields(plugin_class)}
+    comments = {match["key"]: match["comment"] for text in texts for match in COMMENTED_KEY.finditer(text)}
+    parameters = tuple(
+        Parameter(
+            name=field.name,
+            type=field.type if isinstance(field.type, str) else field.type.__name__,
+            default=nested.get(field.name) or str(given.get(field.name, _default(field))),
+            comment=comments.get(field.name, ""),
+        )
+        for field, _ in parameter_fields(plugin_class).values()
+    )
+    documentation = (inspect.getdoc(plugin_class) or "").partition("\n\n")[0].replace("\n", " ")
+    change = _HEAD.match(_text(own.path, f"{stage}/{name}.yaml"))
+    if change and len(texts) > 1:
+        documentation += f" Here: {change['comment']}."
+    return Option(stage, name, target, source.provider, documentation, parameters)
+
+
+def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
+    """The options that a field at `place` (detector.of) holds: one, or several by name."""
+    if holds_one(plugin_class, place.rpartition(".")[2]):
+        own = [path for path, package in made_of.items() if package == place]
+        return own[-1].rpartition("/")[2] if own else ""  # after those that it inherits from
+    packages = (package for package in made_of.values() if f"{place}." in package)
+    return ", ".join(dict.fromkeys(package.rpartition(".")[2] for package in packages))
+
+
+def _default(field: dataclasses.Field[Any]) -> object:
+    if field.default_factory is not dataclasses.MISSING:
+        return field.default_factory()
+    return "???" if field.default is dataclasses.MISSING else field.default
+
+
+def _text(source: str, name: str) -> str:
+    """The YAML as it was written: Hydra's configs have lost the comments."""
+    scheme, _, root = source.partition("://")
+    if scheme == "pkg":
+        package, _, folder = root.replace("/", ".").partition(".")
+        return importlib.resources.files(package).joinpath(*folder.split("."), *name.split("/")).read_text()
+    return Path(root, name).read_text() if scheme == "file" else ""
+
+
+def describe(option: Option) -> str:
+    """An option as indented text: name and documentation, then a line for each parameter."""
+    origin = "" if option.provider == "main" else f"  [from {option.provider}]"
+    lines = [
+        f"  {option.name}{origin}",
+        textwrap.fill(option.documentation, 112, initial_indent=" " * 6, subsequent_indent=" " * 6),
+    ]
+    heads = [f"{parameter.name}: {parameter.type} = {parameter.default}" for parameter in option.parameters]
+    width = min(48, max(map(len, heads), default=0))
+    for head, parameter in zip(heads, option.parameters, strict=True):
+        lines.append(f"      {head:<{width}}  {'# ' if parameter.comment else ''}{parameter.comment}".rstrip())
+    return "\n".join(lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description="Lists the registered plugins.")
+    parser.add_argument("stage", nargs="?", choices=GROUPS, help="only this stage")
+    parser.add_argument("name", nargs="?", help="only this option")
+    asked = arguments(parser)
+    with one_line_errors():
+        stages = [asked.stage] if asked.stage else list(GROUPS)
+        atexit.register(gc.freeze)  # going through all that torch leaves in memory takes a fifth of the time ...
+        gc.disable()  # ... and as much again before the process ends
+        options = registered(*stages, only=asked.name)
+        gc.enable()
+        if asked.name and not options:
+            there = ", ".join(options_of(asked.stage))
+            raise ConfigError(f"there is no {asked.stage}={asked.name}; the options are: {there}")
+        for stage in stages:
+            print(f"{stage} ({GROUPS[stage].__name__}): choose with {stage}=NAME, set with {stage}.PARAMETER=VALUE\n")
+            described = [describe(option) for option in options if option.stage == stage]
+            print("\n\n".join(described) or "  (none)", end="\n\n")

@@ -1,0 +1,46 @@
+"""`python -m framework check dataset=D [out=FILE]`: whether a recording will map, and what to set where it will not.
+
+Exit status 1 = something is wrong.
+"""
+
+from __future__ import annotations
+
+import logging
+
+import hydra
+from omegaconf import DictConfig
+
+from framework.commands.command_line import Jobs
+from framework.config.validation import checked_file
+from framework.errors import DataError
+from framework.files.search_paths import CONF
+from framework.interfaces import MapFuser, RGBDSequence
+
+log = logging.getLogger(__name__)
+jobs = Jobs()
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="check")
+@jobs.reported
+def job(config: DictConfig) -> None:
+    """Builds the dataset that the config names, looks at it, prints what it found and draws it."""
+    out = checked_file("out", config.out, ".png")
+
+    from framework.checking.recording_check import check
+    from framework.figures.check_figure import write_check
+    from framework.registry import build  # here, so that such faults are answered before the heavy libraries load
+    from framework.runtime.process_settings import Settings
+
+    Settings.of(config).apply()
+    farthest = build(MapFuser, config.fuser).scene.depth_range[1]
+    found = check(build(RGBDSequence, config.dataset), farthest)
+    print(found.summary, *found.findings, sep="\n")
+    write_check(out, found)
+    log.info("%s", out)
+    if found.faults:
+        settings = " ".join(dict.fromkeys(finding.setting for finding in found.faults if finding.setting))
+        raise DataError(f"it will not map as it is read{f'; try it with {settings}' if settings else ''}")
+
+
+def main() -> None:
+    jobs.run(job)

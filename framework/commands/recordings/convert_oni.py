@@ -1,0 +1,87 @@
+"""`python -m framework convert-oni FILE.oni OUT`: SceneNN's raw video as the images that `dataset=scenenn` reads.
+
+OpenNI 2 plays the recording. OUT is the scene's folder, DIR/NNN, and gets image/, depth/ and timestamp.txt as from
+SceneNN's own play-back, with the same numbers.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import closing
+from pathlib import Path
+
+import cv2
+from tqdm import tqdm
+
+from framework.commands.command_line import arguments, one_line_errors
+from framework.data import Array
+from framework.datasets.scenenn.oni import read_frames
+from framework.datasets.scenenn.oni_records import Contents, Stream, read_contents
+from framework.datasets.scenenn.timestamps import MICROSECONDS, write_timestamps
+from framework.errors import DataError
+from framework.files.atomic_write import written_whole
+
+PNG = (cv2.IMWRITE_PNG_COMPRESSION, 1)  # what a better one saves takes longer than playing
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="Converts an OpenNI recording to SceneNN's images. Needs OpenNI 2: apt-get install libopenni2-0.",
+    )
+    parser.add_argument("source", metavar="FILE.oni", type=Path, help="the recording, SceneNN's oni/NNN.oni")
+    parser.add_argument("target", metavar="OUT", type=Path, help="the scene's folder, DIR/NNN; has no images yet")
+    asked = arguments(parser)
+    with one_line_errors():
+        convert(asked.source, asked.target)
+
+
+def convert(source: Path, target: Path) -> None:
+    """Does what the command says, and prints what it did; what was written before a fault is kept.
+
+    Raises DataError when `source` cannot be converted, or not to its end, or `target` has images already.
+    """
+    contents = read_contents(source)
+    image, depth, timestamp = target / "image", target / "depth", target / "timestamp.txt"
+    for path in (image, depth, timestamp):
+        if path.exists() and not (path.is_dir() and not any(path.iterdir())):
+            raise DataError(f"{path} is there already; remove it, or choose another folder")
+    image.mkdir(parents=True, exist_ok=True)
+    depth.mkdir(exist_ok=True)
+    color_times: dict[int, float] = {}
+    depth_times: dict[int, float] = {}
+    counts = {stream: images.count for stream, images in contents.streams.items()}
+    number = 0
+    try:
+        with closing(read_frames(contents, target)) as frames:
+            bar = tqdm(frames, total=min(counts.values()), desc=source.name, unit=" frames", disable=None)
+            for number, frame in enumerate(bar, start=1):
+                _write_png(depth / f"depth{number:05d}.png", frame.depth_mm)
+                _write_png(image / f"image{number:05d}.png", cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR))
+                color_times[number] = frame.color_time / MICROSECONDS
+                depth_times[number] = frame.depth_time / MICROSECONDS
+    finally:
+        if depth_times:
+            write_timestamps(timestamp, depth_times, color_times)
+    if not number:
+        raise DataError(f"{source} has no image of color and of depth that are of the same moment")
+    left_out = {stream: count - number for stream, count in counts.items()}
+    print(
+        f"{target}: {number} frames; left out are {left_out[Stream.COLOR]} images of color and"
+        f" {left_out[Stream.DEPTH]} of depth that are damaged or have no partner"
+    )
+    _check_whole(contents, number)
+
+
+def _check_whole(contents: Contents, number: int) -> None:
+    if contents.cut_off:
+        raise DataError(
+            f"{contents.path} is cut off or damaged at byte {contents.end}: what was read is kept, up to"
+            f" image{number:05d}.png; download it again for the rest"
+        )
+
+
+def _write_png(path: Path, image: Array) -> None:
+    """Writes (H, W) uint16 or (H, W, 3) uint8 BGR."""
+    _, data = cv2.imencode(".png", image, PNG)
+    with written_whole(path) as temporary:
+        temporary.write_bytes(data.tobytes())

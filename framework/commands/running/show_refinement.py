@@ -1,0 +1,101 @@
+"""`python -m framework show-refinement dataset=D detector=X refiner=R out=FILE`: one frame before and after refinement.
+
+Draws the masks in the image and their points in 3D from the side (the paper's Figure 5), with the figures below.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+import hydra
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig
+
+from framework.commands.command_line import Jobs
+from framework.config.validation import checked_file
+from framework.errors import ConfigError, DataError, FrameError
+from framework.files.search_paths import CONF
+from framework.interfaces import ClusterRefiner, Detector, RGBDSequence
+
+if TYPE_CHECKING:  # what is imported where it is used loads heavy libraries
+    from framework.data import Detections, Frame
+
+log = logging.getLogger(__name__)
+jobs = Jobs()
+
+TRIED = 6  # frames, evenly spaced, from which one is chosen where none is named
+
+
+@hydra.main(version_base="1.3", config_path=str(CONF), config_name="show_refinement")
+@jobs.reported
+def job(config: DictConfig) -> None:
+    """Builds dataset, detector and refiner, and draws what the last one does to one frame."""
+    if config.out is None:
+        raise ConfigError("out must be given: out=refinement.png")
+    out = checked_file("out", config.out, ".png")
+
+    from framework.detection.stored.cache import with_cache
+    from framework.evaluation.refined_points import Refinement
+    from framework.figures.refinement_figure import write_refinement
+    from framework.registry import build  # here, so that such faults are answered before the heavy libraries load
+    from framework.runtime.process_settings import Settings
+
+    Settings.of(config).apply()
+    sequence = build(RGBDSequence, config.dataset)
+    detector = with_cache(build(Detector, config.detector), config)
+    refiner = build(ClusterRefiner, config.refiner)
+    position, frame, detections = detected(sequence, detector, config.frame)
+    if len(detections) == 0:
+        log.warning("frame %d of %s: nothing was detected, so there is nothing to refine", position, sequence.name)
+    hydra_config = HydraConfig.get()
+    choices, overrides = hydra_config.runtime.choices, hydra_config.overrides.task
+    number = "" if frame.index == position else f" (number {frame.index} of the video)"
+    title = f"{sequence.name}, frame {position}{number}, detector={choices['detector']}"
+    write_refinement(out, Refinement.of(refiner, detections, frame), title, called(choices["refiner"], overrides))
+    log.info("%s: %d detections in frame %d of %s", out, len(detections), position, sequence.name)
+
+
+def detected(sequence: RGBDSequence, detector: Detector, position: object) -> tuple[int, Frame, Detections]:
+    """The frame at `position` with its detections, and its position; None = the one of a few with most detections.
+
+    Raises ConfigError for a position that there is not, FrameError when that frame cannot be used, and DataError when
+    none of the few can.
+    """
+    from framework.detection.domain import warn_outside_domain
+
+    warn_outside_domain(detector, sequence)
+    if position is not None:
+        if isinstance(position, bool) or not isinstance(position, int) or not 0 <= position < len(sequence):
+            raise ConfigError(
+                f"frame must be in [0, {len(sequence) - 1}], a position among the frames of {sequence.name} that "
+                f"dataset.start, stop and stride choose; found {position!r}"
+            )
+        frame = sequence[position]
+        return position, frame, detector.detect(frame)
+    tried = sorted({k * len(sequence) // TRIED for k in range(TRIED)}) if len(sequence) else []
+    best: tuple[int, Frame, Detections] | None = None
+    for k in tried:
+        try:
+            frame = sequence[k]
+            found = detector.detect(frame)
+        except FrameError as error:
+            log.warning("frame skipped: %s", error)
+            continue
+        if best is None or len(found) > len(best[2]):
+            best = k, frame, found
+    if best is None:
+        raise DataError(f"{sequence.name}: none of the {len(tried)} frames that were tried can be used: choose frame=K")
+    return best
+
+
+def called(refiner: str, overrides: Iterable[str]) -> str:
+    """How the refiner is chosen on the command line, with the parameters that are not the config's."""
+    return " ".join(
+        [f"refiner={refiner}", *(item for item in overrides if item.lstrip("+~").startswith(("refiner.", "refiner@")))]
+    )
+
+
+def main() -> None:
+    jobs.run(job)

@@ -1,0 +1,143 @@
+"""The configs: composing one as the command line does, and saying in one line what is wrong with it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from difflib import get_close_matches
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra._internal.core_plugins import file_config_source
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from hydra.plugins.config_source import ConfigResult
+from omegaconf import DictConfig, ListConfig
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
+
+from framework.errors import ConfigError, DataError, printable
+from framework.files.atomic_write import read_text
+from framework.files.search_paths import CONF
+from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
+
+
+def composed(*overrides: str, name: str = "config") -> DictConfig:
+    """A main config with these overrides. Raises ConfigError for a name or a value that there is not."""
+    try:
+        with config_directory():
+            return compose(name, [*overrides])
+    except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra answers some faults with ValueError
+        raise ConfigError(one_line(error)) from error
+
+
+_added: list[Path] = []
+
+
+def add_config_dir(folder: Path) -> None:
+    """Takes the options of another folder for registered in this process, as a run does those of --config-dir.
+
+    Raises ConfigError when there is no such folder.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"--config-dir: there is no folder {folder}")
+    _added.append(folder.resolve())
+
+
+class FileConfigSource(file_config_source.FileConfigSource):
+    """Hydra's own reader of YAML in folders, but files are checked first. Hydra tells sources apart by their name."""
+
+    def load_config(self, config_path: str) -> ConfigResult:
+        path = Path(self.path, self._normalize_file_name(config_path))
+        if not path.is_file():
+            return super().load_config(config_path)
+        with yaml_faults(path):
+            check_yaml(path, read_text(path, LARGEST_FILE))
+            found = super().load_config(config_path)
+        config: Any = found.config
+        if not isinstance(config, DictConfig):
+            raise DataError(f"{path}: expected keys and values, found a list")
+        if "defaults" in config and not isinstance(config.get("defaults"), ListConfig):
+            raise DataError(f"{path}: defaults must be a list")  # Hydra has no word for some of what else it may be
+        return found
+
+
+Plugins.instance()  # registers Hydra's own sources
+SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
+
+
+@contextmanager
+def config_directory() -> Iterator[None]:
+    """Has Hydra compose from our configs and the added ones, also inside of another program that uses it for itself."""
+    outer = GlobalHydra.instance().hydra
+    GlobalHydra.instance().clear()
+    try:
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            loader: Any = GlobalHydra.instance().config_loader()
+            for folder in _added:
+                before = SearchPathQuery(
+                    provider="schema"
+                )  # which must stay the last, as Hydra's own --config-dir does it
+                loader.get_search_path().prepend(provider="command-line", path=f"file://{folder}", anchor=before)
+            if _added:
+                loader.repository.initialize_sources(loader.get_search_path())
+            yield
+    finally:
+        GlobalHydra.instance().hydra = outer
+
+
+def one_line(error: BaseException) -> str:
+    """What is wrong, in one line; Hydra's messages are made to say what the user can do."""
+    return printable(_said(error))
+
+
+def _said(error: BaseException) -> str:
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        return _no_such_option(error)
+    if isinstance(error, OverrideParseException):
+        return f"{error.override!r} is not an override of the form key=value: {error.message.splitlines()[0]}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, ConfigAttributeError | ConfigKeyError):
+        return f"{_joined(str(error).partition('To append')[0])} {_known_keys(error.__cause__)}"
+    if isinstance(error, HydraException) and isinstance(error.__cause__, OmegaConfBaseException):
+        return _joined(f"{error} {error.__cause__}")
+    if isinstance(error, InterpolationResolutionError):  # what a resolver says stands between its kind and the key
+        return _joined(
+            str(error).partition("\n")[0].partition(" raised while resolving interpolation: ")[2] or str(error)
+        )
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}"
+    return _joined(str(error)) or type(error).__name__
+
+
+_EXTRAS = {"joblib": "joblib", "submitit_slurm": "slurm", "ray": "ray"}
+"""What to install, by Hydra's name of a launcher; ours are called like the extras."""
+
+
+def _no_such_option(error: MissingConfigException) -> str:
+    group, _, name = str(error.missing_cfg_file).rpartition("/")
+    if not group:
+        return _joined(str(error))
+    if group == "hydra/launcher" and name in _EXTRAS:
+        extra = _EXTRAS[name]
+        return f"launcher={extra} needs a package that is not installed: pip install instancemap[{extra}]"
+    options = list(error.options or ())
+    close = get_close_matches(name, options, n=1)
+    suggestion = f"; did you mean {close[0]}?" if close else "."
+    return f"there is no {group}={name}{suggestion} The options are: {', '.join(options) or 'none'}"
+
+
+def _known_keys(error: OmegaConfBaseException) -> str:
+    """The keys that there are in place of the one that is not."""
+    keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
+    close = get_close_matches(str(error.key), keys, n=1)
+    path = str(error.full_key or error.key)
+    if close:
+        return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
+    return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"
+
+
+def _joined(text: str) -> str:
+    return " ".join(text.split())

@@ -1,0 +1,91 @@
+"""Colour images moved into the depth camera, where both look from one place and differ in size and intrinsics only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from framework.data import MOST_PIXELS, Camera, UInt8, UInt16
+from framework.datasets.frames.stored_frames import StoredImages
+from framework.errors import DataError, FrameError
+
+LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp
+
+
+@dataclass(frozen=True)
+class ColorRegistration:
+    """Where the colour of a pixel of the depth camera comes from. Raises DataError where that would be too large."""
+
+    color: Camera
+    depth: Camera
+
+    def __post_init__(self) -> None:
+        width, height = self._fine * self.depth.width, self._fine * self.depth.height
+        if width * height > MOST_PIXELS or max(width, height, *self.color.shape) > LONGEST_SIDE:
+            raise DataError(
+                f"colour of {self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px cannot be moved "
+                f"into a depth camera of {self.depth.width}x{self.depth.height} px and fx = {self.depth.fx:g} px"
+            )
+
+    @property
+    def _fine(self) -> int:
+        """How many of the colour camera's pixels lie along a pixel of the depth camera, rounded."""
+        return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
+
+    def apply(self, image: UInt8) -> UInt8:
+        """The depth camera's colours (H, W, 3) from an image of the colour camera.
+
+        A pixel takes the mean of what it covers: the image is first resampled (bilinear) at about its own resolution,
+        `fine` times the depth camera's, then averaged over fine x fine. What the colour camera does not see repeats
+        the nearest colour that it sees.
+        """
+        fine = self._fine
+        # pixel i of the fine image has its centre at (i + 1/2) / fine - 1/2 in the depth image
+        u, u_0 = _line(self.color.fx, self.color.cx, self.depth.fx, self.depth.cx, fine)
+        v, v_0 = _line(self.color.fy, self.color.cy, self.depth.fy, self.depth.cy, fine)
+        resampled = cv2.warpAffine(
+            image,
+            np.array([[u, 0, u_0], [0, v, v_0]]),
+            (fine * self.depth.width, fine * self.depth.height),
+            flags=cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        )
+        size = (self.depth.width, self.depth.height)
+        return np.asarray(cv2.resize(resampled, size, interpolation=cv2.INTER_AREA), np.uint8)
+
+
+@dataclass(frozen=True)
+class RegisteredImages:
+    """A frame's images, colour moved into the depth camera when it is read."""
+
+    images: StoredImages  # colour in the colour camera
+    registration: ColorRegistration
+
+    @property
+    def color_name(self) -> Path | str:
+        return self.images.color_name
+
+    @property
+    def depth_name(self) -> Path | str:
+        return self.images.depth_name
+
+    def color(self) -> UInt8:
+        image, camera = self.images.color(), self.registration.color
+        if image.shape[:2] != camera.shape:
+            raise FrameError(
+                f"{self.color_name} is {image.shape[1]}x{image.shape[0]}, but the colour camera's images are "
+                f"{camera.width}x{camera.height}"
+            )
+        return self.registration.apply(image)
+
+    def depth(self) -> UInt16:
+        return self.images.depth()
+
+
+def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
+    """(a, b): the fine image's coordinate i lies at a i + b in the colour image."""
+    slope = f_color / f_depth
+    return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

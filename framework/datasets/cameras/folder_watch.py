@@ -1,0 +1,194 @@
+"""A folder into which frames are written while they are mapped: the same files as of dataset=rgbd_folder, as they come.
+
+    camera.json         as there; waited for
+    color/000000.jpg    JPEG or PNG, 8-bit
+    depth/000000.png    uint16, registered to colour, along z; 0 or 65535 = no reading
+    end                 an empty file, written last: there will be no more frames
+
+A frame is there once both of its files are whole, in whatever order and however slowly they are written; best is to
+write each under a name that begins with a dot, and rename it. Numbers grow. A frame that is not whole when a later one
+is, or never, is a frame that cannot be used. Files that are no longer needed may be removed while the run goes on.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import time
+from collections.abc import Generator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+
+from framework.config.validation import check_bounds
+from framework.data import Frame
+from framework.datasets.calibration.camera_json import (
+    CAMERA_KEYS,
+    DISTORTION,
+    camera_of,
+    check_keys,
+    distortion_of,
+    read_json_object,
+)
+from framework.datasets.calibration.raw_images import Calibration, check_max_depth
+from framework.datasets.frames.sequence_reader import check_one_number, number_of
+from framework.datasets.frames.stored_frames import ImageFiles
+from framework.errors import DataError, FrameError
+from framework.files.atomic_write import read_bytes
+from framework.files.image_files import LARGEST_FILE, check_image
+from framework.files.search_paths import folder_of
+from framework.interfaces import FrameReader, LiveVideo
+
+COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
+LONGEST_WAIT = 86_400.0  # s
+LARGEST_NUMBER = 2**53  # of a frame; every program has smaller ones exactly
+LEAST_REST = 3.0  # times as long as the last look took, until the next one: a folder of many files is no full-time job
+CLOCK_TICK = 1e-6  # s, between the times of two frames that were found at once
+
+log = logging.getLogger(__name__)
+
+
+@dataclass
+class FolderWatch(LiveVideo):
+    """Frames that another program writes into a folder of images while they are mapped."""
+
+    root: Path  # the folder, which must be there; a relative one in the working, else in the project folder
+    idle_timeout: float = 0.0  # s, in [0, 86400], without a new frame, after which it ends; 0 = never
+    camera_timeout: float = 30.0  # s, in [0, 86400], to wait for camera.json
+    poll_interval: float = 0.01  # s, in [0.001, 0.1], between two looks into the folder
+    max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
+
+    def __post_init__(self) -> None:
+        waits = (0.0, LONGEST_WAIT)
+        check_bounds(self, idle_timeout=waits, camera_timeout=waits, poll_interval=(0.001, 0.1))
+        check_max_depth(self.max_depth)
+        self.folder = folder_of(Path(self.root))
+        if not self.folder.is_dir():
+            raise DataError(f"dataset.root: the folder {self.folder} does not exist")
+        self.name = self.folder.resolve().name
+
+    def frames(self) -> Generator[FrameReader | None]:
+        calibration = yield from self._calibration()
+        arrivals = Arrivals(self.folder)
+        last_time, heard = 0.0, time.monotonic()
+        while True:
+            began = time.monotonic()
+            # asked first: what was there before it counts
+            over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - heard
+            for arrival in arrivals.look(to_the_end=over):
+                last_time, heard = max(time.time(), last_time + CLOCK_TICK), began
+                yield partial(arrival.read, last_time, calibration)
+            if over:
+                return
+            yield None
+            time.sleep(min(max(self.poll_interval, LEAST_REST * (time.monotonic() - began)), 0.1))
+
+    def _calibration(self) -> Generator[None, None, Calibration]:
+        """What camera.json says, once it is there and whole."""
+        path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
+        while True:
+            try:
+                content = read_json_object(path)
+                break
+            except DataError as error:
+                if time.monotonic() > deadline:
+                    raise DataError(f"{error}; waited {self.camera_timeout:g} s for it") from error
+            yield None
+            time.sleep(self.poll_interval)
+        check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
+        camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
+        return Calibration(camera, path, depth_scale, self.max_depth, distortion_of(path, content))
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A frame that has come, or that is passed over."""
+
+    number: int
+    images: ImageFiles | None
+    fault: str = ""  # why it cannot be used
+
+    def read(self, timestamp: float, calibration: Calibration) -> Frame:
+        """Raises FrameError when it cannot be used."""
+        if self.images is None:
+            raise FrameError(self.fault)
+        color = calibration.color(self.images.color(), self.images.color_name)
+        depth = calibration.depth(self.images.depth(), self.images.depth_name)
+        return Frame(self.number, timestamp, color, depth, calibration.camera)
+
+
+class Arrivals:
+    """What has come into a folder since the last look, by its frames' numbers."""
+
+    def __init__(self, folder: Path) -> None:
+        self._color, self._depth = NewImages(folder / "color", COLOR), NewImages(folder / "depth", DEPTH)
+        self._last = -1  # number of the last frame that came
+        self._halves: set[int] = set()  # numbers that were passed over with one image
+
+    def look(self, to_the_end: bool = False) -> list[Arrival]:
+        """The new frames, by number: up to the newest one that is whole, or all of which there is anything."""
+        self._color.look()
+        self._depth.look()
+        color, depth = self._color.waiting, self._depth.waiting
+        both, any_of = sorted(color.keys() & depth.keys()), sorted(color.keys() | depth.keys())
+        newest = next((n for n in reversed(both) if _is_whole(color[n]) and _is_whole(depth[n])), -1)
+        newest = max(newest, self._last)  # what comes later than its successors is passed over
+        passed = any_of if to_the_end else [number for number in any_of if number <= newest]
+        return [arrival for number in passed if (arrival := self._arrival(number, newest))]
+
+    def _arrival(self, number: int, newest: int) -> Arrival | None:
+        """None for the second half of what was passed over."""
+        color, depth = self._color.waiting.pop(number, None), self._depth.waiting.pop(number, None)
+        if number in self._halves:
+            self._halves.remove(number)
+            return None
+        if color is None or depth is None:
+            self._halves.add(number)
+        if number <= self._last:
+            return Arrival(number, None, f"{color or depth} came after frame {self._last}")
+        self._last = number
+        if color is None or depth is None:
+            until = f"when frame {newest} was" if newest > number else "in the end"
+            return Arrival(number, None, f"{color or depth}: the other image of this frame was not there {until}")
+        return Arrival(number, ImageFiles(color, depth))
+
+
+@dataclass
+class NewImages:
+    """The images of a folder that nobody has taken yet."""
+
+    folder: Path
+    suffixes: Sequence[str]
+    waiting: dict[int, Path] = field(default_factory=dict)  # by number
+
+    def __post_init__(self) -> None:
+        self._names: set[str] = set()
+        self._first: Path | None = None
+
+    def look(self) -> None:
+        """Adds what is new. Raises DataError for names that are in no order."""
+        try:
+            with os.scandir(self.folder) as entries:
+                names = {entry.name for entry in entries}
+        except OSError:  # nobody has made it yet
+            return
+        new, self._names = names - self._names, names
+        for name in sorted(new):
+            path = self.folder / name
+            if name.startswith(".") or path.suffix.lower() not in self.suffixes:
+                continue
+            number = number_of(path)
+            if number is None or number >= LARGEST_NUMBER:
+                log.warning("%s is no frame: its name must end in the frame's number, below 2^53", path)
+                continue
+            self._first = self._first or path
+            check_one_number([self._first, path])
+            self.waiting[number] = path
+
+
+def _is_whole(path: Path) -> bool:
+    try:
+        check_image(path, read_bytes(path, LARGEST_FILE))
+    except DataError:
+        return False
+    return True

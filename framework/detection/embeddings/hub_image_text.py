@@ -1,0 +1,121 @@
+"""CLIP and SigLIP, versions 1 and 2, through Hugging Face transformers."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from framework.data import Float32, UInt8
+from framework.detection.embeddings.image_text import ImageTextModel, unit_rows
+from framework.detection.hub.hub_model import CONFIG, PREPROCESSING, TOKENIZER, find_model
+from framework.detection.hub.transformers_parts import imported_transformers, read_part
+from framework.errors import ConfigError, DataError
+from framework.files.hashing import path_hash
+from framework.files.json_file import read_json
+
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # where a file has none
+LONGEST_SIDE = 1024  # px of a model's pictures
+HASH_DIGITS = 16  # of a local folder's content in the name of its space
+
+
+class Family(NamedTuple):
+    """What a kind of model wants."""
+
+    prompt: str  # the words that published figures have around a class's name
+    padding: str  # of texts, as in the training
+    lower: bool  # whether texts are in lower case
+    mean: tuple[float, ...]  # RGB, where the file leaves it out
+    std: tuple[float, ...]
+
+
+FAMILIES = {
+    "clip": Family("a photo of {}.", "longest", False, CLIP_MEAN, CLIP_STD),
+    # https://huggingface.co/docs/transformers/model_doc/siglip2: padded to 64 tokens, in lower case
+    "siglip": Family("This is a photo of {}.", "max_length", True, (0.5,) * 3, (0.5,) * 3),
+}
+"""By the `model_type` in config.json. SigLIP 2 of a fixed size (siglip2-base-patch16-224) is `siglip` there."""
+
+MOST_TOKENS = 64  # of a text; CLIP takes 77 and SigLIP 64
+
+
+class HubImageText(ImageTextModel):
+    """A model by its id on huggingface.co, or from a folder that save_pretrained wrote. It sees an object's picture
+    with what is around it faded: it takes no mask.
+    """
+
+    sees_mask = False
+
+    def __init__(self, model: str, revision: str, device: torch.device, half: bool) -> None:
+        transformers = imported_transformers()
+        self._folder = find_model(model, revision, TOKENIZER)
+        self._device = device
+        config = read_part("detector.model", self._folder, "its config.json", transformers.AutoConfig)
+        if config.model_type not in FAMILIES:
+            raise ConfigError(
+                f"detector.model must be a CLIP or a SigLIP of a fixed size, found {model}, a {config.model_type}"
+            )
+        self._family = FAMILIES[config.model_type]
+        self.side = int(config.vision_config.image_size)
+        if not 16 <= self.side <= LONGEST_SIDE:
+            raise DataError(f"detector.model: {self._folder} takes pictures of {self.side} px; expected 16 to 1024")
+        self._mean, self._std, self._factor = _normalization(self._folder / PREPROCESSING, self._family)
+        self._tokenizer = read_part("detector.model", self._folder, "its tokenizer", transformers.AutoTokenizer)
+        network = read_part("detector.model", self._folder, "its weights", transformers.AutoModel)
+        self._dtype = torch.float16 if half and device.type == "cuda" else torch.float32
+        self._network = network.to(device, self._dtype).eval()
+        self.space = _space(self._folder, model)
+
+    @torch.inference_mode()
+    def embed_crops(self, crops: UInt8) -> Float32:
+        """See ImageTextModel; the fourth channel is not looked at."""
+        pictures = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
+        mean, std = (torch.tensor(values, device=self._device)[:, None, None] for values in (self._mean, self._std))
+        pixels = ((pictures - mean) / std).to(self._dtype)
+        return self._unit(self._network.get_image_features(pixel_values=pixels))
+
+    @torch.inference_mode()
+    def embed_text(self, text: str) -> Float32:
+        prompt = self._family.prompt.format(text.lower() if self._family.lower else text)
+        length = min(MOST_TOKENS, int(self._network.config.text_config.max_position_embeddings))
+        tokens = self._tokenizer(
+            [prompt], padding=self._family.padding, max_length=length, truncation=True, return_tensors="pt"
+        )
+        given = {"input_ids": tokens["input_ids"].to(self._device)}
+        if self._family.padding == "longest":  # SigLIP was trained without
+            given["attention_mask"] = tokens["attention_mask"].to(self._device)
+        return np.asarray(self._unit(self._network.get_text_features(**given))[0])
+
+    def _unit(self, features: Any) -> Float32:
+        vectors: Tensor = features if isinstance(features, Tensor) else features.pooler_output
+        return unit_rows(vectors.float().cpu().numpy(), self.space)
+
+
+def _normalization(path: Path, family: Family) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+    """Mean, standard deviation and the factor before them, by preprocessor_config.json."""
+    content = read_json(path)
+    if not isinstance(content, Mapping):
+        raise DataError(f"detector.model: {path} must hold an object")
+    mean, std = (tuple(content.get(key, value)) for key, value in zip(
+        ("image_mean", "image_std"), (family.mean, family.std), strict=True))  # fmt: skip
+    factor = content.get("rescale_factor", 1 / 255)
+    numbers = (*mean, *std, factor)
+    if len(numbers) != 7 or not all(isinstance(x, int | float) and np.isfinite(x) for x in numbers) or 0 in std:
+        raise DataError(
+            f"detector.model: {path}: image_mean, image_std and rescale_factor must be numbers, not {numbers}"
+        )
+    return mean, std, float(factor)
+
+
+def _space(folder: Path, model: str) -> str:
+    """Of a model id, with the commit that was downloaded; of a folder, with a hash of what it computes with."""
+    if folder.parent.name == "snapshots":
+        return f"{model}@{folder.name}"
+    weights = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("pytorch_model*.bin"))
+    hashes = "".join(path_hash(path) for path in [folder / CONFIG, *weights])
+    return f"{folder.name}@{hashlib.sha256(hashes.encode()).hexdigest()[:HASH_DIGITS]}"

@@ -1,0 +1,104 @@
+"""A network in an ONNX file, run by onnxruntime."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from framework.data import Array
+from framework.detection.hub.weights_file import (
+    Shape,
+    checked_hash,
+    find_file,
+    image_input,
+    input_shape,
+    is_channels_last,
+)
+from framework.detection.runtimes.export_metadata import ExportMetadata
+from framework.detection.runtimes.network_outputs import Outputs, finite_outputs, one_line
+from framework.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from onnxruntime import InferenceSession, NodeArg
+
+INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # numpy's names
+
+
+class OnnxNetwork:
+    """A network from one image to named arrays, on the CPU or with CUDA.
+
+    It takes as many threads as OpenCV, which `threads` of the config sets: onnxruntime would take all cores. Its idle
+    threads sleep, because the map is built at the same time.
+    """
+
+    def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
+        """Loads the network of the file `path`; see `find_file` for a relative one.
+
+        sha256: what the file must have, "" = whatever it is. device: auto, cpu or cuda. input_size: px, the side of
+        the square input of a network that takes any size, 0 for one with a size of its own.
+
+        Raises:
+            DataError: the file is missing, damaged, not the expected one, or cannot be run.
+            ConfigError: onnxruntime or the device is not there, or `input_size` does not fit the network.
+        """
+        self.path = find_file(path)
+        self.sha256 = checked_hash(self.path, sha256)
+        self._session = _loaded(self.path, device)
+        self.metadata = ExportMetadata.parse(self._session.get_modelmeta().custom_metadata_map)
+        image, shape = image_input(self.path, self._session.get_inputs(), _shape, _described)
+        if image.type not in INPUT_DTYPES:
+            wanted = ", ".join(INPUT_DTYPES.values())
+            raise DataError(f"{self.path}: the input must be one of {wanted}, found {_described(image)}")
+        self._name = image.name
+        self.dtype = INPUT_DTYPES[image.type]
+        self.channels_last = is_channels_last(shape)
+        self.shape = input_shape(self.path, _described(image), shape, input_size, self.metadata)
+
+    def __call__(self, image: Array) -> Outputs:
+        """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
+
+        Raises DataError when the network fails or computes numbers that are not finite.
+        """
+        blob = image[None] if self.channels_last else image.transpose(2, 0, 1)[None]
+        names = [output.name for output in self._session.get_outputs()]
+        try:
+            outputs = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
+        except Exception as error:  # onnxruntime has no base of its own
+            raise DataError(f"{self.path} failed in onnxruntime: {one_line(error)}") from error
+        return finite_outputs(self.path, zip(names, outputs, strict=True))
+
+
+def _loaded(path: Path, device: str) -> InferenceSession:
+    try:
+        import onnxruntime
+    except ImportError as error:
+        raise ConfigError("onnxruntime, which runs ONNX files, is not there: pip install instancemap[onnx]") from error
+    cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    if device == "cuda" and not cuda:
+        raise ConfigError("detector.device must be cpu or auto without onnxruntime-gpu and a GPU, found cuda")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = cv2.getNumThreads()
+    options.inter_op_num_threads = 1
+    options.log_severity_level = 3  # errors
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    providers = ["CUDAExecutionProvider"] * (cuda and device != "cpu") + ["CPUExecutionProvider"]
+    try:
+        session = onnxruntime.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:  # onnxruntime has no base of its own
+        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {one_line(error)}") from error
+    if device == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
+        raise ConfigError("detector.device must be cpu or auto where CUDA cannot be started, found cuda")
+    return session
+
+
+def _described(tensor: NodeArg) -> str:
+    shape = ", ".join(str(n or "any") for n in _shape(tensor))
+    return f"{tensor.name} ({shape}) {INPUT_DTYPES.get(tensor.type, tensor.type)}"
+
+
+def _shape(tensor: NodeArg) -> Shape:
+    """With 0 for any: such a dimension has a name, or none."""
+    return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)

@@ -1,0 +1,202 @@
+"""COCO's result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
+
+Beside COCO's own keys an entry may have `category_name`, and `class_probabilities`: the whole distribution. pycocotools
+reads such a file only beside the annotations of its images, and trusts its entries.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from enum import Enum
+from pathlib import Path, PurePosixPath
+from typing import Any, TextIO
+
+import numpy as np
+
+from framework.data import MOST_PIXELS, Detections, Float32
+from framework.detection.masks.run_length import check, encode, pack
+from framework.detection.stored.stored_detection import (
+    Polygons,
+    RunLengths,
+    Segmentation,
+    StoredDetection,
+    read_label,
+    read_probabilities,
+    read_score,
+)
+from framework.errors import ConfigError, DataError
+from framework.files.atomic_write import written_whole
+from framework.files.json_file import read_json
+from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
+
+MOST_DIGITS = 18  # of a frame's number
+
+
+class CategoryIds(Enum):
+    """What `category_id` counts."""
+
+    COCO_91 = "the ids of COCO's annotation files: 1 to 90, with gaps"
+    FROM_ONE = "the labels, from 1"
+    FROM_ZERO = "the labels, from 0"
+
+    def of(self, labels: Sequence[str]) -> list[int]:
+        """The id of each label. Raises ConfigError where the labels are not those that the ids belong to."""
+        if self is not CategoryIds.COCO_91:
+            return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
+        if tuple(labels) != COCO:
+            raise ConfigError("detector.category_ids must be FROM_ONE or FROM_ZERO where labels is not coco")
+        return [k for k, name in enumerate(COCO_BY_ID) if name != NO_CLASS]
+
+
+def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
+    """The detections of a result file, in its order. Raises DataError, naming file and entry, for what cannot be used.
+
+    `segmentation` is run lengths (packed or a list) or polygons. `image_id` is `Frame.index`, as a number or as the
+    name of the image's file ("color/000012.png"). `category_id` counts only where there is no `category_name`.
+    """
+    entries = read_json(path)
+    if not isinstance(entries, list):
+        raise DataError(f"{path} must hold a list of results, as COCO's evaluation reads them, found an object")
+    index = {name: k for k, name in enumerate(labels)}
+    names: dict[int, str] | None = None
+    found: list[StoredDetection] = []
+    folders: dict[int, PurePosixPath] = {}
+    for k, entry in enumerate(entries):
+        where = f"{path}, entry {k}"
+        if not isinstance(entry, Mapping):
+            raise DataError(f"{where}: expected an object, found {entry!r}")
+        if names is None and entry.get("category_name") is None:
+            names = dict(zip(ids.of(labels), labels, strict=True))
+        try:
+            found.append(_read_entry(where, entry, index, names or {}))
+            if isinstance(entry["image_id"], str):
+                _check_folder(folders, found[-1].frame, PurePosixPath(entry["image_id"]))
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from error
+    return found
+
+
+def _read_entry(
+    where: str, entry: Mapping[str, Any], index: Mapping[str, int], names: Mapping[int, str]
+) -> StoredDetection:
+    if entry.get("category_name") is not None:
+        label = read_label(entry["category_name"], index)
+    elif type(entry.get("category_id")) is int and entry["category_id"] in names:
+        label = names[entry["category_id"]]
+    else:
+        raise DataError(f"category_id {entry.get('category_id')!r} is not the id of a label; see detector.category_ids")
+    return StoredDetection(
+        where=where,
+        frame=_read_image_id(entry.get("image_id")),
+        label=label,
+        score=read_score(entry.get("score")),
+        segmentation=_read_segmentation(entry.get("segmentation")),
+        probabilities=read_probabilities(entry.get("class_probabilities"), index),
+        box=_read_box(entry.get("bbox")),
+        exact=entry.get("exact") is True,
+    )
+
+
+def _check_folder(folders: dict[int, PurePosixPath], frame: int, image: PurePosixPath) -> None:
+    """Raises DataError where a frame's detections are of images in several folders, so of several sequences."""
+    other = folders.setdefault(frame, image.parent)
+    if image.parent != other:
+        raise DataError(f"{image} and another image in {other}/ are both frame {frame}; a file is of one sequence")
+
+
+def _read_image_id(found: Any) -> int:
+    if type(found) is int and found >= 0:
+        return found
+    name = PurePosixPath(found if isinstance(found, str) else "")
+    stem = "" if name.suffix[1:].isdigit() else name.stem  # 12.5 is no file name
+    if not (stem.isascii() and stem.isdigit() and len(stem) <= MOST_DIGITS):
+        raise DataError(f"image_id must be the frame's number, or a file name that is one, found {found!r}")
+    return int(stem)
+
+
+def _read_box(found: Any) -> Float32 | None:
+    if found is None:
+        return None
+    whole = isinstance(found, list) and len(found) == 4
+    if not whole or not all(isinstance(x, int | float) and abs(x) <= MOST_PIXELS for x in found) or min(found[2:]) < 0:
+        raise DataError(f"bbox must be [x, y, width, height] px, at most {MOST_PIXELS}, found {found!r:.200}")
+    x, y, width, height = found
+    return np.array([x, y, x + width, y + height], np.float32)
+
+
+def _read_segmentation(found: Any) -> Segmentation:
+    if isinstance(found, list):
+        return _read_polygons(found)
+    size = found.get("size") if isinstance(found, Mapping) else None
+    if not isinstance(size, list) or len(size) != 2 or not all(type(side) is int and side > 0 for side in size):
+        raise DataError("segmentation must be run lengths with their size [height, width], or a list of polygons")
+    shape = (size[0], size[1])
+    if shape[0] * shape[1] > MOST_PIXELS:
+        raise DataError(f"segmentation.size is {shape[1]}x{shape[0]} px, more than the {MOST_PIXELS} of any image")
+    counts = found.get("counts")
+    if isinstance(counts, list):
+        return RunLengths(pack(counts, shape), shape)
+    if not isinstance(counts, str) or not counts.isascii():
+        raise DataError("segmentation.counts must be a packed string or a list of run lengths")
+    packed = counts.encode()
+    check(packed, shape)
+    return RunLengths(packed, shape)
+
+
+def _read_polygons(found: Sequence[Any]) -> Polygons:
+    for outline in found:
+        if not isinstance(outline, list) or len(outline) < 6 or len(outline) % 2:
+            raise DataError("a polygon must be a list x1, y1, x2, y2, ... of three points or more")
+        if not all(isinstance(x, int | float) and np.isfinite(x) for x in outline):
+            raise DataError("a polygon's coordinates must be numbers, px")
+    if not found:
+        raise DataError("segmentation has no polygon")
+    return Polygons(tuple(tuple(float(x) for x in outline) for outline in found))
+
+
+class ResultWriter:
+    """Writes the entries of a result file, frame by frame."""
+
+    def __init__(self, file: TextIO, classes: tuple[str, ...]) -> None:
+        self._file = file
+        self._classes = classes
+        self._ids = (CategoryIds.COCO_91 if classes == COCO else CategoryIds.FROM_ONE).of(classes)
+        self.count = 0  # entries written
+        self.frames = 0
+
+    def write(self, frame: int, detections: Detections) -> None:
+        """Adds the detections of frame number `frame`."""
+        height, width = detections.masks.shape[1:]
+        best = detections.class_probabilities.argmax(axis=1).tolist()
+        boxes = detections.boxes.astype(np.float64)  # in which x + width is x2 again
+        for k, counts in enumerate(encode(detections.masks)):
+            x1, y1, x2, y2 = boxes[k].tolist()
+            entry = {
+                "image_id": frame,
+                "category_id": self._ids[best[k]],
+                "category_name": self._classes[best[k]],
+                "segmentation": {"size": [height, width], "counts": counts.decode()},
+                "bbox": [x1, y1, x2 - x1, y2 - y1],
+                "score": _shortest(detections.scores[k : k + 1])[0],
+                "class_probabilities": _shortest(detections.class_probabilities[k]),
+                **({"exact": True} if detections.exact else {}),
+            }
+            self._file.write((",\n" if self.count else "") + json.dumps(entry, separators=(",", ":"), allow_nan=False))
+            self.count += 1
+        self.frames += 1
+
+
+@contextmanager
+def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]:
+    """A result file of a detector with these classes, there once the body has succeeded and not before."""
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        file.write("[\n")
+        yield ResultWriter(file, classes)
+        file.write("\n]\n")
+
+
+def _shortest(values: Float32) -> list[float]:
+    """The numbers with as few digits as tell one float32 from the next: half the file, and the same bits again."""
+    return [float(text) for text in values.astype(str)]

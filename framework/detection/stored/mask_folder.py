@@ -1,0 +1,95 @@
+"""A folder of masks: for each frame NNNNNN.png with instance ids, and NNNNNN.json that says what they are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Bool
+from framework.detection.stored.stored_detection import (
+    Segmentation,
+    StoredDetection,
+    read_label,
+    read_probabilities,
+    read_score,
+)
+from framework.errors import DataError
+from framework.files.image_files import read_uint16
+from framework.files.json_file import read_json
+
+_read_ids = lru_cache(maxsize=1)(read_uint16)  # the detections of a frame share its image
+
+LARGEST_ID = np.iinfo(np.uint16).max
+
+
+@dataclass(frozen=True)
+class InstanceOfImage(Segmentation):
+    """The pixels of an image that hold an id."""
+
+    path: Path
+    id: int
+
+    def mask(self, shape: tuple[int, int]) -> Bool:
+        ids = _read_ids(self.path)
+        if ids.shape != shape:
+            raise DataError(f"the image is {ids.shape[1]}x{ids.shape[0]} px, but the frame {shape[1]}x{shape[0]} px")
+        return np.asarray(ids == self.id, np.bool_)
+
+
+def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
+    """The detections of a folder of masks. Raises DataError, naming file and entry, for what cannot be used.
+
+    NNNNNN is `Frame.index`; the PNG has one channel of 16 bits; the JSON is a list of {"id", "class", "score"} and,
+    where known, "class_probabilities". Ids that it does not list are no detections. Masks cannot overlap here.
+    """
+    index = {name: k for k, name in enumerate(labels)}
+    found: list[StoredDetection] = []
+    images: dict[int, Path] = {}
+    for path in sorted(folder.glob("*.png")):
+        if not (path.stem.isascii() and path.stem.isdigit()):
+            raise DataError(f"{path}: expected the frame's number as the name, such as 000012.png")
+        frame = int(path.stem)
+        if images.setdefault(frame, path) != path:
+            raise DataError(f"{path} and {images[frame].name} are both of frame {frame}; keep one of them")
+        description = path.with_suffix(".json")
+        ids: set[int] = set()
+        for k, entry in enumerate(_read_list(description)):
+            where = f"{description}, entry {k}"
+            try:
+                instance = _read_id(entry.get("id"))
+                if instance in ids:
+                    raise DataError(f"id {instance} is there twice")
+                ids.add(instance)
+                found.append(
+                    StoredDetection(
+                        where=where,
+                        frame=frame,
+                        label=read_label(entry.get("class"), index),
+                        score=read_score(entry.get("score")),
+                        segmentation=InstanceOfImage(path, instance),
+                        probabilities=read_probabilities(entry.get("class_probabilities"), index),
+                    )
+                )
+            except DataError as error:
+                raise DataError(f"{where}: {error}") from error
+    alone = [path for path in sorted(folder.glob("*.json")) if not path.with_suffix(".png").exists()]
+    if alone:
+        raise DataError(f"{alone[0]} has no image {alone[0].stem}.png beside it")
+    return found
+
+
+def _read_list(path: Path) -> list[dict[str, object]]:
+    entries = read_json(path)
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        raise DataError(f"{path} must hold a list of objects with id, class and score")
+    return entries
+
+
+def _read_id(found: object) -> int:
+    if type(found) is not int or not 0 < found <= LARGEST_ID:
+        raise DataError(f"id must be a whole number from 1 to {LARGEST_ID}, found {found!r}")
+    return found

@@ -1,0 +1,293 @@
+"""Record3D (https://record3d.app): its "EXR + RGB" export, and the .r3d file that it records.
+
+    metadata.json           w, h and dw, dh px of colour and depth; K, 3 x 3 in columns, of colour; fps; poses, a list
+                            [qx, qy, qz, qw, x, y, z] a frame; newer: frameTimestamps, s, and perFrameIntrinsicCoeffs,
+                            [fx, fy, cx, cy] a frame
+    rgb/0.jpg, depth/0.exr  8-bit colour; depth in m, half or single floats in the one channel R
+
+An .r3d file is a zip: metadata (the same JSON), rgbd/0.jpg, rgbd/0.depth (float32, m) and rgbd/0.conf (uint8, 0 to 2,
+only with a LiDAR), the last two compressed by LZFSE. Images stand upright in both, and poses are T_world_camera of the
+upright camera in ARKit's axes: in a real export, which looks down at a door handle, they say 50 degrees down. Older
+versions began with the identity and do not tell up, newer ones have `arframe.camera.transform`, by the app's author in
+marek-simonik/record3d, issues 27 and 64: up is told where the first pose is turned.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from framework.data import MOST_PIXELS, Camera, Float32, Float64, UInt8
+from framework.datasets.calibration.camera_json import read_json_object
+from framework.errors import ConfigError, DataError, FrameError, in_one_line
+from framework.files.atomic_write import MOST_TEXT, read_bytes
+from framework.files.image_files import LARGEST_FILE, decode_color, read_color
+from framework.files.json_file import parse_json
+from framework.files.number_lines import SHOWN
+from framework.files.tum_trajectory import QUATERNION_TOLERANCE
+from framework.importing.phones import json_numbers
+from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, readings
+
+CHANNEL = "R"  # of the EXR files
+LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
+BYTES_A_BLOCK = 20_000  # of an image, at least; the compressor ends a block after 40,000 bytes without repetitions
+UNTURNED = 1e-3  # sine of half the angle: nobody holds a phone so exactly along the axes of the world
+MOST_BLOCKS = 8  # beside these: each may unpack to 27 MB, whatever it says
+
+_MISSING = "{} is not there: pip install instancemap[phone]"
+
+
+class Record3DFiles(Protocol):
+    """The images of a recording, by the number of the frame. Reading raises DataError."""
+
+    def color(self, number: int) -> UInt8:
+        """(H, W, 3) RGB."""
+
+    def depth(self, number: int, shape: tuple[int, int]) -> Float32:
+        """(h, w) m, 0 = no reading."""
+
+    def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
+        """(h, w), 0 to 2; None where the recording has none."""
+
+    def name(self, number: int) -> str:
+        """For messages."""
+
+
+def folder_recognised(path: Path) -> bool:
+    """Whether `path` is a folder with the app's EXR + RGB export."""
+    return (path / "metadata.json").is_file() and (path / "rgb").is_dir() and (path / "depth").is_dir()
+
+
+def open_folder(path: Path) -> Source:
+    """The recording in a folder. Raises DataError, naming the file, when it is none that can be read."""
+    _load_openexr()
+    return _source(path / "metadata.json", read_json_object(path / "metadata.json"), ExrFolder(path))
+
+
+def file_recognised(path: Path) -> bool:
+    """Whether `path` is a file that the app recorded."""
+    return path.suffix.lower() == ".r3d" and path.is_file()
+
+
+def open_file(path: Path) -> Source:
+    """The recording in a file. Raises DataError, naming it, when it is none that can be read."""
+    _load_lzfse()
+    files = R3dFile(path)
+    where = f"{path}: metadata"
+    content = parse_json(where, files.read("metadata", MOST_TEXT))
+    if not isinstance(content, dict):
+        raise DataError(f"{where} must be a JSON object, found {type(content).__name__}")
+    return _source(where, content, files)
+
+
+@dataclass(frozen=True)
+class ExrFolder:
+    """The images of an export."""
+
+    folder: Path
+
+    def color(self, number: int) -> UInt8:
+        return read_color(self.folder / f"rgb/{number}.jpg")
+
+    def depth(self, number: int, shape: tuple[int, int]) -> Float32:
+        path = self.folder / f"depth/{number}.exr"
+        return readings(_read_exr(path, read_bytes(path, LARGEST_FILE), shape))
+
+    def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
+        return None
+
+    def name(self, number: int) -> str:
+        return str(self.folder / f"depth/{number}.exr")
+
+
+class R3dFile:
+    """The images of an .r3d file."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises DataError, naming the file, when it is no zip."""
+        self.path = path
+        try:
+            self._zip = zipfile.ZipFile(path)
+        except (OSError, zipfile.BadZipFile) as error:
+            raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
+        self._members = set(self._zip.namelist())
+
+    def color(self, number: int) -> UInt8:
+        name = f"rgbd/{number}.jpg"
+        return decode_color(f"{self.path}: {name}", self.read(name, LARGEST_FILE))
+
+    def depth(self, number: int, shape: tuple[int, int]) -> Float32:
+        return readings(self._unpacked(f"rgbd/{number}.depth", "<f4", shape).astype(np.float32))
+
+    def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
+        name = f"rgbd/{number}.conf"
+        return np.asarray(self._unpacked(name, "u1", shape), np.uint8) if name in self._members else None
+
+    def name(self, number: int) -> str:
+        return f"{self.path}: rgbd/{number}.depth"
+
+    def read(self, name: str, most: int) -> bytes:
+        """What a member holds. Raises DataError, naming it, when it cannot be read or says it has more than `most`."""
+        try:
+            info = self._zip.getinfo(name)
+            if info.file_size > most:
+                raise DataError(
+                    f"{self.path}: {name} has {info.file_size} bytes, more than the {most} that it can have"
+                )
+            return self._zip.read(info)
+        except KeyError as error:
+            raise FrameError(f"{self.path} has no {name}") from error
+        except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, ValueError, RuntimeError) as error:
+            raise FrameError(f"{self.path}: {name} is damaged: {in_one_line(error)[:SHOWN]}") from error
+        except NotImplementedError as error:
+            raise FrameError(f"{self.path}: {name} is compressed in a way that is not known: {error}") from error
+
+    def _unpacked(self, name: str, dtype: str, shape: tuple[int, int]) -> np.typing.NDArray[np.generic]:
+        size = math.prod(shape) * np.dtype(dtype).itemsize
+        packed = self.read(name, 2 * size + 1000)
+        if packed.count(LZFSE_BLOCK) > MOST_BLOCKS + size // BYTES_A_BLOCK:
+            raise FrameError(f"{self.path}: {name} has more blocks than {size} bytes have when they are packed")
+        lzfse = _load_lzfse()
+        try:
+            raw = lzfse.decompress(packed)
+        except (lzfse.error, MemoryError) as error:
+            raise FrameError(f"{self.path}: {name} could not be unpacked: it is damaged") from error
+        if len(raw) != size:
+            raise FrameError(f"{self.path}: {name} has {len(raw)} bytes, expected {size} for {shape[1]}x{shape[0]} px")
+        return np.frombuffer(raw, dtype).reshape(shape)
+
+
+def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles) -> Source:
+    poses = content.get("poses")
+    if not isinstance(poses, list) or not poses:
+        raise DataError(f"{where}: poses must be a list of poses, found {str(poses)[:60]}")
+    size = json_numbers.named(where, content, "w", "h")
+    cameras = [json_numbers.camera(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
+    shape = _depth_shape(where, content, cameras[0])
+    times = _times(where, content, len(poses))
+    tells_up = not _is_unturned(poses[0])
+    frames = [
+        partial(_read, files, k, times[k], camera, shape, f"{where}: pose {k}", poses[k], tells_up)
+        for k, camera in enumerate(cameras)
+    ]
+    return Source("Record3D", frames, len(frames), posed=True)
+
+
+def _read(
+    files: Record3DFiles,
+    number: int,
+    timestamp: float,
+    camera: Camera,
+    shape: tuple[int, int],
+    where: str,
+    pose: Any,
+    tells_up: bool,
+) -> DeviceFrame:
+    T_world_camera = _pose(where, pose)
+    return DeviceFrame(
+        name=files.name(number),
+        timestamp=timestamp,
+        camera=camera,
+        color=files.color(number),
+        depth=files.depth(number, shape),
+        confidence=files.confidence(number, shape),
+        T_world_camera=T_world_camera,
+        up=arkit_up(T_world_camera) if tells_up else None,
+    )
+
+
+def _pose(where: str, values: Any) -> Float64:
+    quat_xyzw, position = np.split(np.array(json_numbers.finite(where, values, 7)), [4])
+    length = float(np.linalg.norm(quat_xyzw))
+    if abs(length - 1) > QUATERNION_TOLERANCE:
+        raise DataError(f"{where}: the quaternion qx qy qz qw has length {length:.4g}, expected 1")
+    T_world_arkit = np.eye(4)
+    T_world_arkit[:3, :3] = Rotation.from_quat(quat_xyzw).as_matrix()
+    T_world_arkit[:3, 3] = position
+    return arkit_pose(where, T_world_arkit)
+
+
+def _is_unturned(pose: Any) -> bool:
+    """Whether a stored pose has the rotation of the identity, or is none."""
+    try:
+        quat_xyzw = json_numbers.finite("pose", pose, 7)[:4]
+    except DataError:
+        return True
+    return bool(np.linalg.norm(quat_xyzw[:3]) < UNTURNED)
+
+
+def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> list[tuple[float, ...]]:
+    """fx, fy, cx, cy of each frame's colour image."""
+    own = content.get("perFrameIntrinsicCoeffs")
+    if isinstance(own, list) and len(own) == count:
+        return [tuple(json_numbers.finite(f"{where}: perFrameIntrinsicCoeffs", values, 4)) for values in own]
+    fx, _, _, _, fy, _, cx, cy, _ = json_numbers.listed(where, content, "K", 9)
+    return [(fx, fy, cx, cy)] * count
+
+
+def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
+    """s, of each frame; by the frame rate in recordings of before the app stored them."""
+    if "frameTimestamps" in content:
+        return json_numbers.listed(where, content, "frameTimestamps", count)
+    [rate] = json_numbers.named(where, content, "fps")
+    if not rate > 0:
+        raise DataError(f"{where}: fps must be positive, found {rate:g}")
+    return [k / rate for k in range(count)]
+
+
+def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
+    """(h, w) px of depth. Before the app stored it, depth came from the camera at the front, in colour's size."""
+    if "dw" not in content:
+        return camera.shape
+    width, height = json_numbers.named(where, content, "dw", "dh")
+    of_depth = json_numbers.camera(where, width, height, camera.fx, camera.fy, 0, 0)
+    return of_depth.shape
+
+
+def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
+    """(h, w) of the one channel. The header is looked at first: it says how much memory the rest takes."""
+    OpenEXR = _load_openexr()
+    try:
+        header = OpenEXR.File(io.BytesIO(data), header_only=True).header()
+        low, high = header["dataWindow"]
+        found = tuple(int(n) for n in (high - low + 1)[::-1])
+        names = [channel.name for channel in header["channels"]]
+    except Exception as error:  # of many kinds
+        raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
+    if found != shape or names != [CHANNEL] or math.prod(shape) > MOST_PIXELS:
+        raise FrameError(
+            f"{path} has {found[1]}x{found[0]} px of {', '.join(names)[:60]}, "
+            f"expected {shape[1]}x{shape[0]} of {CHANNEL}"
+        )
+    try:
+        image = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[CHANNEL].pixels
+    except Exception as error:
+        raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
+    if image.shape != shape or image.dtype not in (np.float16, np.float32):
+        raise FrameError(f"{path} must hold floats, found {image.dtype}")
+    return np.asarray(image, np.float32)
+
+
+def _load_openexr() -> Any:
+    try:
+        import OpenEXR
+    except ImportError as error:
+        raise ConfigError(_MISSING.format("OpenEXR, which reads Record3D's depth,")) from error
+    return OpenEXR
+
+
+def _load_lzfse() -> Any:
+    try:
+        import lzfse
+    except ImportError as error:
+        raise ConfigError(_MISSING.format("lzfse, which unpacks Record3D's .r3d files,")) from error
+    return lzfse

@@ -1,0 +1,114 @@
+"""Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md): iPhones and iPads with LiDAR.
+
+    rgb.mp4                 HEVC, 1920x1440, as the sensor lies: a phone held upright shows the room on its side
+    depth/000000.png        uint16 mm, 256x192, one a frame of the video
+    confidence/000000.png   uint8 0 to 2, ARKit's
+    camera_matrix.csv       3 x 3 intrinsics of the video
+    odometry.csv            timestamp, frame, x, y, z, qx, qy, qz, qw, and of newer versions fx, fy, cx, cy
+
+The app turns ARKit's camera about its x axis before it writes (q_WA * q_AC in its OdometryEncoder), so that poses are
+T_world_camera in our axes. A real recording agrees: there its accelerometer has gravity 0.20 along the view, and these
+poses say 0.24; in ARKit's axes they would say -0.24.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from framework.data import Camera
+from framework.errors import DataError
+from framework.files.image_files import read_uint8, read_uint16
+from framework.files.number_lines import SHOWN, numbers, read_lines
+from framework.files.tum_trajectory import TumLine
+from framework.importing.phones.video import Video
+from framework.importing.source import DeviceFrame, Source, arkit_up, metres
+
+POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
+INTRINSICS = ("fx", "fy", "cx", "cy")  # the next ones, of newer versions
+LAST_FRAME = 10**6 - 1  # six digits
+
+
+@dataclass(frozen=True)
+class OdometryRow:
+    """A line of odometry.csv."""
+
+    line: TumLine
+    frame: int  # number of the images
+    camera: Camera  # of the video in this frame
+
+
+def recognised(path: Path) -> bool:
+    """Whether `path` is a folder of this app."""
+    return (path / "odometry.csv").is_file() and (path / "camera_matrix.csv").is_file()
+
+
+def open_source(path: Path) -> Source:
+    """The recording in a folder. Raises DataError, naming the file, when it is none that can be read."""
+    video = Video(path / "rgb.mp4")
+    rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
+    confident = (path / "confidence").is_dir()
+    frames = [partial(_read, path, row, video, confident) for row in rows]
+    return Source("Stray Scanner", frames, len(frames), posed=True)
+
+
+def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: bool) -> DeviceFrame:
+    if isinstance(row, DataError):
+        raise row
+    name, T_world_camera = f"{row.frame:06d}.png", row.line.pose()
+    return DeviceFrame(
+        name=folder / "depth" / name,
+        timestamp=row.line.timestamp,
+        camera=row.camera,
+        color=video.frame(row.frame),
+        depth=metres(read_uint16(folder / "depth" / name)),
+        confidence=read_uint8(folder / "confidence" / name) if confident else None,
+        T_world_camera=T_world_camera,
+        up=arkit_up(T_world_camera),
+    )
+
+
+def _read_odometry(path: Path, camera: Camera) -> list[OdometryRow | DataError]:
+    """Each frame's row, or what is wrong with it; `camera` is that of rows without intrinsics."""
+    lines = read_lines(path)
+    header = [word.strip() for word in lines[0].split(",")] if lines else []
+    if tuple(header[: len(POSE)]) != POSE:
+        raise DataError(f"{path} must begin with the line {', '.join(POSE)}, found {', '.join(header)[:100]!r}")
+    if tuple(header[len(POSE) : len(POSE) + len(INTRINSICS)]) != INTRINSICS:
+        lines = [",".join(line.split(",")[: len(POSE)]) for line in lines]
+    numbered = [(n, line.split(",")) for n, line in enumerate(lines[1:], start=2) if line.strip()]
+    return [_row_or_fault(path, n, words, camera) for n, words in numbered]
+
+
+def _row_or_fault(path: Path, number: int, words: list[str], camera: Camera) -> OdometryRow | DataError:
+    where = f"{path}, line {number}"
+    try:
+        timestamp, frame, *pose = numbers(where, words[: len(POSE)], len(POSE), ", ".join(POSE))
+        if not 0 <= frame <= LAST_FRAME or frame != int(frame):
+            raise DataError(f"{where}: a frame is a whole number, found {words[1].strip()[:SHOWN]!r}")
+        own = [word for word in words[len(POSE) : len(POSE) + len(INTRINSICS)] if word.strip()]
+        if own:
+            values = numbers(where, own, len(INTRINSICS), ", ".join(INTRINSICS))
+            camera = _camera(where, camera.width, camera.height, values)
+    except DataError as error:
+        return error
+    return OdometryRow(TumLine(path, number, timestamp, tuple(pose[:3]), tuple(pose[3:])), int(frame), camera)
+
+
+def _read_camera(path: Path, video: Video) -> Camera:
+    lines = [line for line in read_lines(path) if line.strip()]
+    if len(lines) != 3:
+        raise DataError(f"{path} must hold 3 lines of 3 numbers, found {len(lines)} lines")
+    (fx, _, cx), (_, fy, cy), _ = (
+        numbers(f"{path}, line {n}", line.split(","), 3) for n, line in enumerate(lines, start=1)
+    )
+    return _camera(str(path), video.width, video.height, (fx, fy, cx, cy))
+
+
+def _camera(where: str, width: int, height: int, intrinsics: Sequence[float]) -> Camera:
+    try:
+        return Camera(width, height, *intrinsics)
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error

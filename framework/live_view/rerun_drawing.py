@@ -1,0 +1,256 @@
+"""Draws a run into a rerun recording (rerun-sdk 0.41)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+import open3d  # noqa: F401  # here and not in the middle of a run: boxes need it
+import simplejpeg
+from scipy.spatial.transform import Rotation
+
+from framework.data import Float32, Float64, Frame, InstanceMesh, Int32, Pose, UInt8
+from framework.live_view import rerun_layout as at
+from framework.live_view.instance_colors import InstanceColors
+from framework.live_view.mesh_regions import MeshRegions
+from framework.live_view.seen_instances import seen_instances
+from framework.live_view.updates import FrameNote, MapSnapshot, Picture
+from framework.mapping.instances.instance_list import box_around, vertices_by_id
+
+if TYPE_CHECKING:
+    import rerun as rr
+
+PATH_PIECE = 200  # poses that are drawn anew when one is added
+MM = 1000  # units of depth images per m
+UNKNOWN = 65535  # number, in an image of masks, of what is under a mask and no instance of the map
+UNKNOWN_COLOR = np.array([235, 235, 235], np.uint8)
+MASK_OPACITY = 0.5
+PATH_COLOR, LOST_COLOR = (40, 160, 255), (230, 60, 50)
+NAME_RADIUS = 0.005  # m
+PATH_RADIUS = 0.004  # m
+FRUSTUM_M = 0.25  # m, from the camera to its picture
+LEAST_TURN = 0.01  # of a unit vector, that up must have changed by
+
+
+class RerunDrawing:
+    """A `Drawing` that logs to a recording stream.
+
+    Pictures have every `stride`-th pixel of a frame in either direction, JPEG of `jpeg_quality`; the mesh lies in
+    regions of `region` m; instances below `min_confidence` are background, detections below it have no name.
+    """
+
+    def __init__(
+        self, recording: rr.RecordingStream, stride: int, jpeg_quality: int, region: float, min_confidence: float
+    ) -> None:
+        import rerun
+
+        self._rr, self._recording = rerun, recording
+        self._stride, self._jpeg_quality, self._min_confidence = stride, jpeg_quality, min_confidence
+        self._regions, self._colors = MeshRegions(region), InstanceColors()
+        self._first_s: float | None = None  # timestamp of the first frame
+        self._path: list[Float32] = []  # (3,) of the last piece
+        self._pieces = 0
+        self._up: Float64 | None = None  # (3,) as it is drawn
+        self._ahead: Float64 = np.array([0.0, 0.0, 1.0])  # (3,) where the first camera looked
+        self._mesh: InstanceMesh | None = None  # as it was drawn last, its instances those that are shown
+        self._names: dict[int, str] = {}  # of these
+        self._named: dict[int, str] = {}  # of all so far, as they are in images of masks
+        recording.log("/", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stages, colors = [*at.STAGE_COLORS], [*at.STAGE_COLORS.values()]
+        recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
+        self._name_masks()
+
+    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: Picture | None) -> None:
+        for note in notes:
+            self._note(note)
+        self._draw_times(notes)
+        for fault in faults:
+            self._recording.log(at.LOG, self._rr.TextLog(f"skipped: {fault}", level="WARN"))
+        if self._path:
+            self._draw_path()
+        if picture is not None:
+            self._set_time(picture.frame.index, picture.frame.timestamp)
+            self._draw_camera(picture.frame, picture.pose)
+            self._draw_picture(picture)
+
+    def draw_map(self, snapshot: MapSnapshot) -> None:
+        self._set_time(snapshot.index, snapshot.timestamp)
+        if snapshot.up is not None:
+            self._turn(snapshot.up)
+        shown = {key: of for key, of in snapshot.objects.items() if of[1] >= self._min_confidence}
+        mesh = snapshot.mesh
+        ids = np.where(np.isin(mesh.instance_ids, [*shown]), mesh.instance_ids, 0).astype(np.int32)
+        self._mesh = replace(mesh, instance_ids=ids)
+        members = vertices_by_id(ids)
+        self._names = {key: mesh.classes[shown[key][0]] for key in members}
+        self._colors.add({key: mesh.vertices[of].mean(axis=0, dtype=np.float64) for key, of in members.items()})
+        if not self._named.items() >= self._names.items():
+            self._named |= self._names
+            self._name_masks()
+        self._draw_mesh(self._mesh)
+        self._draw_boxes(members, {key: shown[key][1] for key in members}, snapshot)
+
+    def close(self) -> None:
+        try:
+            self._recording.flush()
+        finally:
+            self._recording.disconnect()
+
+    def _set_time(self, index: int, timestamp: float) -> None:
+        self._recording.set_time(at.FRAME, sequence=index)
+        self._recording.set_time(at.SECONDS, duration=self._since_first(timestamp))
+
+    def _since_first(self, timestamp: float) -> float:
+        self._first_s = timestamp if self._first_s is None else self._first_s
+        return timestamp - self._first_s
+
+    def _turn(self, up: Float64) -> None:
+        """Turns the world so that `up` (3,) is the view's z."""
+        if self._up is None or not np.allclose(self._up, up, atol=LEAST_TURN):
+            self._up = up
+            self._recording.log(at.WORLD, self._rr.Transform3D(mat3x3=turned(up, self._ahead)))
+
+    def _begin_world(self, T_world_camera: Float64) -> None:
+        """Turns the world as the first camera was held, until the map knows better, and looks over its shoulder."""
+        up, self._ahead = -T_world_camera[:3, 1], T_world_camera[:3, 2]
+        self._turn(up)
+        T_view_camera = T_world_camera.copy()
+        T_view_camera[:3] = turned(up, self._ahead) @ T_world_camera[:3]
+        self._recording.send_blueprint(at.layout(T_view_camera))
+        self._recording.log(at.LOG, self._rr.TextLog("mapping begins", level="INFO"))
+
+    def _note(self, note: FrameNote) -> None:
+        self._set_time(note.index, note.timestamp)
+        if note.pose.lost:
+            reason = note.pose.reason or "the tracker gave no reason"
+            self._recording.log(at.LOG, self._rr.TextLog(f"lost: {reason}", level="WARN"))
+            self._end_piece()
+            return
+        T_world_camera = note.pose.T_world_camera
+        if self._up is None:
+            self._begin_world(T_world_camera)
+        self._path.append(T_world_camera[:3, 3].astype(np.float32))
+        if len(self._path) == PATH_PIECE:
+            self._end_piece()
+            self._path.append(T_world_camera[:3, 3].astype(np.float32))
+
+    def _draw_path(self) -> None:
+        strip = self._rr.LineStrips3D([self._path], colors=PATH_COLOR, radii=PATH_RADIUS)
+        self._recording.log(f"{at.PATH}/{self._pieces}", strip)
+
+    def _end_piece(self) -> None:
+        if self._path:
+            self._draw_path()
+            self._pieces += 1
+            self._path = []
+
+    def _draw_times(self, notes: Sequence[FrameNote]) -> None:
+        if notes:
+            ms = [[note.stage_ms.get(stage, np.nan) for stage in at.STAGE_COLORS] for note in notes]
+            frames = self._rr.TimeColumn(at.FRAME, sequence=[note.index for note in notes])
+            seconds = self._rr.TimeColumn(at.SECONDS, duration=[self._since_first(note.timestamp) for note in notes])
+            rows = self._rr.Scalars.columns(scalars=np.ravel(ms)).partition([len(at.STAGE_COLORS)] * len(notes))
+            self._recording.send_columns(at.STAGE_MS, indexes=[frames, seconds], columns=rows)
+
+    def _draw_picture(self, picture: Picture) -> None:
+        frame, stride = picture.frame, self._stride
+        color = frame.color
+        if stride > 1:
+            size = tuple(-(-side // stride) for side in reversed(frame.camera.shape))
+            color = cv2.resize(color, size, interpolation=cv2.INTER_AREA)
+        jpeg = simplejpeg.encode_jpeg(np.ascontiguousarray(color), self._jpeg_quality)
+        self._recording.log(at.COLOR, self._rr.EncodedImage(contents=jpeg, media_type="image/jpeg"))
+        depth_mm = np.minimum(frame.depth[::stride, ::stride] * MM, 65535).astype(np.uint16)
+        png = cv2.imencode(".png", depth_mm)[1]
+        depth = self._rr.EncodedDepthImage(blob=png, media_type="image/png", meter=MM, colormap="Viridis")
+        self._recording.log(at.DEPTH, depth)
+        self._draw_found(picture)
+
+    def _draw_found(self, picture: Picture) -> None:
+        """The masks in the colours of their instances, and their names."""
+        found, stride = picture.detections, self._stride
+        ids = np.zeros(len(found), np.int32)
+        if self._mesh is not None and not picture.pose.lost:
+            ids = seen_instances(found.masks, picture.frame, picture.pose.T_world_camera, self._mesh)
+        numbers = np.where((ids > 0) & (ids < UNKNOWN), ids, UNKNOWN).astype(np.uint16)
+        image = np.zeros(found.masks[:, ::stride, ::stride].shape[1:], np.uint16)
+        for mask, number in zip(found.masks[::-1, ::stride, ::stride], numbers[::-1], strict=True):
+            image[mask] = number  # the best is painted last
+        self._recording.log(at.MASKS, self._rr.SegmentationImage(image, opacity=MASK_OPACITY))
+        named = np.flatnonzero(found.scores >= self._min_confidence).tolist()
+        classes = found.class_probabilities.argmax(axis=1)
+        labels = [f"{found.classes[classes[k]]} {found.scores[k]:.2f}" for k in named]
+        colors = [self._colors.known().get(int(ids[k]), UNKNOWN_COLOR) for k in named]
+        boxes = (found.boxes[named] + 0.5) / stride  # rerun's pixels begin at whole numbers
+        form = self._rr.Box2DFormat.XYXY
+        self._recording.log(at.FOUND, self._rr.Boxes2D(array=boxes, array_format=form, colors=colors))
+        middles = (boxes[:, :2] + boxes[:, 2:]) / 2  # below its box, a name may lie outside of the picture
+        names = self._rr.Points2D(middles, labels=labels, colors=_lighter(colors), radii=2.0, show_labels=True)
+        self._recording.log(at.NAMES, names)
+
+    def _draw_camera(self, frame: Frame, pose: Pose) -> None:
+        camera, stride = frame.camera, self._stride
+        T_world_camera = pose.T_world_camera
+        self._recording.log(
+            at.CAMERA,
+            self._rr.Transform3D(translation=T_world_camera[:3, 3], mat3x3=T_world_camera[:3, :3]),
+            self._rr.Pinhole(
+                focal_length=(camera.fx / stride, camera.fy / stride),
+                principal_point=((camera.cx + 0.5) / stride, (camera.cy + 0.5) / stride),
+                resolution=[-(-side // stride) for side in (camera.width, camera.height)],
+                camera_xyz=self._rr.ViewCoordinates.RDF,
+                image_plane_distance=FRUSTUM_M,
+                color=LOST_COLOR if pose.lost else PATH_COLOR,
+            ),
+        )
+
+    def _name_masks(self) -> None:
+        """Says what the numbers in images of masks mean."""
+        known = [(key, name, self._colors[key]) for key, name in self._named.items()]
+        nothing, unknown = (0, "nothing", np.zeros(4, np.uint8)), (UNKNOWN, "not in the map", UNKNOWN_COLOR)
+        self._recording.log(at.MASKS, self._rr.AnnotationContext([nothing, unknown, *known]), static=True)
+
+    def _draw_mesh(self, mesh: InstanceMesh) -> None:
+        colors = self._colors.painted(mesh)
+        for (x, y, z), part in self._regions.changed(mesh.vertices, mesh.triangles, colors):
+            place = f"{at.MESH}/{x}_{y}_{z}"
+            if len(part.triangles):
+                drawn = self._rr.Mesh3D(
+                    vertex_positions=part.vertices, triangle_indices=part.triangles, vertex_colors=part.colors
+                )
+                self._recording.log(place, drawn)
+            else:
+                self._recording.log(place, self._rr.Clear(recursive=False))
+
+    def _draw_boxes(
+        self, members: Mapping[int, Int32], confidences: Mapping[int, float], snapshot: MapSnapshot
+    ) -> None:
+        boxes = [box_around(snapshot.mesh.vertices[of], snapshot.up) for of in members.values()]
+        centers, colors = [box.center for box in boxes], [self._colors[key] for key in members]
+        turned = [Rotation.from_matrix(box.rotation).as_quat() for box in boxes]
+        labels = [f"{self._names[key]} {confidences[key]:.2f}" for key in members]
+        drawn = self._rr.Boxes3D(
+            centers=centers,
+            sizes=[box.extent for box in boxes],
+            quaternions=turned,
+            colors=colors,
+            fill_mode="MajorWireframe",
+        )
+        self._recording.log(at.OBJECTS, drawn)
+        names = self._rr.Points3D(centers, labels=labels, colors=_lighter(colors), radii=NAME_RADIUS, show_labels=True)
+        self._recording.log(at.OBJECT_NAMES, names)
+
+
+def turned(up: Float64, ahead: Float64) -> Float64:
+    """R_view_world (3, 3): turns the unit vector `up` (3,) to z, and the level part of `ahead` (3,) to y."""
+    across = np.cross(ahead, up)
+    across = across / np.linalg.norm(across) if across.any() else np.linalg.svd(up[None])[2][1]
+    return np.stack([across, np.cross(up, across), up])
+
+
+def _lighter(colors: Sequence[UInt8]) -> UInt8:
+    """Colours (N, 3) RGB for texts on a dark ground."""
+    return (np.array(colors, np.uint16).reshape(-1, 3) // 2 + 115).astype(np.uint8)

@@ -1,0 +1,83 @@
+"""The page of rerun's viewer, sealed: this machine alone gets it, and what it shows there may talk to nobody else.
+
+As rerun serves it, the page sends statistics of its use to its makers, and asks several servers for news, examples and
+fonts (0.41, seen in a browser). A Content-Security-Policy forbids that; rerun's own server cannot be told to send one.
+So that one is asked for the page's files, once, and ended.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from threading import Thread
+from urllib.parse import quote
+from urllib.request import ProxyHandler, build_opener
+
+from framework.live_view.rerun_program import HERE, page_server
+
+FILES = ("/", "/re_viewer.js", "/re_viewer_bg.wasm", "/sw.js")  # 43 MB
+SOURCES = "'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' blob: data:"
+SOURCE_TIMEOUT_S = 30.0
+
+
+@dataclass(frozen=True)
+class PageFile:
+    """A file of the page, as it is served."""
+
+    content: bytes
+    content_type: str
+
+
+class SealedPage:
+    """Serves the page on `port` of this machine's own address, until it is closed. Raises OSError where it cannot.
+
+    `data_port` is where the data are; the page may have them, under either name of this machine.
+    """
+
+    def __init__(self, port: int, data_port: int) -> None:
+        data = f"http://{HERE}:{data_port} http://localhost:{data_port}"
+        policy = f"default-src {SOURCES}; connect-src 'self' blob: data: {data}"
+        files: dict[str, PageFile] = {}
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                file = files.get(self.path.partition("?")[0])
+                if file is None:
+                    self.send_error(404)
+                    return
+                self.send_response(200)
+                self.send_header("Content-Type", file.content_type)
+                self.send_header("Content-Length", str(len(file.content)))
+                self.send_header("Content-Security-Policy", policy)
+                self.end_headers()
+                try:
+                    self.wfile.write(file.content)
+                except ConnectionError:  # the browser has gone
+                    self.close_connection = True
+
+            def log_message(self, format: str, *args: object) -> None:
+                """Nobody asked."""
+
+        self._server = ThreadingHTTPServer((HERE, port), Handler)  # first, as the port may be another's
+        try:
+            files |= page_files()
+        except BaseException:
+            self._server.server_close()
+            raise
+        Thread(target=self._server.serve_forever, name="viewer-page", daemon=True).start()
+        self.url = f"http://{HERE}:{port}/?url={quote(f'rerun+http://{HERE}:{data_port}/proxy', safe='')}"
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._server.server_close()
+
+
+def page_files() -> dict[str, PageFile]:
+    """The page's files by path, from rerun's server. Raises OSError where it does not give them."""
+    opener = build_opener(ProxyHandler({}))  # this machine is reached without a proxy
+    found = {}
+    with page_server() as address:
+        for path in FILES:
+            with opener.open(address + path, timeout=SOURCE_TIMEOUT_S) as answer:
+                found[path] = PageFile(answer.read(), answer.headers["Content-Type"])
+    return found

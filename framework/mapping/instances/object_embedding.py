@@ -1,0 +1,119 @@
+"""What an object's pictures mean, as one vector: the mean of the embeddings of its detections."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from framework.data import LONGEST_EMBEDDING, LONGEST_SPACE, Array, Float32, Float64, check_array
+from framework.errors import DataError
+from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader
+
+ARRAYS = ("embedding_ids", "embedding_sums", "embedding_weights", "embedding_counts")
+"""Of a saved map, where its objects have embeddings: (M,) ids int32, (M, D) float64, (M,) float64, (M,) int64."""
+
+SPACE = "embedding_space"  # the key of a saved table that names what its embeddings are of
+MOST_WEIGHT = 1e12  # of one object
+
+
+@dataclass(frozen=True)
+class ObjectEmbedding:
+    """A weighted sum of unit vectors."""
+
+    sum: Float64  # (D,)
+    weight: float  # > 0, of all of them
+    count: int  # how many, >= 1
+
+    @classmethod
+    def of(cls, embedding: Float32, weight: float) -> ObjectEmbedding:
+        """Of one unit vector (D,)."""
+        return cls(weight * embedding.astype(np.float64), weight, 1)
+
+    def __add__(self, other: ObjectEmbedding) -> ObjectEmbedding:
+        if self.sum.shape != other.sum.shape:
+            raise DataError(
+                f"an object has embeddings of {len(self.sum)} numbers and of {len(other.sum)}, both said to be of one "
+                "space; map again with one model"
+            )
+        return ObjectEmbedding(self.sum + other.sum, self.weight + other.weight, self.count + other.count)
+
+    @property
+    def mean(self) -> Float32:
+        """(D,) the unit vector along the sum; 0 where its vectors cancel out."""
+        length = float(np.linalg.norm(self.sum))
+        return np.asarray(self.sum / length if length > 0 else self.sum, np.float32)
+
+    @property
+    def spread(self) -> float:
+        """1 - |mean of the unit vectors|, in [0, 1]: 0 = all alike, near 1 = they have nothing in common."""
+        return float(np.clip(1 - np.linalg.norm(self.sum) / self.weight, 0, 1))
+
+
+def added(known: ObjectEmbedding | None, new: ObjectEmbedding | None) -> ObjectEmbedding | None:
+    """The sum of what two say, of which either may say nothing."""
+    if known is None or new is None:
+        return known or new
+    return known + new
+
+
+def agreed_space(known: str, found: str) -> str:
+    """The space of a map's embeddings, which is that of the first ones: `known` is "" before.
+
+    Raises DataError unless a frame's embeddings are of that one.
+    """
+    if known and known != found:
+        raise DataError(
+            f"the map has embeddings of {known} and this frame's detections have others, of {found}; choose the model "
+            "that the map was made with, or map again"
+        )
+    return found
+
+
+def embedding_arrays(embeddings: Mapping[int, ObjectEmbedding]) -> dict[str, Array]:
+    """What a map's file has of its objects' embeddings, by id; nothing where none has one."""
+    if not embeddings:
+        return {}
+    values = list(embeddings.values())
+    return {
+        "embedding_ids": np.array(list(embeddings), np.int32),
+        "embedding_sums": np.stack([value.sum for value in values]),
+        "embedding_weights": np.array([value.weight for value in values], np.float64),
+        "embedding_counts": np.array([value.count for value in values], np.int64),
+    }
+
+
+def read_embeddings(plain: MapHeader, arrays: Mapping[str, Any]) -> tuple[str, dict[int, ObjectEmbedding]]:
+    """The space and the embeddings by id that a map's file has. Raises DataError where they cannot be."""
+    if SPACE not in plain.values:
+        return "", {}
+    space = plain.values[SPACE]
+    if not isinstance(space, str) or not 0 < len(space) <= LONGEST_SPACE:
+        raise DataError(f"{plain.name}.{SPACE} must be 1 to {LONGEST_SPACE} characters, found {space!r:.60}")
+    missing = [name for name in ARRAYS if name not in arrays]
+    if missing:
+        raise DataError(f"it names an embedding space and has no {', '.join(missing)}")
+    ids, sums, weights, counts = (arrays[name] for name in ARRAYS)
+    n = len(ids) if ids.ndim else 0
+    dimension = sums.shape[1] if sums.ndim == 2 else 0
+    if not 1 <= dimension <= LONGEST_EMBEDDING:
+        raise DataError(f"embedding_sums must be (M, D) with D from 1 to {LONGEST_EMBEDDING}, found {sums.shape}")
+    check_array("embedding_ids", ids, (n,), np.int32)
+    check_array("embedding_sums", sums, (n, dimension), np.float64)
+    check_array("embedding_weights", weights, (n,), np.float64)
+    check_array("embedding_counts", counts, (n,), np.int64)
+    if len(np.unique(ids)) < n:
+        raise DataError("embedding_ids has an instance twice")
+    if n and not (weights.min() > 0 and weights.max() <= MOST_WEIGHT):
+        raise DataError(f"embedding_weights must be in (0, {MOST_WEIGHT:g}], found {weights.min()} to {weights.max()}")
+    if n and not (counts.min() >= 1 and counts.max() <= LARGEST_COUNT):
+        raise DataError(f"embedding_counts must be at least 1, found {counts.min()}")
+    with np.errstate(over="ignore"):  # of what cannot be
+        lengths = np.linalg.norm(sums / weights[:, None], axis=1)
+    if n and lengths.max() > 1 + 1e-3:
+        raise DataError(f"embedding_sums must be no longer than their weights, found {lengths.max():.4g} of one")
+    return space, {
+        int(k): ObjectEmbedding(sums[i], float(weights[i]), int(counts[i])) for i, k in enumerate(ids.tolist())
+    }

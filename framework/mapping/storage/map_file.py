@@ -1,0 +1,239 @@
+"""A saved map: one .npz with a header of plain numbers and the map's arrays, written whole or not at all."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from framework.data import Array, check_array
+from framework.errors import DataError, InstanceMapError, in_one_line
+from framework.files.atomic_write import check_regular, written_whole
+from framework.files.json_file import parse_json
+from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
+from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
+from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
+from framework.mapping.voxels.voxel_grid import FARTHEST_BLOCK
+
+DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
+
+HEADER = "header"
+LARGEST_HEADER = 2**28  # bytes, of an hour with thousands of instances some 10 MB
+LARGEST_ID = 2**24  # of an instance
+MOST_EVIDENCE = 1e12  # for a class
+MOST_ARRAYS = 100  # of a file that says itself which it has
+SHARE_OF_MEMORY = 0.5  # of the machine, that a map may take when it is loaded
+
+
+def write_map(path: Path | str, header: Mapping[str, Any], arrays: Mapping[str, Array]) -> None:
+    """Writes an .npz as np.load reads it, lightly compressed: a third of the arrays' size. It has no time in it."""
+    if not isinstance(cast(object, path), str | Path):
+        raise DataError(f"a map is saved to a path, found {path!r:.60}")
+    encoded = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    with (
+        written_whole(Path(path)) as temporary,
+        zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED, compresslevel=DEFLATE_LEVEL) as archive,
+    ):
+        for name, array in {HEADER: encoded, **arrays}.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, np.ascontiguousarray(array), allow_pickle=False)
+
+
+def read_map(path: Path | str, expected_format: object, names: Sequence[str]) -> tuple[MapHeader, dict[str, Any]]:
+    """The header and the named arrays of a saved map, and those of its objects' embeddings where it has any.
+
+    Raises DataError for a file that is none, for another format, for a checksum that fails, and before memory is asked
+    for where the arrays do not have the sizes that they claim or are more than this machine holds.
+    """
+    with faults_of(path), _opened(path) as archive:
+        header = _header(archive)
+        found = header.values.get("format")
+        if found != expected_format:  # its arrays may have other names
+            raise DataError(f"it has map format {found!r:.60}, this version reads {expected_format}")
+        damaged = archive.testzip()
+        if damaged is not None:
+            raise DataError(f"the checksum of {damaged} does not hold; the file is damaged")
+        there = set(archive.namelist())
+        optional = [name for name in ARRAYS if f"{name}.npy" in there]
+        return header, {name: _array(archive, name) for name in dict.fromkeys((*names, *optional))}
+
+
+def read_arrays(path: Path | str, expected_format: object) -> dict[str, Array]:
+    """All that is in a file besides its header, which lists their `names`. Raises DataError, likewise."""
+    with faults_of(path), _opened(path) as archive:
+        names = _header(archive).items("names")
+    return read_map(path, expected_format, [str(name) for name in names[:MOST_ARRAYS]])[1]
+
+
+def read_format(path: Path | str) -> str:
+    """What a saved map says that it is. Raises DataError for a file that is none."""
+    with faults_of(path), _opened(path) as archive:
+        return str(_header(archive).values.get("format"))
+
+
+@contextmanager
+def faults_of(path: Path | str) -> Iterator[None]:
+    """Turns what goes wrong while a map is made from a file into a DataError that names the file."""
+    try:
+        yield
+    except InstanceMapError as error:
+        raise DataError(f"{path}: {error}; map again") from error
+    except Exception as error:  # of damaged archives, zipfile and numpy raise almost anything
+        raise DataError(f"{path} is not a map that can be read: {in_one_line(error)}; map again") from error
+
+
+@contextmanager
+def _opened(path: Path | str) -> Iterator[zipfile.ZipFile]:
+    check_regular(Path(path))
+    with zipfile.ZipFile(path) as archive:
+        unpacked = sum(info.file_size for info in archive.infolist())
+        if unpacked > SHARE_OF_MEMORY * machine_memory():
+            raise DataError(f"it has {unpacked} bytes unpacked, more than half of this machine's {machine_memory()}")
+        yield archive
+
+
+def _header(archive: zipfile.ZipFile) -> MapHeader:
+    info = archive.getinfo(f"{HEADER}.npy")
+    if info.file_size > LARGEST_HEADER:
+        raise DataError(f"its header has {info.file_size} bytes, more than {LARGEST_HEADER}")
+    return MapHeader.of(parse_json("its header", _array(archive, HEADER).tobytes()))
+
+
+def _array(archive: zipfile.ZipFile, name: str) -> Array:
+    """Reads an array whose member of the archive is as long as its shape says."""
+    info = archive.getinfo(f"{name}.npy")
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(member)
+        claimed = member.tell() + math.prod(shape) * dtype.itemsize
+    if claimed != info.file_size or min(shape, default=0) < 0:
+        raise DataError(f"{name} claims to be {shape} of {dtype}, and has {info.file_size} bytes")
+    with archive.open(info) as member:
+        return np.asarray(np.lib.format.read_array(member, allow_pickle=False))
+
+
+def machine_memory() -> int:
+    """Bytes of this machine; a usual number where the system does not tell."""
+    try:
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return 2**34
+
+
+def check_like(arrays: Mapping[str, Array], expected: Mapping[str, Array], length: int, prefix: str = "") -> None:
+    """Raises DataError unless the arrays, which kernels read without looking, have the expected types, and the expected
+    shapes but for the `length`.
+    """
+    for name, like in expected.items():
+        check_array(prefix + name, arrays[prefix + name], (length, *like.shape[1:]), like.dtype)
+
+
+def check_known(name: str, array: Array, known: Iterable[int]) -> None:
+    """Raises DataError unless all numbers in the array, which kernels take for places in others, are known ones."""
+    unknown = array[~np.isin(array, list(known))]
+    if unknown.size:
+        raise DataError(f"{name} has {unknown[0]}, which is none of the map's")
+
+
+def check_numbers(name: str, numbers: Array, count: int) -> None:
+    """Raises DataError unless the array has each of the numbers 0 to `count` - 1 once, and -1 for none."""
+    used = numbers[numbers != -1]
+    beyond = used[(used < 0) | (used >= count)]
+    if beyond.size:
+        raise DataError(f"{name} has {beyond[0]}, which is none of the map's")
+    if used.size != count or not np.array_equal(np.bincount(used, minlength=count), np.ones(count)):
+        raise DataError(f"{name} must have each of the {count} numbers once")
+
+
+def check_blocks(coords: Any) -> None:
+    """Raises DataError unless blocks (B, 3) lie where the map has any, and each is named once."""
+    if len(coords) and np.abs(coords, dtype=np.int64).max() >= FARTHEST_BLOCK:
+        raise DataError(f"block_coords must be within {FARTHEST_BLOCK} of 0, found {coords.min()} to {coords.max()}")
+    if len(np.unique(coords, axis=0)) < len(coords):
+        raise DataError("block_coords has a block twice")
+
+
+def plain_table(table: InstanceTable) -> dict[str, Any]:
+    """The table of instances as JSON can hold it; the vectors are in `table_arrays`."""
+    space = {SPACE: table.embedding_space} if table_arrays(table) else {}
+    return {
+        "combine": table.combine.name,
+        "logarithmic": table.logarithmic,
+        "last_id": table.last_id,
+        **space,
+        "instances": [
+            {
+                **_numbers(record),
+                "class_evidence": record.class_evidence.tolist(),
+                "observed_in": sorted(record.observed_in),
+                "in_view": record.in_view.spans,
+            }
+            for record in table.records.values()
+        ],
+    }
+
+
+def _numbers(record: InstanceRecord) -> dict[str, Any]:
+    """Of an instance, all but its embedding."""
+    return {name: value for name, value in asdict(replace(record, embedding=None)).items() if name != "embedding"}
+
+
+def table_arrays(table: InstanceTable) -> dict[str, Array]:
+    """The arrays of a table: its objects' embeddings, where there are any."""
+    embeddings = {k: record.embedding for k, record in table.records.items() if record.embedding is not None}
+    return embedding_arrays(embeddings)
+
+
+def table_of(plain: MapHeader, classes: int, arrays: Mapping[str, Any]) -> InstanceTable:
+    """The table that `plain_table` and `table_arrays` wrote down, of a map with so many classes.
+
+    Raises DataError where it cannot be.
+    """
+    table = InstanceTable(plain.option("combine", Combine), plain.flag("logarithmic"))
+    table.last_id = plain.whole("last_id", 0, LARGEST_ID)
+    for entry in plain.parts("instances"):
+        record = _record(entry, table.last_id, classes)
+        if record.id in table.records:
+            raise DataError(f"{entry.name}.id is {record.id}, as that of another instance")
+        table.records[record.id] = record
+    table.embedding_space, embeddings = read_embeddings(plain, arrays)
+    check_known("embedding_ids", np.array(list(embeddings), np.int32), table.records)
+    for k, embedding in embeddings.items():
+        table.records[k].embedding = embedding
+    return table
+
+
+def _record(entry: MapHeader, last_id: int, classes: int) -> InstanceRecord:
+    evidence = entry.items("class_evidence")
+    if len(evidence) != classes or not classes or not all(type(value) in (int, float) for value in evidence):
+        raise DataError(f"{entry.name}.class_evidence must be {classes} numbers, one a class, found {evidence!r:.60}")
+    record = InstanceRecord(
+        id=entry.whole("id", 1, last_id),
+        class_evidence=np.array(evidence, np.float64),
+        first_frame=entry.whole("first_frame", -LARGEST_COUNT),
+        last_frame=entry.whole("last_frame", -LARGEST_COUNT),
+        observed_in={whole(f"{entry.name}.observed_in", k, -LARGEST_COUNT) for k in entry.items("observed_in")},
+        in_view=FrameSet(_span(f"{entry.name}.in_view", found) for found in entry.items("in_view")),
+        score_sum=entry.number("score_sum", (0.0, float(entry.whole("detections")))),
+        detections=entry.whole("detections"),
+    )
+    if not np.abs(record.class_evidence).max() <= MOST_EVIDENCE:
+        raise DataError(f"{entry.name}.class_evidence must be within {MOST_EVIDENCE:g} of 0, found {evidence!r:.60}")
+    return record
+
+
+def _span(name: str, found: object) -> list[int]:
+    if not isinstance(found, list) or len(found) != 2:
+        raise DataError(f"{name} must have the first and the last frame of each span, found {found!r:.60}")
+    first = whole(name, found[0], -LARGEST_COUNT)
+    return [first, whole(name, found[1], first)]

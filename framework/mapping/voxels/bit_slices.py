@@ -1,0 +1,54 @@
+"""A slice of a block, 8 x 8 voxels, as the bits of one word: voxel (x, y) is bit 8 y + x.
+
+Shifted words compare 64 voxels with their neighbours at once.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from framework.mapping.voxels.voxel_grid import device
+
+ONE = np.uint64(1)
+_EIGHT = np.uint64(8)
+_TO_LAST_COLUMN = np.uint64(7)
+_TO_LAST_ROW = np.uint64(56)
+_FIRST_COLUMN = np.uint64(0x0101010101010101)
+_LAST_COLUMN = np.uint64(0x8080808080808080)
+
+
+@device
+def count_bits(word):
+    """How many bits are set; LLVM knows this idiom and makes it one instruction."""
+    word -= (word >> ONE) & np.uint64(0x5555555555555555)
+    word = (word & np.uint64(0x3333333333333333)) + ((word >> np.uint64(2)) & np.uint64(0x3333333333333333))
+    word = (word + (word >> np.uint64(4))) & np.uint64(0x0F0F0F0F0F0F0F0F)
+    return np.int32((word * _FIRST_COLUMN) >> _TO_LAST_ROW)
+
+
+@device
+def lowest_bit(word):
+    """The place of the lowest bit set."""
+    return count_bits((word & (~word + ONE)) - ONE)
+
+
+@device
+def ahead_x(word, beyond):
+    """The bits (x + 1, y) of a slice, where `beyond` is the slice of the next block along x."""
+    return ((word & ~_FIRST_COLUMN) >> ONE) | ((beyond & _FIRST_COLUMN) << _TO_LAST_COLUMN)
+
+
+@device
+def ahead_y(word, beyond):
+    return (word >> _EIGHT) | (beyond << _TO_LAST_ROW)
+
+
+@device
+def behind_x(word, before):
+    """The bits (x - 1, y) of a slice, where `before` is the slice of the block before along x."""
+    return ((word & ~_LAST_COLUMN) << ONE) | ((before & _LAST_COLUMN) >> _TO_LAST_COLUMN)
+
+
+@device
+def behind_y(word, before):
+    return (word << _EIGHT) | (before >> _TO_LAST_ROW)

@@ -1,0 +1,83 @@
+"""The camera and the depth sensor as the kernels see them."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from framework.data import Camera, Float32, Float64
+from framework.mapping.voxels.voxel_grid import device
+
+BOUNDS = {  # of what measures, and of the voxels that it fills; see Tsdf and VoxelHashing
+    "voxel_size": (1e-4, 1.0),
+    "truncation": (1e-4, 100.0),
+    "truncation_slope": (0.0, 1.0),
+    "min_depth": (1e-3, 100.0),
+    "max_depth": (1e-3, 1000.0),
+    "max_weight": (1.0, 255.0),
+    "full_weight_depth": (1e-3, 1000.0),
+}
+
+
+class Sensor(NamedTuple):
+    """How depth readings become distances: the parameters of integration."""
+
+    truncation: np.float32  # m at depth 0
+    truncation_slope: np.float32  # m more for each m of depth
+    min_depth: np.float32  # m
+    max_depth: np.float32  # m
+    max_weight: np.float32  # observations
+    full_weight_depth: np.float32  # m; a reading weighs min(1, (full_weight_depth / depth)^2)
+
+    @property
+    def max_truncation(self) -> float:
+        """The widest truncation distance, m."""
+        return float(self.truncation + self.truncation_slope * self.max_depth)
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """m: readings that are nearer or farther are not integrated."""
+        return float(self.min_depth), float(self.max_depth)
+
+
+class Pinhole(NamedTuple):
+    """A camera and its pose as the kernels see them, float32."""
+
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+    R: Float32  # (3, 3)
+    t: Float32  # (3,)
+
+
+def pinhole(camera: Camera, T: Float64) -> Pinhole:
+    """`camera` with the rotation and translation of `T`, whichever way round the kernel wants it."""
+    return Pinhole(
+        fx=np.float32(camera.fx),
+        fy=np.float32(camera.fy),
+        cx=np.float32(camera.cx),
+        cy=np.float32(camera.cy),
+        R=np.ascontiguousarray(T[:3, :3], np.float32),
+        t=np.ascontiguousarray(T[:3, 3], np.float32),
+    )
+
+
+@device
+def ray_direction(view, u, v):
+    """(dx, dy, dz), in the world, m for each m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
+    ray_x = (np.float32(u) - view.cx) / view.fx
+    ray_y = (np.float32(v) - view.cy) / view.fy
+    return (
+        view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2],
+        view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2],
+        view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2],
+    )
+
+
+@device
+def seen_point(view, u, v, z):
+    """(x, y, z), in the world, m: the point that pixel (u, v) sees at depth z (m). `view` holds T_world_camera."""
+    dx, dy, dz = ray_direction(view, u, v)
+    return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz

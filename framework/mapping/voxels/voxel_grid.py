@@ -1,0 +1,377 @@
+"""Voxel hashing: blocks of 8^3 voxels, allocated where surface is seen, found through a hash table.
+
+After Niessner et al., "Real-time 3D Reconstruction at Scale using Voxel Hashing" (2013). The hash table holds regions
+of 8^3 blocks; a region is a dense table of block numbers. Neighbouring look-ups along a ray or a row of voxels fall
+into the same region, so nearly all of them cost one comparison and one load, and a ray crosses unmapped space a region
+at a time.
+
+Voxel (i, j, k) samples the field at the world point (i, j, k) * voxel_size. In memory x runs fastest:
+voxel (x, y, z) of a block is number (z * 8 + y) * 8 + x.
+
+Bytes: 8 a voxel (distance 2, weight 2, colour 4), so 4 KiB a block. Beside its voxels a block takes 49 (neighbors 32,
+coordinates 12, label row 4, solid 1), and its region 2 KiB of block numbers, 12 of coordinates and 24 to 48 of the hash
+table for up to 512 blocks: measured 117 blocks a region in a dense room and 73 in a real kitchen, so 18 and 29 a block.
+Together 8.15 bytes a voxel. Labels take 84 more in each that has some, and 4 in the others of its block: see
+evidence_rows.py.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from framework.data import Int32, UInt8
+from framework.errors import MapFullError
+from framework.runtime.memory import PagesAhead, keep_freed_memory
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+Element = TypeVar("Element", bound=np.generic)
+Made = TypeVar("Made")
+
+BLOCK_SIDE = 8  # voxels
+BLOCK_VOXELS = BLOCK_SIDE**3
+MOST_BLOCKS = 2**31 // BLOCK_VOXELS  # of a map: the numbers of its voxels are 32-bit
+REGION_SIDE = 8  # blocks
+REGION_BLOCKS = REGION_SIDE**3
+WEIGHT_ONE = 256  # weights are stored in 1/256 of an observation
+TSDF_MAX = 32767  # the stored value of the widest truncation distance
+UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
+NO_KEY = -1
+FIRST_RESERVED = 1024  # blocks or voxels
+
+# What kernels call in their innermost loops. Without reference counts (_nrt): threads that count the same arrays of the
+# Grid up and down at each call wait for each other.
+device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
+
+
+@device
+def one_more(count, condition):
+    """`count`, int32, and one where the condition holds. numba adds in 64 bits, and half as many fit into a vector."""
+    return np.int32(count + (np.int32(1) if condition else np.int32(0)))
+
+
+_KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin, along any axis, where the map ends
+_KEY_OFFSET = FARTHEST_BLOCK
+_KEY_MASK = (1 << _KEY_BITS) - 1
+
+
+class Grid(NamedTuple):
+    """The arrays of a VoxelGrid as the kernels see them. B and S are capacities; only the first so many are in use."""
+
+    voxel_size: np.float32  # m
+    tsdf_unit: np.float32  # m, the distance that a stored tsdf of 1 stands for
+    table_keys: npt.NDArray[np.int64]  # (T,) packed region coordinates, NO_KEY = free; T is a power of two
+    table_regions: Int32  # (T,) region number
+    region_coords: Int32  # (S, 3) region coordinates; its first block is 8 times that
+    region_blocks: Int32  # (S, 512) block number, -1 = not allocated
+    block_coords: Int32  # (B, 3) block coordinates; its first voxel is 8 times that
+    neighbors: Int32  # (B, 8) the blocks at +0 or +1 along x (bit 0), y (bit 1), z (bit 2); -1 = not allocated
+    tsdf: npt.NDArray[np.int16]  # (B, 512) signed distance in tsdf_unit, positive in front of the surface; UNSEEN
+    weight: npt.NDArray[np.uint16]  # (B, 512) in 1/256 observations
+    color: npt.NDArray[np.uint32]  # (B, 512) packed, see pack_color()
+    solid: UInt8  # (B,) 1 where a voxel of it lies behind a surface: rays skip the others until they come near one
+    label_row: Int32  # (B,) the block's row in the label evidence, -1 = nothing was ever detected there
+
+
+OF_BLOCKS = Grid._fields[Grid._fields.index("block_coords") :]  # (B, ...)
+
+
+@device
+def pack_key(x, y, z):
+    """The key of the coordinates of a region or a block, never negative."""
+    return (
+        ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
+        | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
+        | ((np.int64(z) + _KEY_OFFSET) & _KEY_MASK)
+    )
+
+
+@device
+def unpack_key(key):
+    """The coordinates that pack_key() was given."""
+    return (
+        np.int32((key >> (2 * _KEY_BITS)) - _KEY_OFFSET),
+        np.int32(((key >> _KEY_BITS) & _KEY_MASK) - _KEY_OFFSET),
+        np.int32((key & _KEY_MASK) - _KEY_OFFSET),
+    )
+
+
+@device
+def _slot(key, size):
+    """Where the search for `key` starts in a table of `size` slots (Fibonacci hashing)."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(mixed >> np.uint64(32)) & (size - 1)
+
+
+@device
+def find_region(grid, key):
+    """The number of the region with this key, -1 if there is none. Linear probing."""
+    size = grid.table_keys.shape[0]
+    slot = _slot(key, size)
+    while True:
+        found = grid.table_keys[slot]
+        if found == key:
+            return grid.table_regions[slot]
+        if found == NO_KEY:
+            return np.int32(-1)
+        slot = (slot + 1) & (size - 1)
+
+
+@device
+def child_number(bx, by, bz):
+    """The place of a block in its region's table."""
+    return ((bz & 7) * 8 + (by & 7)) * 8 + (bx & 7)
+
+
+@device
+def find_block(grid, bx, by, bz, last_key, last_region):
+    """(block, key, region) at block coordinates; block -1 = not allocated.
+
+    `last_key` and `last_region` are what the previous call returned: the cache that makes neighbouring look-ups cheap.
+    """
+    key = pack_key(bx >> 3, by >> 3, bz >> 3)
+    if key != last_key:
+        last_region = find_region(grid, key)
+    if last_region < 0:
+        return np.int32(-1), key, last_region
+    return grid.region_blocks[last_region, child_number(bx, by, bz)], key, last_region
+
+
+@njit(cache=True, nogil=True)
+def insert_blocks(grid, coords, start, region_count, block_count, blocks):
+    """Allocates the blocks of coords[start:] that do not exist yet, in order, and fills in their numbers, blocks (N,).
+
+    Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call
+    again.
+    """
+    size = grid.table_keys.shape[0]
+    region, last_key = np.int32(-1), np.int64(NO_KEY)
+    for i in range(start, coords.shape[0]):
+        bx, by, bz = coords[i, 0], coords[i, 1], coords[i, 2]
+        key = pack_key(bx >> 3, by >> 3, bz >> 3)
+        if key != last_key:  # neighbors lie in the same region, mostly
+            region = find_region(grid, key)
+            last_key = key
+        if region < 0:
+            if region_count == grid.region_blocks.shape[0] or 2 * (region_count + 1) > size:
+                return i, region_count, block_count
+            region = np.int32(region_count)
+            region_count += 1
+            slot = _slot(key, size)
+            while grid.table_keys[slot] != NO_KEY:
+                slot = (slot + 1) & (size - 1)
+            grid.table_keys[slot] = key
+            grid.table_regions[slot] = region
+            grid.region_coords[region, 0] = bx >> 3
+            grid.region_coords[region, 1] = by >> 3
+            grid.region_coords[region, 2] = bz >> 3
+            grid.region_blocks[region] = -1
+        child = child_number(bx, by, bz)
+        if grid.region_blocks[region, child] < 0:
+            if block_count == grid.block_coords.shape[0]:
+                return i, region_count, block_count
+            grid.region_blocks[region, child] = block_count
+            grid.block_coords[block_count, 0] = bx
+            grid.block_coords[block_count, 1] = by
+            grid.block_coords[block_count, 2] = bz
+            grid.tsdf[block_count] = UNSEEN
+            grid.weight[block_count] = 0
+            grid.color[block_count] = 0
+            grid.solid[block_count] = 0
+            grid.label_row[block_count] = -1
+            _link_neighbors(grid, block_count)
+            block_count += 1
+        blocks[i] = grid.region_blocks[region, child]
+    return coords.shape[0], region_count, block_count
+
+
+@njit(cache=True, nogil=True)
+def _link_neighbors(grid, block):
+    """Tells a new block of its neighbors, and them of it."""
+    bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
+    key = np.int64(-2)
+    region = np.int32(-1)
+    for c in range(8):
+        dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
+        after, key, region = find_block(grid, bx + dx, by + dy, bz + dz, key, region)
+        grid.neighbors[block, c] = after
+        before, key, region = find_block(grid, bx - dx, by - dy, bz - dz, key, region)
+        if before >= 0:
+            grid.neighbors[before, c] = block
+
+
+# numpy's numbers, and their results cast, because numba computes in 64 bits else: half as many fit into a vector
+_CHANNEL = np.int32(1023)
+_GREEN = np.int32(10)
+_BLUE = np.int32(20)
+COLORED = np.uint32(1 << 30)  # the bit that tells a colour from none
+
+
+@device
+def pack_color(red, green, blue):
+    """A voxel's colour from quarters of a level, 0 to 1020 each: ten bits a channel, so that averages do not stall."""
+    return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
+
+
+@device
+def unpack_color(packed):
+    """(red, green, blue) float32 in quarters of a level."""
+    bits = np.int32(packed)
+    return (
+        np.float32(np.int32(bits & _CHANNEL)),
+        np.float32(np.int32((bits >> _GREEN) & _CHANNEL)),
+        np.float32(np.int32((bits >> _BLUE) & _CHANNEL)),
+    )
+
+
+@device
+def is_solid(tsdf):
+    """Whether a voxel of a block, tsdf (512,), was seen to lie behind a surface."""
+    lowest = np.int16(0)
+    for n in range(BLOCK_VOXELS):
+        stored = tsdf[n]
+        lowest = min(lowest, stored if stored != UNSEEN else np.int16(0))
+    return lowest < 0
+
+
+@njit(cache=True, nogil=True)
+def find_solid_blocks(grid, block_count):
+    """Fills grid.solid of the first blocks from their distances."""
+    for block in range(block_count):
+        grid.solid[block] = is_solid(grid.tsdf[block])
+
+
+@njit(cache=True, nogil=True)
+def _rehash(old_keys, old_regions, keys, regions):
+    size = keys.shape[0]
+    for i in range(old_keys.shape[0]):
+        if old_keys[i] != NO_KEY:
+            slot = _slot(old_keys[i], size)
+            while keys[slot] != NO_KEY:
+                slot = (slot + 1) & (size - 1)
+            keys[slot] = old_keys[i]
+            regions[slot] = old_regions[i]
+
+
+def _free_blocks(count: int) -> dict[str, Any]:
+    """The OF_BLOCKS of so many blocks."""
+    return {
+        "block_coords": np.empty((count, 3), np.int32),
+        "neighbors": np.empty((count, 8), np.int32),
+        "tsdf": np.empty((count, BLOCK_VOXELS), np.int16),
+        "weight": np.empty((count, BLOCK_VOXELS), np.uint16),
+        "color": np.empty((count, BLOCK_VOXELS), np.uint32),
+        "solid": np.empty(count, np.uint8),
+        "label_row": np.empty(count, np.int32),
+    }
+
+
+def reserved(most: int, make: Callable[[int], Made]) -> Made:
+    """What `make` gives for the length `most`, or for FIRST_RESERVED, to grow, where memory is counted by what is asked
+    for: that is so on Windows, under `ulimit -v`, and where the system does not promise more than it has.
+
+    It makes arrays without writing them: they cost no memory yet, and what need not grow is never copied.
+    """
+    first = min(most, FIRST_RESERVED)
+    if resource is None or resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY:
+        return make(first)
+    try:
+        return make(most)
+    except MemoryError:
+        return make(first)
+
+
+class VoxelGrid:
+    """Owns the arrays of the grid and makes them grow. The kernels work on `self.grid`."""
+
+    def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
+        keep_freed_memory()
+        self.max_blocks = max_blocks
+        self.block_count = 0
+        self.region_count = 0
+        self.grid = Grid(
+            voxel_size=np.float32(voxel_size),
+            tsdf_unit=np.float32(max_truncation / TSDF_MAX),
+            table_keys=np.full(256, NO_KEY, np.int64),
+            table_regions=np.full(256, -1, np.int32),
+            region_coords=np.empty((64, 3), np.int32),
+            region_blocks=np.empty((64, REGION_BLOCKS), np.int32),
+            **reserved(max_blocks, _free_blocks),
+        )
+        self._pages = PagesAhead()
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For pickling: without what is only reserved, which is gigabytes."""
+        blocks = {name: getattr(self.grid, name)[: self.block_count] for name in OF_BLOCKS}
+        return {**vars(self), "grid": self.grid._replace(**blocks), "_pages": PagesAhead()}
+
+    @property
+    def byte_count(self) -> int:
+        """Of what is in use: capacity that no block has been given yet takes no memory."""
+        grid = self.grid
+        table = (grid.table_keys, grid.table_regions)
+        regions = (grid.region_coords, grid.region_blocks)
+        blocks: list[npt.NDArray[Any]] = [getattr(grid, name) for name in OF_BLOCKS]
+        return (
+            sum(array.nbytes for array in table)
+            + sum(array[: self.region_count].nbytes for array in regions)
+            + sum(array[: self.block_count].nbytes for array in blocks)
+        )
+
+    def allocate(self, coords: Int32) -> Int32:
+        """The numbers (N,) of the blocks at `coords` (N, 3); those that do not exist yet get theirs in the order given.
+
+        Raises MapFullError when that takes more than `max_blocks`; the blocks before stay.
+        """
+        done, blocks = 0, np.empty(len(coords), np.int32)
+        while True:
+            done, self.region_count, self.block_count = insert_blocks(
+                self.grid, coords, done, self.region_count, self.block_count, blocks
+            )
+            if done == len(coords):
+                self._pages.ask((getattr(self.grid, name) for name in OF_BLOCKS), self.block_count)
+                return blocks
+            if self.block_count == self.max_blocks:
+                raise MapFullError(
+                    f"the map is full: {self.max_blocks} blocks of {BLOCK_SIDE}^3 voxels "
+                    f"({self.byte_count / 2**20:.0f} MiB); raise fuser.max_blocks or fuser.voxel_size"
+                )
+            self._grow()
+
+    def _grow(self) -> None:
+        """Doubles whichever capacity is used up."""
+        grid = self.grid
+        if self.block_count == len(grid.block_coords):
+            more = min(max(2 * len(grid.block_coords), FIRST_RESERVED), self.max_blocks)
+            longer: dict[str, Any] = {name: grown(getattr(grid, name), more) for name in OF_BLOCKS}
+            grid = grid._replace(**longer)
+        if self.region_count == len(grid.region_blocks):
+            grid = grid._replace(
+                region_coords=grown(grid.region_coords, 2 * self.region_count),
+                region_blocks=grown(grid.region_blocks, 2 * self.region_count),
+            )
+        if 2 * (self.region_count + 1) > len(grid.table_keys):
+            keys = np.full(2 * len(grid.table_keys), NO_KEY, np.int64)
+            regions = np.full(len(keys), -1, np.int32)
+            _rehash(grid.table_keys, grid.table_regions, keys, regions)
+            grid = grid._replace(table_keys=keys, table_regions=regions)
+        self.grid = grid
+
+
+def grown(array: npt.NDArray[Element], length: int, zeros: bool = False) -> npt.NDArray[Element]:
+    """A copy of `array` with its first axis made `length` long; the new part holds anything, or zeros.
+
+    It costs no memory before it is written.
+    """
+    longer = (np.zeros if zeros else np.empty)((length, *array.shape[1:]), array.dtype)
+    longer[: len(array)] = array
+    return longer

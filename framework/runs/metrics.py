@@ -1,0 +1,106 @@
+"""The figures of one run: the flat dictionary that becomes metrics.json."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from framework.data import Float64, Instance, InstanceMesh, Pose, SceneTruth
+from framework.evaluation import instances, trajectory
+from framework.evaluation.instances import PredictedInstances, Transfer
+from framework.files.hashing import add_values
+from framework.interfaces import RGBDVideo, SceneMap
+from framework.mapping.gravity import floor_height
+from framework.runtime.run_log import RunResult
+
+Metrics = dict[str, float | int | str | bool | None]
+
+MAIN_FIGURES = ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou")  # of `instances.`, given for both transfers
+TRUTH = "truth_sha256"  # the key that says which true instances the run was compared with
+STAGES_TIMED = ("read", "detect", "track", "lift", "refine", "fuse")
+
+
+def run_metrics(result: RunResult) -> Metrics:
+    """Counts, speed, time by stage and the size of the map; of a live video also what it dropped, and its latency."""
+    metrics: Metrics = {
+        "frames": result.frames,
+        "frames_lost": result.frames_lost,
+        "frames_skipped": result.frames_skipped,
+        "fps": result.fps,
+        "fps_median": result.fps_median,
+        "pose_source": result.pose_source,
+        "map.voxels": result.scene.voxel_count,
+        "map.bytes": result.scene.byte_count,
+        "map.evictions": result.scene.evictions,
+    }
+    for stage in STAGES_TIMED:
+        milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
+        metrics[f"stage_ms.{stage}.median"] = float(np.median(milliseconds)) if milliseconds else None
+        metrics[f"stage_ms.{stage}.p95"] = float(np.percentile(milliseconds, 95)) if milliseconds else None
+    if result.live is not None:
+        latencies = 1e3 * np.array(result.live.latencies)
+        metrics["frames_dropped"] = result.live.frames_dropped
+        metrics["latency_ms"] = float(np.median(latencies)) if len(latencies) else None
+        metrics["latency_ms.p95"] = float(np.percentile(latencies, 95)) if len(latencies) else None
+    return metrics
+
+
+def trajectory_metrics(result: RunResult) -> Metrics:
+    """The error of the poses that were not lost; nothing where no true pose is known."""
+    reference: list[Float64 | None] = [None] * result.frames  # a step over a skipped frame is no step of one frame
+    estimated = [Pose(np.eye(4), lost=True)] * result.frames
+    for frame in result.tracked:
+        reference[frame.position], estimated[frame.position] = frame.T_world_camera_truth, frame.pose
+    return dict(trajectory.evaluate(reference, estimated).metrics())
+
+
+def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
+    """Which way is up in the world, what tells it, and how high the floor is; nothing where the map does not tell."""
+    up = scene.up()
+    if up is None:
+        return {}
+    figures: Metrics = {f"map.up.{axis}": float(value) for axis, value in zip("xyz", up, strict=True)}
+    figures["up_from"] = scene.up_from()
+    return figures | {"map.floor_m": floor_height(mesh.vertices, mesh.triangles, up)}
+
+
+def instance_metrics(
+    video: RGBDVideo, mesh: InstanceMesh, found: Mapping[int, Instance], classes: tuple[str, ...]
+) -> Metrics:
+    """How many instances were found and, where the true ones are known, how well."""
+    count: Metrics = {"instances.count": len(found)}
+    truth = video.scene_truth()
+    if truth is None:
+        return count
+    return count | evaluation_metrics(PredictedInstances.of_map(mesh, found, classes), truth, video.annotation)
+
+
+def evaluation_metrics(predictions: PredictedInstances, truth: SceneTruth, annotation: str) -> Metrics:
+    """The figures of `InstanceEvaluation.metrics`, and the main ones of the other transfer as `instances.to_map.`...
+
+    `annotation_release` names the release of the truth, None = there is but one; `truth_sha256` tells it from others.
+    """
+    figures = instances.evaluate(predictions, truth).metrics()
+    to_map = instances.evaluate(predictions, truth, transfer=Transfer.TO_MAP).metrics()
+    of_map = {f"instances.to_map.{name}": to_map[f"instances.{name}"] for name in MAIN_FIGURES if to_map}
+    return {**figures, **of_map, "annotation_release": annotation or None, TRUTH: truth_sha256(truth)}
+
+
+def truth_sha256(truth: SceneTruth) -> str:
+    """Of all that predictions are compared with."""
+    digest = hashlib.sha256(repr((sorted(truth.class_names.items()), truth.classes)).encode())
+    for array in (truth.points_world, truth.instance_ids):
+        add_values(digest, array)
+    return digest.hexdigest()
+
+
+def is_evaluation(key: str) -> bool:
+    """Whether a key of metrics.json is one that `evaluation_metrics` writes."""
+    return key in ("annotation_release", TRUTH) or (key.startswith("instances.") and key != "instances.count")
+
+
+def class_name(instance: Instance, classes: tuple[str, ...]) -> str | None:
+    """The most probable class of an instance; None where the map knows no classes."""
+    return classes[int(np.argmax(instance.class_probabilities))] if classes else None

@@ -1,0 +1,104 @@
+"""Where results come from: the config, the code and the machine."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import subprocess
+from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import framework
+from framework.runtime.process_settings import available_cores
+
+PACKAGES = ("torch", "numpy", "numba", "open3d")
+UNKNOWN = "unknown"
+WITHOUT_EFFECT = (
+    *("hydra", "debug", "resume", "ahead", "detection_cache", "detection_cache_dir", "viewer"),
+    "threads",  # but for networks' last digits: a sweep goes on with another number of jobs at once
+    *("row", "rows", "sequences", "table", "figure"),  # of an experiment: what its runs are compared for
+)
+"""Keys of the config that change no result."""
+
+OF_SPEED = ("threads", "ahead", "detection_cache")  # of these, what times depend on ...
+OF_MACHINE = ("environment.processor", "environment.cpus")  # ... like on these, of metrics.json
+
+
+def config_hash(resolved: Mapping[str, Any]) -> str:
+    """SHA-256 of what a config says about results, whatever the order of its keys and wherever the run is written."""
+    return hashlib.sha256(json.dumps(relevant(resolved), sort_keys=True, default=str).encode()).hexdigest()
+
+
+def relevant(config: Mapping[str, Any]) -> dict[str, Any]:
+    """The keys that results depend on."""
+    return {key: value for key, value in config.items() if key not in WITHOUT_EFFECT}
+
+
+def leaves(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of a config by dotted key; a list is one value."""
+    for key, value in node.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}", value
+
+
+def shows_speed(config: Mapping[str, Any]) -> bool:
+    """Whether a config is of an experiment whose table has a column of frames a second."""
+    return "fps" in (config.get("table") or {}).get("columns", ())
+
+
+def speed_settings(config: Mapping[str, Any], metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """What the times of a run depend on and its results do not."""
+    return {key: config.get(key) for key in OF_SPEED} | {key: metrics.get(key) for key in OF_MACHINE}
+
+
+def code_version() -> dict[str, str | bool]:
+    """The commit of the checkout that runs, and whether files differ from it; "unknown" outside a checkout."""
+    checkout = Path(framework.__file__).resolve().parent.parent
+    top = _git(checkout, "rev-parse", "--show-toplevel")
+    if top is None or Path(top).resolve() != checkout:  # installed from a wheel, perhaps inside another repository
+        return {"git_commit": UNKNOWN, "git_dirty": UNKNOWN}
+    return {
+        "git_commit": _git(checkout, "rev-parse", "HEAD") or UNKNOWN,
+        "git_dirty": bool(_git(checkout, "status", "--porcelain", "--untracked-files=no")),
+    }
+
+
+def environment() -> dict[str, str | int]:
+    """What times and last digits depend on: the machine and the libraries."""
+    return {
+        "environment.python": platform.python_version(),
+        "environment.platform": platform.platform(),
+        "environment.processor": _processor(),
+        "environment.cpus": available_cores(),
+        "environment.instancemap": framework.__version__,
+        **{f"environment.{package}": _version(package) for package in PACKAGES},
+    }
+
+
+def _git(directory: Path, *arguments: str) -> str | None:
+    try:
+        done = subprocess.run(
+            ["git", "-C", str(directory), *arguments], capture_output=True, text=True, timeout=20, check=False
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _processor() -> str:
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or UNKNOWN
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

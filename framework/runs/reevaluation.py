@@ -1,0 +1,126 @@
+"""Stored runs evaluated anew, by the code of today, from the mesh and the instances that they left behind."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from framework.data import SceneTruth
+from framework.errors import DataError
+from framework.evaluation.instances import PredictedInstances
+from framework.files.directory_lock import locked
+from framework.files.json_file import write_json
+from framework.interfaces import RGBDVideo
+from framework.registry import build
+from framework.runs.metrics import TRUTH, evaluation_metrics, is_evaluation
+from framework.runs.provenance import code_version, leaves
+from framework.runs.stored_map import read_objects
+from framework.runs.stored_runs import EVALUATION, METRICS, Record
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What a run's dataset knows about its scene."""
+
+    scene: SceneTruth | None  # None = nobody labelled it
+    annotation: str  # RGBDVideo.annotation
+
+    @classmethod
+    def of(cls, config: Mapping[str, Any]) -> Truth:
+        """From a run's config, in which nothing is left to be resolved: a record does not ask for the environment.
+
+        Raises InstanceMapError when the dataset cannot be built or read.
+        """
+        node = OmegaConf.create(dict(config)).get("dataset")
+        for key, value in leaves({"dataset": config.get("dataset")}):
+            if "${" in str(value):
+                raise DataError(f"a run's config is stored resolved, and this one is not: {key}={value}")
+        video = build(RGBDVideo, node)
+        return cls(video.scene_truth(), video.annotation)
+
+
+@dataclass(frozen=True)
+class Reevaluation:
+    """A run's figures as they are stored and as they are now."""
+
+    record: Record
+    metrics: Mapping[str, Any]  # the whole new metrics.json
+
+    @classmethod
+    def of(cls, record: Record, truth: Truth, other_truth: bool = False) -> Reevaluation:
+        """Keeps all that is not the evaluation of the instances: speed, counts, and the errors of the trajectory.
+
+        Those need the true pose of every frame, so every frame read again. Raises DataError when the files do not
+        belong together, when there is no truth any more for figures that are stored, or when it is not the one that
+        the run was compared with, unless `other_truth` allows that.
+        """
+        if truth.scene is None:
+            if any(map(is_evaluation, record.metrics)):
+                raise DataError(f"{record.directory}: its figures are of true instances that the dataset has no longer")
+            return cls(record, record.metrics)
+        found = evaluation_metrics(read_predictions(record), truth.scene, truth.annotation)
+        if not other_truth and record.metrics.get(TRUTH) not in (None, found[TRUTH]):
+            raise DataError(
+                f"{record.directory}: the true instances of {record.config['dataset']['_target_']} are not those that "
+                "the run was compared with: its dataset has changed, or a relative dataset.root means another folder "
+                "here; --other-truth compares with them all the same"
+            )
+        metrics: dict[str, Any] = {}
+        for key, value in record.metrics.items():
+            if not is_evaluation(key) and not key.startswith(EVALUATION):
+                metrics[key] = value
+            if key == "instances.count":
+                metrics |= found | {EVALUATION + name: value for name, value in code_version().items()}
+        return cls(record, metrics)
+
+    @property
+    def changed(self) -> dict[str, tuple[Any, Any]]:
+        """The stored figures that are not what they were, old and new; None = not known."""
+        old, new = self.record.metrics, self.metrics
+        return {
+            key: (value, new.get(key)) for key, value in old.items() if is_evaluation(key) and new.get(key) != value
+        }
+
+    @property
+    def added(self) -> list[str]:
+        """The figures that were not stored."""
+        return [key for key in self.metrics if is_evaluation(key) and key not in self.record.metrics]
+
+    def write(self) -> None:
+        """Replaces the record's metrics.json; its time stays, by which tables tell the latest of several runs.
+
+        Raises DataError when the run has begun again meanwhile.
+        """
+        path = self.record.directory / METRICS
+        with locked(self.record.directory):  # a run that begins now waits, or it would end up with these figures
+            try:
+                before = path.stat()
+            except OSError:
+                before = None
+            if before is None or before.st_mtime != self.record.written:
+                raise DataError(f"{path} has changed: the run has begun again meanwhile; evaluate it later")
+            write_json(path, self.metrics)
+            os.utime(path, ns=(before.st_atime_ns, before.st_mtime_ns))
+
+
+def read_predictions(record: Record) -> PredictedInstances:
+    """What the run's map claims, exactly as it was evaluated when it ended.
+
+    Raises DataError when mesh.ply and instances.json are not of this run.
+    """
+    mesh, instances = read_objects(record)
+    return PredictedInstances.on_mesh(
+        mesh,
+        [instance.id for instance in instances],
+        [instance.confidence for instance in instances],
+        [instance.class_name for instance in instances],
+    )
+
+
+def dataset_of(record: Record) -> str:
+    """The same text for runs on the same truth."""
+    return str(record.config.get("dataset"))

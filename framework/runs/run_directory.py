@@ -1,0 +1,267 @@
+"""The directory that a run leaves behind: every file whole or not at all, the small ones first, metrics.json last."""
+
+from __future__ import annotations
+
+import csv
+import logging
+import sys
+from collections import Counter
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from framework.config.composition import one_line
+from framework.data import Instance, InstanceMesh
+from framework.errors import InstanceMapError
+from framework.files.atomic_write import remove_left_over, written_whole
+from framework.files.json_file import write_json
+from framework.files.tum_trajectory import write_tum
+from framework.interfaces import RGBDVideo, SceneMap
+from framework.registry import STAGES
+from framework.rendering.overview import write_overview
+from framework.runs.inputs import INPUTS, inputs_sha256
+from framework.runs.instances_file import write_instances
+from framework.runs.mesh_file import write_mesh
+from framework.runs.metrics import (
+    Metrics,
+    class_name,
+    instance_metrics,
+    room_metrics,
+    run_metrics,
+    trajectory_metrics,
+)
+from framework.runs.provenance import code_version, config_hash, environment
+from framework.runs.stored_runs import (
+    CONFIG,
+    INSTANCES,
+    MAP,
+    MAPPED,
+    MESH,
+    METRICS,
+    PARTIAL_METRICS,
+    PLACES,
+    REPORT,
+    TRAJECTORY,
+)
+from framework.runtime.run_log import RunResult
+from framework.tracking.keyframes_file import write_places
+
+log = logging.getLogger(__name__)
+
+LIKELY = 0.3  # confidence from which on an instance is in the picture and in what a run says; files have them all
+
+
+Arguments = ParamSpec("Arguments")
+Made = TypeVar("Made")
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """Writes one run's directory."""
+
+    directory: Path
+    config: Mapping[str, Any]  # resolved
+    choices: Mapping[str, str | None]  # the option chosen of each config group
+    inputs: str  # inputs_sha256
+    provenance: Metrics  # the code and the machine, as they were when the run began
+
+    @classmethod
+    def begin(cls, directory: Path, config: DictConfig, choices: Mapping[str, str | None]) -> RunRecord:
+        """Takes `directory` over: an earlier run's metrics and report are removed: they could pass for this one's."""
+        resolved = OmegaConf.to_container(config, resolve=True)
+        assert isinstance(resolved, dict)
+        asked = {str(key): value for key, value in resolved.items()}
+        inputs = inputs_sha256(asked)
+        provenance: Metrics = {**code_version(), **environment()}
+        directory.mkdir(parents=True, exist_ok=True)
+        remove_left_over(directory)
+        for name in (METRICS, PARTIAL_METRICS, REPORT):
+            (directory / name).unlink(missing_ok=True)
+        _write_config(directory / CONFIG, asked)
+        _reset_peak_memory()
+        return cls(directory, asked, choices, inputs, provenance)
+
+    def write(
+        self, video: RGBDVideo, result: RunResult, counts: Mapping[str, int] | None = None
+    ) -> BaseException | None:
+        """Writes everything that the run found, and says the main figures in the log.
+
+        Returns why the record is partial: `result.stopped_by`, or the first fault of the writing, which does not keep
+        the other files from being written; None = it is whole. `counts` are further figures for metrics.json, by key.
+
+        What was mapped is written before it is judged: where the truth turns out to be unusable, it stays. While that
+        goes on, metrics.partial.json tells what there is: who is killed in the middle of it leaves a partial record.
+        """
+        self.directory.mkdir(parents=True, exist_ok=True)
+        scene, attempt = result.scene, _Attempts(result.stopped_by)
+        for name in (*MAPPED, PLACES):  # of an earlier run into the same directory
+            attempt((self.directory / name).unlink, missing_ok=True)
+        if not (self.directory / CONFIG).exists():  # the directory was removed meanwhile
+            attempt(_write_config, self.directory / CONFIG, self.config)
+        trusted = [frame for frame in result.tracked if not frame.pose.lost]
+        poses = np.array([frame.pose.T_world_camera for frame in trusted]).reshape(-1, 4, 4)
+        attempt(write_tum, self.directory / TRAJECTORY, np.array([frame.timestamp for frame in trusted]), poses)
+        attempt(write_timings, self.directory / "timings.csv", result)
+        figures: Metrics = {**(attempt(run_metrics, result) or {}), **(counts or {})}
+        found = attempt(_found, scene)
+        if found is not None:
+            attempt(write_instances, self.directory / INSTANCES, *found, scene.classes)
+            figures |= attempt(room_metrics, scene, found[0]) or {}
+            figures["instances.count"] = len(found[1])
+        attempt(self._write_partial, video, figures, attempt.fault)
+        if found is not None:
+            attempt(write_mesh, self.directory / MESH, found[0])
+        attempt(scene.save, self.directory / MAP)
+        if result.places:
+            attempt(write_places, self.directory / PLACES, result.places)
+        if found is not None:
+            figures |= attempt(instance_metrics, video, *found, scene.classes) or {}
+        figures |= attempt(trajectory_metrics, result) or {}
+        title = headline({"sequence": video.name, **figures})
+        if found is not None:
+            labels = _labels(found[1], scene.classes)
+            attempt(write_overview, self.directory / "overview.png", found[0], labels, poses, title)
+        if attempt.fault is None:
+            attempt(write_json, self.directory / METRICS, self._metrics(video, figures))
+        if attempt.fault is None:
+            (self.directory / PARTIAL_METRICS).unlink(missing_ok=True)
+        else:
+            attempt(self._write_partial, video, figures, attempt.fault)
+        self._announce(title, labels if found is not None else {}, figures, attempt.fault)
+        return attempt.fault
+
+    def _metrics(self, video: RGBDVideo, figures: Metrics) -> Metrics:
+        return {
+            "sequence": video.name,
+            **{f"choice.{group}": self.choices.get(group) for group in STAGES},
+            **figures,
+            "peak_rss_bytes": peak_memory(),
+            "seed": self.config.get("seed"),
+            "config_hash": config_hash(self.config),
+            INPUTS: self.inputs,
+            **self.provenance,
+        }
+
+    def _write_partial(self, video: RGBDVideo, figures: Metrics, fault: BaseException | None) -> None:
+        """Says what there is of a record that is not whole, and why; no fault = it is being written."""
+        why = "its record was not finished" if fault is None else reason(fault)
+        write_json(self.directory / PARTIAL_METRICS, {"partial": why, **self._metrics(video, figures)})
+
+    def _announce(
+        self, title: str, labels: Mapping[int, tuple[str, float]], figures: Metrics, fault: BaseException | None
+    ) -> None:
+        log.info("%s", title)
+        likely = Counter(name for name, _ in labels.values())
+        counted = ", ".join(f"{count} {name}" for name, count in likely.most_common()) or "no likely instance"
+        unlikely = int(figures.get("instances.count") or 0) - len(labels)
+        rest = f"; {unlikely} of a confidence below {LIKELY} are in the files alone" if unlikely else ""
+        log.info("found: %s%s", counted, rest)
+        written = [name for name in ("overview.png", "mesh.ply", "instances.json") if (self.directory / name).exists()]
+        if written:  # one line: a job of a sweep has a long name
+            beside = f", and beside it {', '.join(written[1:])}" if written[1:] else ""
+            log.info("%s%s", _from_here(self.directory / written[0]), beside)
+        if fault is not None:
+            log.warning("partial run, %s: its figures are in %s", reason(fault), PARTIAL_METRICS)
+
+
+@dataclass
+class _Attempts:
+    """Calls one function after the other; one that fails says so in the log, and does not keep the others from it."""
+
+    fault: BaseException | None  # the first
+
+    def __call__(
+        self, function: Callable[Arguments, Made], *arguments: Arguments.args, **named: Arguments.kwargs
+    ) -> Made | None:
+        """What the function returns; None where it failed."""
+        try:
+            return function(*arguments, **named)
+        except Exception as error:
+            log.warning("%s", reason(error))
+            self.fault = self.fault or error
+            return None
+
+
+def _write_config(path: Path, config: Mapping[str, Any]) -> None:
+    with written_whole(path) as temporary:
+        OmegaConf.save(OmegaConf.create(dict(config)), temporary)
+
+
+def _from_here(path: Path) -> Path:
+    """The path as one would give it in the working folder."""
+    here, place = Path.cwd(), path.absolute()
+    return place.relative_to(here) if place.is_relative_to(here) else place
+
+
+def _found(scene: SceneMap) -> tuple[InstanceMesh, Mapping[int, Instance]]:
+    return scene.mesh(), scene.instances()
+
+
+def _labels(instances: Mapping[int, Instance], classes: tuple[str, ...]) -> dict[int, tuple[str, float]]:
+    """Class name and confidence of the instances that are likely, by id."""
+    return {
+        key: (class_name(instance, classes) or "object", instance.confidence)
+        for key, instance in instances.items()
+        if instance.confidence >= LIKELY
+    }
+
+
+_FAULTS = {"frames_lost": "lost", "frames_skipped": "skipped", "frames_dropped": "dropped"}
+_QUALITY = {"instances.ap50": "AP50", "instances.ap25": "AP25"}
+
+
+def headline(metrics: Mapping[str, Any]) -> str:
+    """The main figures of a run in one line, as far as there are any."""
+    parts = [str(metrics["sequence"])]
+    if "frames" in metrics:
+        parts += [f"{metrics['frames']} frames at {metrics['fps']:.1f}/s"]
+    parts += [f"{metrics[key]} {word}" for key, word in _FAULTS.items() if metrics.get(key)]
+    if metrics.get("latency_ms") is not None:
+        parts.append(f"latency {metrics['latency_ms']:.0f} ms")
+    if metrics.get("pose_source") == "ground_truth":
+        parts.append("given poses")
+    elif metrics.get("trajectory.ate_rmse_m") is not None:
+        parts.append(f"ATE {metrics['trajectory.ate_rmse_m']:.3f} m")
+    if "instances.count" in metrics:
+        parts.append(f"{metrics['instances.count']} instances")
+    parts += [f"{word} {metrics[key]:.2f}" for key, word in _QUALITY.items() if metrics.get(key) is not None]
+    return " | ".join(parts)
+
+
+def reason(fault: BaseException) -> str:
+    """Why a run is partial, in words."""
+    if isinstance(fault, KeyboardInterrupt):
+        return str(fault) or "interrupted by Ctrl-C"
+    return one_line(fault) if isinstance(fault, InstanceMapError) else f"{type(fault).__name__}: {one_line(fault)}"
+
+
+def write_timings(path: Path, result: RunResult) -> None:
+    """Writes how long each stage took for each frame, in the order in which it happened."""
+    with written_whole(path) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(("frame", "stage", "milliseconds"))
+        writer.writerows((time.frame, time.stage, f"{time.milliseconds:.3f}") for time in result.timings)
+
+
+def peak_memory() -> int | None:
+    """The largest resident size of this process so far, bytes: since the run began, where the kernel can say so.
+
+    None on Windows, which has no `resource`.
+    """
+    try:
+        import resource
+    except ImportError:
+        return None
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts in KiB
+
+
+def _reset_peak_memory() -> None:
+    """Forgets the peak of what this process did before: an earlier job of a sweep may have needed more."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")

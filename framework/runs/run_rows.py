@@ -1,0 +1,209 @@
+"""Rows of runs side by side: means with their spread, and differences paired run by run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from framework.runs.provenance import leaves, relevant
+from framework.runs.stored_runs import Record, is_number
+
+CHOICE = "choice."  # starts the keys of metrics.json that say which option was chosen of a config group
+DATA = "dataset.root"  # the key of the config that says where recorded data are
+CONFIDENCE = 0.95
+
+Run = tuple[str, ...]  # what a run has under the keys that are averaged over: ("3",) is seed 3
+
+
+@dataclass(frozen=True)
+class Mean:
+    """A mean over runs. NaN where nothing is known: the mean of no run, the deviation of one."""
+
+    value: float
+    deviation: float  # sample standard deviation, with n - 1
+    count: int
+
+    @classmethod
+    def of(cls, values: Iterable[float]) -> Mean:
+        sample = np.array(list(values), np.float64)
+        value = float(sample.mean()) if len(sample) else math.nan
+        deviation = float(sample.std(ddof=1)) if len(sample) > 1 else math.nan
+        return cls(value, deviation, len(sample))
+
+    @property
+    def error(self) -> float:
+        """The standard error of the mean."""
+        return self.deviation / math.sqrt(self.count) if self.count > 1 else math.nan
+
+    @property
+    def is_not_zero(self) -> bool:
+        """Whether 0 lies outside of the mean's interval of confidence, by Student's t.
+
+        Values that are all the same have no interval: they are counts, and say nothing about the next one.
+        """
+        if self.count < 2 or self.deviation <= 1e-9 * abs(self.value):
+            return False
+        from scipy.stats import t
+
+        return abs(self.value) > self.error * float(t.ppf((1 + CONFIDENCE) / 2, self.count - 1))
+
+
+@dataclass(frozen=True)
+class Row:
+    """Runs that differ in nothing but the keys that are averaged over."""
+
+    name: str
+    records: Mapping[Run, Record]
+    system: str = ""  # what an experiment calls it; "" outside of experiments
+    variant: tuple[str, ...] = ()  # in what it differs from others beside that: ("tracker=icp_only",)
+
+    @property
+    def pose_source(self) -> str:
+        return self._distinct("pose_source")
+
+    @property
+    def poses(self) -> str:
+        """The pose source in words, and the tracker where there was one."""
+        tracked = {"tracked": f"tracked ({self._distinct(f'{CHOICE}tracker')})"}
+        return tracked.get(self.pose_source, self.pose_source.replace("_", " "))
+
+    @property
+    def annotation(self) -> str:
+        """The release of the true instances; "" = the dataset does not say."""
+        return "/".join(sorted({record.annotation for record in self.records.values()}))
+
+    def _distinct(self, key: str) -> str:
+        return "/".join(sorted({str(record.metrics.get(key)) for record in self.records.values()}))
+
+    def values(self, column: str) -> dict[Run, float]:
+        """The runs' figures, without those that are not defined."""
+        found = {run: record.metrics.get(column) for run, record in self.records.items()}
+        return {run: float(value) for run, value in found.items() if is_number(value)}
+
+    def mean(self, column: str) -> Mean:
+        return Mean.of(self.values(column).values())
+
+    def differences(self, base: Row, column: str) -> dict[Run, float]:
+        """This row's figure less the base's, for the runs that both rows have.
+
+        Runs of one seed have the same room and the same detections: most of what varies between seeds cancels.
+        """
+        own, others = self.values(column), base.values(column)
+        return {run: own[run] - others[run] for run in own if run in others}
+
+
+def rows_of(
+    records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
+) -> list[Row]:
+    """The rows that `records` make: those named in `overrides` first, the others by name.
+
+    A row is what an experiment calls `row`, else what was chosen: the stages' options and the parameters in which the
+    records differ, other than the keys `over` and what follows them, as dataset.seed follows seed. A row of an
+    experiment is split by what differs inside of it, by what differs between rows although no row's overrides change
+    it (one row tracked, another with given poses; one with more frames), and always by where the data are and which
+    annotation they have. Of two records of the same run, the later one counts.
+    """
+    overrides = overrides or {}
+    variants = [_Variant.of(record, over) for record in sorted(records, key=lambda record: record.written)]
+    own = _following(variants, over)
+    changed = {_changed(override) for changes in overrides.values() for override in changes}
+    stages = _differing(
+        [(one.row, one.choices) for one in variants]
+        + [("", {key: value for key, value in one.choices.items() if key not in changed}) for one in variants]
+    )
+    parameters = _differing(
+        [((one.row, *map(one.choices.get, stages)), one.parameters) for one in variants]
+        + [("", {DATA: one.parameters[DATA]}) for one in variants if DATA in one.parameters]
+        + [kept for one in variants if not one.row or one.row in overrides for kept in _kept(one, changed)]
+    )
+    rows: dict[tuple[str, tuple[str, ...]], dict[Run, Record]] = {}
+    for one in variants:
+        variant = [f"{key}={one.choices[key]}" for key in stages if key in one.choices]
+        variant += [f"{key}={one.parameters[key]}" for key in parameters if key in one.parameters and key not in own]
+        rows.setdefault((one.row, tuple(variant)), {})[one.run] = one.record
+    place = {name: k for k, name in enumerate(overrides)}
+    # what a row of an experiment is split into stands where it does
+    order = sorted(rows, key=lambda key: (place.get(key[0], len(place)), key))
+    return [_row(system, variant, rows[system, variant]) for system, variant in order]
+
+
+def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -> Row:
+    name = ", ".join([system, *variant] if system else variant) or "all runs"
+    return Row(name, dict(sorted(records.items(), key=lambda item: natural(item[0]))), system, variant)
+
+
+def _changed(override: str) -> str:
+    """The key that an override changes: refiner for refiner=chain, refiner.links.x for refiner@refiner.links.x=y."""
+    group, _, package = override.lstrip("+~").partition("=")[0].partition("@")
+    return package or group.replace("/", ".")
+
+
+def _kept(one: _Variant, changed: Collection[str]) -> Iterator[tuple[Any, Mapping[str, Any]]]:
+    """The parameters that no row says it changes, under their stage and its option: runs of two rows share them."""
+    for key, value in one.parameters.items():
+        if not _is_below(key, changed):
+            stage = key.partition(".")[0]
+            yield (stage, one.choices.get(stage)), {key: value}
+
+
+def _is_below(key: str, others: Collection[str]) -> bool:
+    """Whether a dotted key is one of `others` or below one."""
+    parts = key.split(".")
+    return any(".".join(parts[:k]) in others for k in range(1, len(parts) + 1))
+
+
+@dataclass(frozen=True)
+class _Variant:
+    """What a record says about the row and the run that it belongs to."""
+
+    record: Record
+    row: str
+    run: Run
+    choices: Mapping[str, Any]  # by stage, and the annotation
+    parameters: Mapping[str, Any]  # by dotted key
+
+    @classmethod
+    def of(cls, record: Record, over: Sequence[str]) -> _Variant:
+        parameters = dict(leaves(relevant(record.config)))
+        choices = {k.removeprefix(CHOICE): v for k, v in record.metrics.items() if k.startswith(CHOICE)}
+        choices["annotation"] = record.annotation or "not told"
+        run = tuple(str(parameters.get(key)) for key in over)
+        row = record.config.get("row")
+        return cls(record, "" if row is None else str(row), run, choices, parameters)
+
+
+def following(records: Sequence[Record], over: Sequence[str]) -> list[str]:
+    """The keys that had the value of one of `over` in every record, although none of its name: maybe by chance."""
+    variants = [_Variant.of(record, over) for record in records]
+    names = {key.rpartition(".")[2] for key in over}
+    differing = set(_differing([("", one.parameters) for one in variants]))
+    return sorted(key for key in differing & _following(variants, over) if key.rpartition(".")[2] not in names)
+
+
+def _following(variants: Sequence[_Variant], over: Sequence[str]) -> set[str]:
+    """The keys `over`, and those whose value is that of one of them in every record."""
+    found = set(over)
+    for key in {key for one in variants for key in one.parameters}:
+        for k in range(len(over)):
+            if all(str(one.parameters[key]) == one.run[k] for one in variants if key in one.parameters):
+                found.add(key)
+    return found
+
+
+def _differing(groups: Sequence[tuple[Any, Mapping[str, Any]]]) -> list[str]:
+    """The keys that have several values in one group, in their order; `groups` are groups with keys and values."""
+    seen: dict[Any, dict[str, set[str]]] = {}
+    for group, values in groups:
+        for key, value in values.items():
+            seen.setdefault(group, {}).setdefault(key, set()).add(repr(value))
+    differing = {key for keys in seen.values() for key, values in keys.items() if len(values) > 1}
+    return [key for key in dict.fromkeys(key for _, values in groups for key in values) if key in differing]
+
+
+def natural(run: Run) -> tuple[tuple[float, str], ...]:
+    """Seeds in their order as numbers, other words after them."""
+    return tuple((float(word) if word.isdecimal() else math.inf, word) for word in run)

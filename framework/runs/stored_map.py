@@ -1,0 +1,69 @@
+"""The map that a run left behind, as far as pictures show it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Float64, InstanceMesh, Int32, SceneTruth
+from framework.errors import DataError
+from framework.evaluation.instances import MAX_DISTANCE, transfer_labels
+from framework.files.tum_trajectory import read_tum
+from framework.runs.instances_file import StoredInstance, read_instances
+from framework.runs.mesh_file import read_mesh
+from framework.runs.stored_runs import INSTANCES, MESH, METRICS, TRAJECTORY, Record
+
+
+@dataclass(frozen=True)
+class StoredMap:
+    """A map of F frames with V vertices."""
+
+    mesh: InstanceMesh
+    ids: Int32  # (V,) 0 = of no instance that the run counted
+    class_names: Mapping[int, str]  # by instance
+    poses: Float64  # (F, 4, 4) T_world_camera of the frames that were mapped
+    record: Record
+
+    @classmethod
+    def of(cls, record: Record) -> StoredMap:
+        """Raises DataError, naming the file, when one cannot be read or is of another run, or nothing was mapped."""
+        mesh, instances = read_objects(record)
+        _, poses = read_tum(record.directory / TRAJECTORY)
+        if not len(mesh.triangles) or not len(poses):
+            raise DataError(f"{record.directory}: nothing was mapped")
+        names = {instance.id: instance.class_name for instance in instances}
+        ids = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
+        return cls(mesh, ids, names, poses, record)
+
+    def true_ids(self, truth: SceneTruth) -> Int32:
+        """(V,) the true instance nearest to each vertex, 0 = none, or none as near as the evaluation asks."""
+        return transfer_labels(truth.points_world, truth.instance_ids, self.mesh.vertices, MAX_DISTANCE)
+
+
+def read_objects(record: Record) -> tuple[InstanceMesh, list[StoredInstance]]:
+    """mesh.ply and instances.json. Raises DataError when they are not of this run."""
+    mesh, instances = read_labeled_mesh(record.directory)
+    if len(instances) != record.metrics.get("instances.count"):
+        raise DataError(
+            f"{record.directory / INSTANCES} lists {len(instances)} instances, but {METRICS} counts "
+            f"{record.metrics.get('instances.count')}: they are not of one run; run it again"
+        )
+    return mesh, instances
+
+
+def read_labeled_mesh(directory: Path) -> tuple[InstanceMesh, list[StoredInstance]]:
+    """The same of a run that may have ended early. Raises DataError when the two files are not of one run."""
+    mesh_path, instances_path = directory / MESH, directory / INSTANCES
+    instances, mesh = read_instances(instances_path), read_mesh(mesh_path)
+    ids, counts = np.unique(mesh.instance_ids, return_counts=True)
+    vertices = dict(zip(ids.tolist(), counts.tolist(), strict=True))
+    for instance in instances:
+        if vertices.get(instance.id, 0) != instance.vertices:
+            raise DataError(
+                f"{instances_path} gives instance {instance.id} {instance.vertices} vertices, but {mesh_path} has "
+                f"{vertices.get(instance.id, 0)}: they are not of one run; run it again"
+            )
+    return mesh, instances

@@ -1,0 +1,54 @@
+"""timings.csv read back: how long each stage took for each frame."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import Float64, Int64
+from framework.errors import DataError
+from framework.files.atomic_write import read_text
+
+HEADER = ["frame", "stage", "milliseconds"]
+LARGEST = 2**53  # numbers of frames are smaller: every program has these exactly
+
+
+@dataclass(frozen=True)
+class StageTimes:
+    """The times of one run."""
+
+    frames: Int64  # (F,) numbers of the video's frames, ascending
+    milliseconds: Mapping[str, Float64]  # by stage: (F,), NaN where it did not run, as after a lost pose
+
+
+def read_timings(path: Path) -> StageTimes:
+    """The times that a run wrote. Raises DataError, naming file and line, for anything else."""
+    try:
+        lines = list(csv.reader(read_text(path).splitlines(keepends=True)))
+    except csv.Error as error:
+        raise DataError(f"{path} cannot be read: {error}") from error
+    if lines[:1] != [HEADER]:
+        raise DataError(f"{path}, line 1: expected {','.join(HEADER)}, found {','.join(next(iter(lines), []))!r:.60}")
+    taken: dict[tuple[int, str], float] = {}
+    for number, line in enumerate(lines[1:], start=2):
+        try:
+            frame, stage, milliseconds = int(line[0]), line[1], float(line[2])
+        except (ValueError, IndexError):
+            frame, stage, milliseconds = 0, "", np.nan
+        if not (0 <= milliseconds < np.inf and abs(frame) < LARGEST):
+            raise DataError(
+                f"{path}, line {number}: expected a frame, a stage and a time, found {','.join(line)!r:.60}"
+            )
+        taken[frame, stage] = milliseconds
+    if not taken:
+        raise DataError(f"{path} has no times")
+    frames = sorted({frame for frame, _ in taken})
+    stages = dict.fromkeys(stage for _, stage in taken)
+    return StageTimes(
+        np.array(frames, np.int64),
+        {stage: np.array([taken.get((frame, stage), np.nan) for frame in frames], np.float64) for stage in stages},
+    )

@@ -1,0 +1,202 @@
+"""What happens while a pipeline runs: timings, poses, faults and progress."""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from itertools import takewhile
+from types import TracebackType
+
+import numpy as np
+from tqdm.contrib.logging import logging_redirect_tqdm
+
+from framework.data import Array, Float64, Frame, Pose
+from framework.errors import FrameError, NoPoseError
+from framework.interfaces import PoseTracker, SceneMap
+from framework.runtime.progress import Progress
+
+log = logging.getLogger(__name__)
+
+SKIPS_LOGGED = 10  # later unusable frames are only counted, so that a broken disk does not flood the log
+COUNT_INTERVAL_S = 1.0  # how often the progress bar asks the map for its number of instances
+
+
+@dataclass(frozen=True)
+class StageTime:
+    """How long one stage took for one frame."""
+
+    frame: int  # Frame.index
+    stage: str  # read, detect, track, lift, refine or fuse
+    milliseconds: float
+
+
+@dataclass(frozen=True)
+class TrackedFrame:
+    """Where the camera was believed to be, and where it was."""
+
+    index: int  # Frame.index
+    position: int  # among the frames taken from the sequence, skipped ones included
+    timestamp: float  # s
+    pose: Pose
+    T_world_camera_truth: Float64 | None  # (4, 4)
+
+
+@dataclass(frozen=True)
+class LiveFigures:
+    """What only a live video has."""
+
+    frames_dropped: int  # came while another was in work, and a newer one followed
+    latencies: tuple[float, ...]  # s, from when a frame was there to when it was in the map, of each fused frame
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """What a run over a video leaves in memory."""
+
+    scene: SceneMap
+    frames: int  # taken from the video: mapped, lost and skipped ones
+    frames_skipped: int  # could not be used: unreadable, inconsistent, or without a pose where poses are given
+    tracked: tuple[TrackedFrame, ...]  # in order, lost frames included
+    timings: tuple[StageTime, ...]
+    seconds: float  # wall clock of the whole loop
+    stopped_by: BaseException | None = None  # what ended it early; None = the video was mapped to its end
+    intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
+    pose_source: str = PoseTracker.pose_source
+    live: LiveFigures | None = None  # None = of a recording, which is mapped whole
+    places: Mapping[str, Array] = field(default_factory=dict)  # that the tracker remembers
+
+    @property
+    def frames_lost(self) -> int:
+        """Frames that were not fused because the tracker could not tell their pose."""
+        return sum(frame.pose.lost for frame in self.tracked)
+
+    @property
+    def fps(self) -> float:
+        """Frames per second of wall clock, reading and detection included."""
+        return self.frames / self.seconds
+
+    @property
+    def fps_median(self) -> float:
+        """The same by the median frame, without what only some frames cost: compiling the kernels, filling caches."""
+        return 1 / float(np.median(self.intervals)) if self.intervals else self.fps
+
+
+@dataclass
+class Journal:
+    """Keeps the record of a run while it goes on, and shows its progress."""
+
+    scene: SceneMap
+    frames_expected: int | None  # None = of a live video, which goes on as long as it likes
+    pose_source: str
+    frames: int = 0
+    frames_skipped: int = 0
+    without_pose: int = 0  # of the skipped frames: no pose is given for them
+    first_without_pose: str = ""  # which that was, and why
+    tracked: list[TrackedFrame] = field(default_factory=list)
+    timings: list[StageTime] = field(default_factory=list)
+    frames_in_map: int = 0  # of which at least a part may be in the map
+    stopped_by: BaseException | None = None
+    frames_began: list[float] = field(default_factory=list)  # s, when each frame was taken
+    lost_for: int = 0  # frames up to the last one
+    frames_dropped: int = 0
+    latencies: list[float] = field(default_factory=list)  # s
+
+    def __enter__(self) -> Journal:
+        self._screen = ExitStack()
+        self._bar = self._screen.enter_context(Progress(self.frames_expected, " frames"))
+        if not self._bar.disable:
+            self._screen.enter_context(logging_redirect_tqdm())
+        self._counted_at = self._started = time.perf_counter()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.seconds = time.perf_counter() - self._started
+        self._screen.close()
+        if 0 < self.without_pose < self.frames:
+            told = (self.without_pose, self.frames, self.first_without_pose)
+            log.warning("%d of %d frames skipped, as no pose is given for them; the first: %s", *told)
+        if self._faults > SKIPS_LOGGED:
+            log.warning("%d frames skipped in all", self.frames_skipped)
+        if self.frames_dropped:
+            log.warning("%d frames dropped: they came while others were mapped", self.frames_dropped)
+
+    @contextmanager
+    def timed(self, frame: int, stage: str) -> Iterator[None]:
+        """Notes how long the body takes, if it succeeds."""
+        started = time.perf_counter()
+        yield
+        self.timings.append(StageTime(frame, stage, 1e3 * (time.perf_counter() - started)))
+
+    def stage_ms(self, frame: int) -> dict[str, float]:
+        """What each stage took for the last frame, ms; `frame` is its index."""
+        of_last = takewhile(lambda time: time.frame == frame, reversed(self.timings))
+        return {time.stage: time.milliseconds for time in of_last}
+
+    def frame_begins(self) -> None:
+        """Counts a frame that was taken from the sequence, whatever becomes of it."""
+        self.frames += 1
+        self._bar.update()
+        now = time.perf_counter()
+        self.frames_began.append(now)
+        if not self._bar.disable and now - self._counted_at > COUNT_INTERVAL_S:
+            counts = {"instances": self.scene.instance_count}
+            if self.frames_expected is None:
+                counts["dropped"] = self.frames_dropped
+            self._bar.set_postfix(counts, refresh=False)
+            self._counted_at = time.perf_counter()
+        if self._bar.line_is_due():
+            of_all = "" if self.frames_expected is None else f" of {self.frames_expected}"
+            log.info("frame %d%s, %d instances", self.frames, of_all, self.scene.instance_count)
+
+    def frame_skipped(self, error: FrameError) -> None:
+        """Counts a frame that cannot be used."""
+        self.frames_skipped += 1
+        if isinstance(error, NoPoseError):
+            self.without_pose += 1
+            self.first_without_pose = self.first_without_pose or str(error)
+            return
+        if self._faults <= SKIPS_LOGGED:
+            log.warning("frame skipped: %s", error)
+        if self._faults == SKIPS_LOGGED:
+            log.warning("further skipped frames are only counted")
+
+    @property
+    def _faults(self) -> int:
+        """Skipped frames of which each is worth a word."""
+        return self.frames_skipped - self.without_pose
+
+    def frame_tracked(self, frame: Frame, pose: Pose) -> None:
+        """Keeps the pose; says when tracking gets lost and when it is found again."""
+        self.tracked.append(TrackedFrame(frame.index, self.frames - 1, frame.timestamp, pose, frame.T_world_camera))
+        if pose.lost:
+            if not self.lost_for:
+                log.warning("frame %d: lost: %s", frame.index, pose.reason or "the tracker gave no reason")
+            self.lost_for += 1
+        elif self.lost_for:
+            log.warning("frame %d: tracked again after %d lost frames", frame.index, self.lost_for)
+            self.lost_for = 0
+
+    def frame_fused(self, frame: Frame) -> None:
+        """Keeps how old a frame of a live video is when the map has it."""
+        if self.frames_expected is None:
+            self.latencies.append(time.time() - frame.timestamp)
+
+    def result(self) -> RunResult:
+        """The run as it stands once the loop has ended."""
+        return RunResult(
+            scene=self.scene,
+            frames=self.frames,
+            frames_skipped=self.frames_skipped,
+            tracked=tuple(self.tracked),
+            timings=tuple(self.timings),
+            seconds=self.seconds,
+            stopped_by=self.stopped_by,
+            intervals=tuple(np.diff(self.frames_began).tolist()),
+            pose_source=self.pose_source,
+            live=LiveFigures(self.frames_dropped, tuple(self.latencies)) if self.frames_expected is None else None,
+        )

@@ -1,0 +1,143 @@
+"""A small room whose every pixel is known exactly: what the contracts run on.
+
+The corner of a room (two walls and a floor, textured) with a chair and a couch, both spheres. World: x right, y down,
+z forward, like the first camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import (
+    Camera,
+    Detections,
+    Float32,
+    Float64,
+    Frame,
+    FrameTruth,
+    Instance,
+    InstanceMesh,
+    Int32,
+    PointClusters,
+    Pose,
+    UInt8,
+    View,
+)
+from framework.errors import DataError
+from framework.geometry import exp_se3
+from framework.interfaces import SceneMap
+from framework.refinement.lifting import lift
+
+CLASSES = ("chair", "couch")
+CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
+RATE = 30  # Hz
+PLANES = (((-1.0, 0.0, 0.0), 1.5), ((0.0, -1.0, 0.0), 1.0), ((0.0, 0.0, -1.0), 3.0))  # n . p + d = 0, n into the room
+SPHERES = (((-0.5, 0.7, 2.2), 0.35), ((0.5, 0.6, 2.5), 0.45))  # centre, radius: instances 1 and 2
+
+
+def look(camera: Camera, T_world_camera: Float64) -> tuple[Float32, Float64, UInt8, Int32]:
+    """Depth (H, W), normals (H, W, 3), colour (H, W, 3) and instance ids (H, W), all exact."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(u.shape)], axis=-1)
+    d = rays @ T_world_camera[:3, :3].T
+    o = T_world_camera[:3, 3]
+    depth = np.full(u.shape, np.inf)
+    normals = np.zeros((*u.shape, 3))
+    ids = np.zeros(u.shape, np.int32)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        for n, offset in PLANES:
+            t = -(o @ np.array(n) + offset) / (d @ np.array(n))
+            nearer = (t > 1e-3) & (t < depth)
+            depth[nearer], normals[nearer] = t[nearer], n
+        for k, (center, radius) in enumerate(SPHERES, start=1):
+            b, a = d @ (o - center), (d**2).sum(-1)
+            t = (-b - np.sqrt(b**2 - a * (((o - center) ** 2).sum() - radius**2))) / a
+            nearer = (t > 1e-3) & (t < depth)
+            depth[nearer], ids[nearer] = t[nearer], k
+            normals[nearer] = ((o + t[..., None] * d - center) / radius)[nearer]
+    seen = np.isfinite(depth)
+    depth = np.where(seen, depth, 0)
+    p = o + depth[..., None] * d
+    waves = np.stack([np.sin(9 * p + 1.3 * k).sum(-1) + np.sin(23 * p[..., k] + k) for k in range(3)], axis=-1)
+    color = np.where(seen[..., None], 128 + 28 * waves + 20 * (ids[..., None] - 1), 0)
+    return depth.astype(np.float32), normals, np.clip(color, 0, 255).astype(np.uint8), ids
+
+
+def pose_at(k: int) -> Float64:
+    """T_world_camera of frame k: about a centimetre and a third of a degree further than the one before."""
+    return exp_se3(np.array([0.010, -0.003, 0.006, 0.002, -0.005, 0.001]) * k)
+
+
+def frame_at(k: int, truth: bool = True) -> Frame:
+    """Frame k of a camera that moves through the room, with its true pose and instances, or without either."""
+    depth, _, color, ids = look(CAMERA, pose_at(k))
+    if not truth:
+        return Frame(k, k / RATE, color, depth, CAMERA)
+    return Frame(k, k / RATE, color, depth, CAMERA, pose_at(k), FrameTruth(ids, dict(enumerate(CLASSES, start=1))))
+
+
+def spheres_in(frame: Frame) -> Detections:
+    """Both spheres, where they really are. Raises DataError for a frame without true instances."""
+    if frame.truth is None:
+        raise DataError(f"frame {frame.index} has no true instances: choose a detector that needs none")
+    masks = frame.truth.instance_ids == np.array([1, 2], np.int32)[:, None, None]
+    boxes = [
+        [u.min(), v.min(), u.max() + 1, v.max() + 1] if len(u) else [0, 0, 0, 0] for v, u in map(np.nonzero, masks)
+    ]
+    sure = np.array([[0.9, 0.1], [0.2, 0.8]], np.float32)
+    return Detections(masks, np.array(boxes, np.float32), sure.max(1), sure, CLASSES)
+
+
+def exact_clusters(frame: Frame) -> PointClusters:
+    """Both spheres, lifted from their true masks and the true pose."""
+    return lift(spheres_in(frame), frame, Pose(pose_at(frame.index)))
+
+
+def bleeding_clusters(frame: Frame) -> PointClusters:
+    """Both spheres, with masks that take in some of the wall behind."""
+    exact = spheres_in(frame)
+    masks = exact.masks | np.roll(exact.masks, 3, axis=2)
+    return lift(replace(exact, masks=masks), frame, Pose(pose_at(frame.index)))
+
+
+@dataclass(frozen=True)
+class RoomMap(SceneMap):
+    """The room itself as a map, which nobody can write: every view of it is perfect."""
+
+    classes: tuple[str, ...] = CLASSES
+
+    @property
+    def voxel_count(self) -> int:
+        return 1
+
+    @property
+    def byte_count(self) -> int:
+        return 1
+
+    def render(self, camera: Camera, T_world_camera: Float64) -> View:
+        depth, normals, color, ids = look(camera, T_world_camera)
+        return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
+
+    def mesh(self) -> InstanceMesh:
+        return InstanceMesh(
+            vertices=np.zeros((0, 3), np.float32),
+            triangles=np.zeros((0, 3), np.int32),
+            colors=np.zeros((0, 3), np.uint8),
+            instance_ids=np.zeros(0, np.int32),
+            class_ids=np.zeros(0, np.int32),
+            classes=self.classes,
+        )
+
+    def instances(self) -> Mapping[int, Instance]:
+        return {}
+
+    def save(self, path: Path | str) -> None:
+        raise DataError("the room is not to be saved")
+
+    @classmethod
+    def load(cls, path: Path | str) -> RoomMap:
+        raise DataError("the room is not to be loaded")

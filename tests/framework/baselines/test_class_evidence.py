@@ -1,0 +1,112 @@
+"""The recursion over classes and background in one voxel, beside the dense one that keeps every class."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numba import njit
+
+from framework.baselines.class_evidence import ClassEvidence, ClassRows, MaskClasses, mask_classes, observe_mask
+from framework.data import PointClusters
+from framework.errors import DataError
+from framework.mapping.labels.class_slots import CLASS_SLOTS, NEW_CLASSES, NO_CLASS
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
+from framework.mapping.voxels.voxel_grid import VoxelGrid
+
+
+def one_voxel(classes: int) -> ClassEvidence:
+    voxels = VoxelGrid(0.01, 0.1, 8)
+    voxels.allocate(np.zeros((1, 3), np.int32))
+    rows = ClassRows(voxels)
+    rows.begin(classes)
+    rows._add_rows(np.zeros(1, np.int32))
+    return rows.evidence
+
+
+def masks_that_say(log_ratio: np.ndarray, frame: int = 0) -> MaskClasses:
+    """Masks with these (N, C), side by side in one row of pixels."""
+    n, c = log_ratio.shape
+    clusters = PointClusters(
+        np.zeros((n, 3), np.float32),
+        np.stack([np.arange(n), np.zeros(n)], axis=1).astype(np.int32),
+        np.arange(n, dtype=np.int32),
+        np.full((n, c), 1 / c, np.float32),
+        np.ones(n, np.float32),
+        tuple(map(str, range(c))),
+    )
+    return mask_classes(log_ratio, clusters, list_points_by_pixel(clusters, (1, n)), frame)
+
+
+@njit
+def observe(evidence, masks, k):
+    return observe_mask(evidence, 0, 0, masks, k)
+
+
+def sums(evidence: ClassEvidence, classes: int) -> np.ndarray:
+    """(C,) what the voxel holds for each class."""
+    found = np.full(classes, evidence.rest[0, 0], np.float64)
+    for label, value in zip(evidence.class_ids[0, 0], evidence.log_ratio[0, 0], strict=True):
+        if label != NO_CLASS:
+            found[label] = value
+    return found
+
+
+def test_few_classes_are_kept_exactly() -> None:
+    rng = np.random.default_rng(0)
+    said = rng.normal(0, 2, (30, 5))
+    masks, evidence = masks_that_say(said), one_voxel(5)
+    assert sum(observe(evidence, masks, k) for k in range(30)) == 0
+    np.testing.assert_allclose(sums(evidence, 5), said.sum(axis=0), atol=1e-4)
+    assert evidence.class_ids[0, 0, 0] == said.sum(axis=0).argmax()
+    assert evidence.masked[0, 0] == 30
+
+
+def test_what_is_named_late_has_all_that_was_said_before() -> None:
+    """Of 14 classes each mask names 8 and finds the others alike: as a detector's floor does."""
+    rng = np.random.default_rng(1)
+    said = np.full((20, 14), -3.0)
+    for row in said:
+        row[rng.choice(14, NEW_CLASSES, replace=False)] = rng.normal(0, 1, NEW_CLASSES)
+    masks, evidence = masks_that_say(said), one_voxel(14)
+    assert sum(observe(evidence, masks, k) for k in range(20)) == 0
+    np.testing.assert_allclose(sums(evidence, 14), said.sum(axis=0), atol=1e-4)
+
+
+def test_a_voxel_without_room_drops_the_least_likely_class_and_counts_it() -> None:
+    said = np.full((3, 40), -5.0)
+    said[0, :8], said[1, 8:16], said[2, 16:24] = 1.0, 2.0, 9.0
+    masks, evidence = masks_that_say(said), one_voxel(40)
+    assert evidence.class_ids.shape[2] == CLASS_SLOTS
+    assert [observe(evidence, masks, k) for k in range(3)] == [0, 0, 8]
+    # classes 0 to 7 have 1 - 5 - 5, 8 to 15 have -5 + 2 - 5, 16 to 23 have -5 - 5 + 9
+    assert set(evidence.class_ids[0, 0].tolist()) == set(range(8, 24))
+    assert evidence.class_ids[0, 0, 0] == 16
+    assert evidence.log_ratio[0, 0, 0] == pytest.approx(-1)
+
+
+def test_frames_are_counted_and_the_first_and_last_are_known() -> None:
+    evidence = one_voxel(2)
+    for frame in (4, 7, 9):
+        observe(evidence, masks_that_say(np.zeros((1, 2)), frame), 0)
+    assert (evidence.masked[0, 0], evidence.first_frame[0, 0], evidence.last_frame[0, 0]) == (3, 4, 9)
+    assert (evidence.masked[0, 1], evidence.first_frame[0, 1], evidence.last_frame[0, 1]) == (0, -1, -1)
+
+
+def test_of_masks_over_a_pixel_the_best_scored_speaks() -> None:
+    clusters = PointClusters(
+        np.zeros((5, 3), np.float32),
+        np.int32([[0, 0], [0, 0], [1, 0], [0, 0], [2, 0]]),
+        np.int32([0, 1, 1, 2, -1]),
+        np.full((3, 2), 0.5, np.float32),
+        np.float32([0.4, 0.9, 0.9]),
+        ("chair", "bed"),
+    )
+    masks = mask_classes(np.zeros((3, 2)), clusters, list_points_by_pixel(clusters, (1, 4)), 0)
+    assert masks.cluster.tolist() == [1, 1, -1, -1]
+
+
+def test_a_voxel_tells_255_classes_apart() -> None:
+    rows = ClassRows(VoxelGrid(0.01, 0.1, 8))
+    rows.begin(255)
+    with pytest.raises(DataError, match="255 classes"):
+        rows.begin(256)

@@ -1,0 +1,50 @@
+"""`compile` says what it did, and is ended by Ctrl-C at once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from framework.commands.installation.compile import compile_named
+from framework.compilation.catalog import DEFAULT, listed
+from framework.errors import ConfigError
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+
+
+def compiling(cache: Path, *words: str) -> subprocess.Popen[str]:
+    line = [sys.executable, "-m", "framework", "compile", *words]
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache)}
+    pipe = subprocess.PIPE
+    return subprocess.Popen(line, cwd=CHECKOUT, env=environment, stdout=pipe, stderr=pipe, text=True)
+
+
+def test_a_second_call_has_nothing_to_compile(tmp_path: Path) -> None:
+    first, _ = compiling(tmp_path, "allocation._unpack", "masks._bounds").communicate()
+    assert first.startswith("2 of 2 kernels compiled in ")
+    second, _ = compiling(tmp_path, "allocation._unpack", "masks._bounds").communicate()
+    assert second == "all 2 kernels are compiled\n"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows sends no SIGINT to one process")
+def test_ctrl_c_ends_it_in_one_line(tmp_path: Path) -> None:
+    process = compiling(tmp_path)
+    time.sleep(3)  # it is at work, or about to be
+    process.send_signal(signal.SIGINT)
+    asked = time.monotonic()
+    _, said = process.communicate(timeout=10)
+    assert time.monotonic() - asked < 5
+    assert process.returncode == 128 + signal.SIGINT
+    assert "Traceback" not in said
+    assert said.splitlines()[-1] == "interrupted"
+
+
+def test_a_word_that_no_kernel_has_is_refused() -> None:
+    with pytest.raises(ConfigError, match="no kernel with nothing in its name"):
+        compile_named(listed(DEFAULT), ["nothing"])

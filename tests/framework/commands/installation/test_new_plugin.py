@@ -1,0 +1,184 @@
+"""A repository that `new-plugin` writes: built, installed outside of the checkout, tested there and swept."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import venv
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+from framework.commands.installation.new_plugin import LONGEST_NAME, check_name, files_of, write_repository
+from framework.doctor.requirements import NOT_OF_USERS
+from framework.errors import ConfigError
+from framework.registry import GROUPS
+from tests.support import option_files
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+EXAMPLE = CHECKOUT / "examples" / "instancemap-depth-median"
+SITE = Path(sysconfig.get_paths()["purelib"])
+
+
+def test_the_example_is_what_new_plugin_writes() -> None:
+    written = files_of("refiner", "depth_median")
+    files = {path.relative_to(EXAMPLE) for path in EXAMPLE.rglob("*") if path.is_file()}
+    left = {path for path in files if not {"__pycache__", ".ruff_cache", ".pytest_cache"}.intersection(path.parts)}
+    assert left == set(map(Path, written))
+    for path, text in written.items():
+        assert (EXAMPLE / path).read_text() == text, f"{path}: remove {EXAMPLE.name}, write it anew with new-plugin"
+
+
+@pytest.mark.parametrize("name", ["x", "a" * LONGEST_NAME])
+@pytest.mark.parametrize("stage", GROUPS)
+def test_what_is_written_is_in_style(stage: str, name: str, tmp_path: Path) -> None:
+    """ruff also finds a name that is not defined, and a template that is no Python."""
+    made = write_repository(stage, name, tmp_path)
+    for line in (["check", "--no-cache"], ["format", "--check", "--no-cache"]):
+        done = subprocess.run(
+            [sys.executable, "-m", "ruff", *line], cwd=made, capture_output=True, text=True, timeout=60
+        )
+        assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("gmm_em", "there is a refiner=gmm_em already"),
+        ("../up", "found '../up'"),
+        ("/tmp/x", "found '/tmp/x'"),
+        ("My", "found 'My'"),
+        ("", "found ''"),
+        ("a__b", "found 'a__b'"),
+        ("2d", "found '2d'"),
+        ("x" * (LONGEST_NAME + 1), f"at most {LONGEST_NAME} characters"),
+        ("class", "means something else"),
+        ("conf", "means something else"),
+        ("null", "NAME null is a value"),
+        ("nan", "NAME nan is a value"),
+        ("on", "NAME on is a value"),
+        ("config_error", "its class ConfigError would have the name of another"),
+        ("cluster_refiner", "its class ClusterRefiner would have the name of another"),
+    ],
+)
+def test_a_name_that_cannot_be_is_refused_in_one_line(name: str, said: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        check_name("refiner", name)
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_nothing_is_written_over_and_nothing_half(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = write_repository("refiner", "mine", tmp_path)
+    (made / "README.md").write_text("my own")
+    with pytest.raises(ConfigError, match="is there already"):
+        write_repository("refiner", "mine", tmp_path)
+    assert (made / "README.md").read_text() == "my own"
+    with pytest.raises(ConfigError, match="--in: there is no folder"):
+        write_repository("refiner", "other", tmp_path / "nowhere")
+    (tmp_path / "instancemap-linked").symlink_to(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="is there already"):
+        write_repository("refiner", "linked", tmp_path)
+
+    def full(path: Path, *_: object, **__: object) -> int:
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(Exception, match="instancemap-other could not be written: No space left on device"):
+        write_repository("refiner", "other", tmp_path)
+    assert {path.name for path in tmp_path.iterdir()} == {made.name, "instancemap-linked"}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a plugin's repository for each group, and `env`, where all of them are installed from wheels.
+
+    The libraries are those of this environment; InstanceMap itself is in its own, and nothing of the checkout.
+    """
+    folder = tmp_path_factory.mktemp("stranger")
+    (folder / "wheels").mkdir()
+    for stage in GROUPS.keys() - {"refiner"}:
+        write_repository(stage, f"my_{stage}", folder)
+    line = [sys.executable, "-m", "framework", "new-plugin", "refiner", "my_refiner", "--in", str(folder)]
+    said = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, check=True, timeout=60).stdout
+    assert len(said.splitlines()) == 3
+    for source in (CHECKOUT, *folder.glob("instancemap-my-*")):
+        build = [sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory", str(folder / "wheels")]
+        subprocess.run(build, cwd=source, check=True, capture_output=True, timeout=120)
+    venv.create(folder / "env", symlinks=True)
+    wheels = [str(path) for path in (folder / "wheels").iterdir()]
+    install = [sys.executable, "-m", "pip", "--python", str(folder / "env"), "install", "--quiet", "--no-deps"]
+    subprocess.run([*install, "--no-index", *wheels], check=True, timeout=120)
+    [site] = folder.glob("env/lib/python*/site-packages")
+    (site / "libraries.pth").write_text(f"{SITE}\n")
+    copy_kernels(site)
+    return folder
+
+
+def copy_kernels(site: Path) -> None:
+    """What numba has compiled of the checkout's files, for the same files here: it looks at their times and sizes."""
+    for path in (CHECKOUT / "framework").rglob("*.py"):
+        shutil.copystat(path, site / path.relative_to(CHECKOUT))
+    for path in (CHECKOUT / "framework").rglob("*.nb[ic]"):
+        copied = site / path.relative_to(CHECKOUT)
+        copied.parent.mkdir(exist_ok=True)
+        shutil.copy2(path, copied)
+
+
+def run(place: Path, *line: str) -> str:
+    """What a program of the new environment prints."""
+    alone = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "HYDRA_FULL_ERROR")}
+    program = str(place / "env" / "bin" / line[0])
+    done = subprocess.run([program, *line[1:]], cwd=place, env=alone, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout[-4000:] + done.stderr[-4000:]
+    return done.stdout
+
+
+def test_each_plugins_own_tests_pass_where_it_is_installed(place: Path) -> None:
+    where = run(place, "python", "-c", "import framework, instancemap_my_refiner; print(framework.__file__)")
+    assert where.startswith(str(place))
+    (place / "pytest.ini").touch()
+    tests = [str(path) for path in place.glob("instancemap-my-*/tests/test_*.py")]
+    assert len(tests) == len(GROUPS)
+    said = run(place, "python", "-m", "pytest", "--quiet", "-p", "no:dash", "--import-mode=importlib", *tests)
+    assert " passed" in said
+    assert "skipped" not in said
+
+
+def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: Path) -> None:
+    (place / "DIR").mkdir()
+    option_files.overrides("dataset", "rgbd_folder", place / "DIR")
+    chosen = "dataset=rgbd_folder dataset.root=DIR detector=simulated tracker=ground_truth fuser.min_observations=1"
+    more = ("viewer=my_viewer", "hydra.sweep.dir=outputs/first_sweep")
+    said = run(place, "instancemap", "-m", "refiner=gmm_em,my_refiner", *chosen.split(), *more)
+    records = [json.loads(path.read_text()) for path in (place / "outputs" / "first_sweep").glob("*/metrics.json")]
+    assert [record["frames"] for record in records] == [3, 3]
+    assert all(record["instances.count"] > 0 for record in records)
+    for job in ("refiner=gmm_em", "refiner=my_refiner"):
+        [log] = (place / "outputs" / "first_sweep").glob(f"*{job}*/frames.jsonl")
+        assert [json.loads(line)["frame"] for line in log.read_text().splitlines()] == [0, 1, 2]
+    assert run(place, "instancemap", "tables", "outputs/first_sweep").strip() in said
+    with (place / "outputs" / "first_sweep" / "table.csv").open() as table:
+        rows = list(csv.DictReader(table))
+    assert [row["row"] for row in rows] == ["refiner=gmm_em", "refiner=my_refiner"]
+    assert "refiner=my_refiner" in said
+    listed = run(place, "instancemap", "plugins", "refiner", "my_refiner")
+    assert "my_refiner  [from instancemap-my-refiner]" in listed
+
+
+def test_an_installed_package_examines_itself_and_writes_plugins(place: Path) -> None:
+    sections = json.loads(run(place, "instancemap", "doctor", "--json"))
+    found = {of["title"]: {one["name"]: one for one in of["findings"]} for of in sections}
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert set(found["Libraries"]) == {Requirement(line).name for line in project["dependencies"]}
+    assert set(found["Extras, optional"]) == project["optional-dependencies"].keys() - NOT_OF_USERS
+    assert found["InstanceMap"]["commit"]["detail"] == "no checkout"
+    assert "written: instancemap-other" in run(place, "instancemap", "new-plugin", "tracker", "other")
+    assert (place / "instancemap-other" / "instancemap_other" / "other.py").exists()

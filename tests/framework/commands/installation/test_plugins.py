@@ -1,0 +1,235 @@
+"""The listing, and a real third-party package whose plugin is there after `pip install` like any other."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from framework.commands.installation.plugins import Option, Parameter, describe, registered
+from framework.config import composition
+from framework.registry import GROUPS, STAGES
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+
+PACKAGE = {
+    "pyproject.toml": """
+        [build-system]
+        requires = ["setuptools"]
+        build-backend = "setuptools.build_meta"
+        [project]
+        name = "acme-detectors"
+        version = "1.0"
+        [tool.setuptools]
+        packages = ["acme", "hydra_plugins"]
+        [tool.setuptools.package-data]
+        acme = ["conf/**/*.yaml"]
+    """,
+    "acme/__init__.py": "",
+    "acme/everything.py": '''
+        from dataclasses import dataclass
+        import numpy as np
+        from framework.data import Detections, Frame
+        from framework.errors import ConfigError
+        from framework.interfaces import Detector
+
+        @dataclass
+        class Everything(Detector):
+            """The whole image is one object.
+
+            More that a listing leaves out.
+            """
+
+            score: float = 0.5
+
+            def __post_init__(self) -> None:
+                if not 0 <= self.score <= 1:
+                    raise ConfigError(f"score must be in [0, 1], found {self.score}")
+                self.classes = ("chair",)
+
+            def detect(self, frame: Frame) -> Detections:
+                height, width = frame.camera.shape
+                return Detections(
+                    masks=np.ones((1, height, width), np.bool_),
+                    boxes=np.array([[0, 0, width, height]], np.float32),
+                    scores=np.array([self.score], np.float32),
+                    class_probabilities=np.ones((1, 1), np.float32),
+                    classes=self.classes,
+                )
+    ''',
+    "acme/another.py": """
+        from dataclasses import dataclass
+        from acme.everything import Everything
+
+        @dataclass
+        class Another(Everything):
+            pass
+    """,
+    "acme/conf/parts/acme_another.yaml": """
+        _target_: acme.another.Another
+    """,
+    "acme/conf/detector/acme_by_part.yaml": """
+        defaults: ["/parts/acme_another@_here_", _self_]
+        score: 0.5
+    """,
+    "acme/conf/detector/acme_everything.yaml": """
+        _target_: acme.everything.Everything
+        score: 0.75 # in [0, 1], of the one object
+    """,
+    "acme/conf/detector/acme_certain.yaml": """
+        # acme_everything without doubt
+        defaults: [acme_everything, _self_]
+        score: 1.0
+    """,
+    "acme/conf/detector/acme_broken.yaml": """
+        _target_: acme.missing.Detector
+    """,
+    "acme/conf/detector/acme_orphan.yaml": """
+        defaults: [acme_nobody, _self_]
+    """,
+    "hydra_plugins/acme_search_path.py": """
+        from hydra.core.config_search_path import ConfigSearchPath
+        from hydra.plugins.search_path_plugin import SearchPathPlugin
+
+        class AcmeSearchPath(SearchPathPlugin):
+            def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+                search_path.append(provider="acme", path="pkg://acme.conf")
+    """,
+}
+
+
+@pytest.fixture(scope="module")
+def environment(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """An environment in which the package is installed."""
+    import textwrap
+
+    source, site = tmp_path_factory.mktemp("acme"), tmp_path_factory.mktemp("site")
+    for name, text in PACKAGE.items():
+        path = source / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(textwrap.dedent(text).strip() + "\n")
+    install = "-m pip install --quiet --no-deps --no-build-isolation --no-index --target"
+    subprocess.run([sys.executable, *install.split(), str(site), str(source)], check=True, timeout=120)
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    return clean | {"PYTHONPATH": f"{CHECKOUT}:{site}"}
+
+
+def run(environment: dict[str, str], directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", *arguments]
+    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def test_an_installed_package_is_listed(environment: dict[str, str], tmp_path: Path) -> None:
+    done = run(environment, tmp_path, "framework", "plugins", "detector")
+    assert done.returncode == 0, done.stderr
+    lines = done.stdout.splitlines()
+    at = lines.index("  acme_everything  [from acme]")
+    assert lines[at + 1 : at + 4] == [
+        "      The whole image is one object.",
+        "      score: float = 0.75  # in [0, 1], of the one object",
+        "",
+    ]
+    at = lines.index("  acme_certain  [from acme]")
+    assert lines[at + 1 : at + 4] == [
+        "      The whole image is one object. Here: acme_everything without doubt.",
+        "      score: float = 1.0  # in [0, 1], of the one object",
+        "",
+    ]
+    assert "cannot be used: detector acme.missing.Detector: there is no module acme.missing" in done.stdout
+    at = lines.index("  acme_orphan  [from acme]")
+    assert lines[at + 1].startswith("      cannot be used: ")
+    assert "acme_nobody" in lines[at + 1]
+
+
+def test_an_installed_package_runs(environment: dict[str, str], tmp_path: Path) -> None:
+    fakes = [f"{stage}=fake" for stage in STAGES if stage != "detector"]
+    places = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "hydra.run.dir=run"]
+    done = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everything", "dataset.frames=1")
+    assert done.returncode == 0, done.stderr
+    assert '"instances.count": 1' in (tmp_path / "run" / "metrics.json").read_text()
+    unregistered = run(environment, tmp_path, "framework", *places, *fakes, "detector._target_=acme.another.Anothr")
+    assert (
+        "no registered option of detector has this _target_; did you mean 'acme.another.Another'?"
+        in unregistered.stderr
+    )
+    typo = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_everthing")
+    assert "did you mean acme_everything?" in typo.stderr
+    wrong = run(environment, tmp_path, "framework", *places, *fakes, "detector=acme_by_part", "detector.score=2")
+    assert "score must be in [0, 1], found 2.0" in wrong.stderr
+    assert len(wrong.stderr.splitlines()) == 1
+
+
+def test_asking_for_what_is_not_there_is_one_line(environment: dict[str, str], tmp_path: Path) -> None:
+    done = run(environment, tmp_path, "framework", "plugins", "detector", "acme_nothing")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith("error: there is no detector=acme_nothing; the options are: acme_")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_an_option_reads_like_its_yaml() -> None:
+    parameters = (Parameter("n", "int", "3", "px, size"), Parameter("longer", "str", "x", ""))
+    option = Option("detector", "own", "a.b.C", "main", "Finds things.", parameters)
+    assert describe(option).splitlines() == [
+        "  own",
+        "      Finds things.",
+        "      n: int = 3       # px, size",
+        "      longer: str = x",
+    ]
+
+
+FAULTY_OPTIONS = {
+    "no_yaml": ("a: [1,\n", "no_yaml.yaml cannot be read: "),
+    "list": ("- 1\n", "list.yaml: expected keys and values, found a list"),
+    "no_text": ("\udcff", "no_text.yaml could not be read as text: "),
+    "no_class": ("_target_: plugins.detectors.none.NoDetection\n", "has no NoDetection; did you mean 'NoDetections'?"),
+    "a_refiner": ("_target_: plugins.refiners.identity.Identity\n", "expected a class that implements Detector"),
+    "no_key": ("_target_: plugins.detectors.none.NoDetections\nscore: 1\n", "there is no parameter 'score'"),
+    "no_number": (
+        "_target_: plugins.detectors.simulated.SimulatedDetector\nmin_pixels: many\nseed: ${seed}\n",
+        "min_pixels: Value 'many' of type 'str' could not be converted to Integer",
+    ),
+    "no_option": ("defaults: [nobody, _self_]\n", "there is no detector=nobody"),
+}
+
+
+def test_options_of_a_folder_are_listed_and_each_faulty_one_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    group = tmp_path / "detector"
+    group.mkdir()
+    for name, (text, _) in FAULTY_OPTIONS.items():
+        (group / f"{name}.yaml").write_bytes(text.encode(errors="surrogateescape"))
+    (group / "own.yaml").write_text("_target_: plugins.detectors.none.NoDetections\n")
+    monkeypatch.setattr(composition, "_added", [tmp_path])
+    found = {option.name: option for option in registered("detector")}
+    for name, (_, said) in FAULTY_OPTIONS.items():
+        assert found[name].documentation.startswith("cannot be used: ")
+        assert said in found[name].documentation
+        assert "\n" not in found[name].documentation
+    assert found["own"].provider == "command-line"
+    assert found["own"].documentation == found["none"].documentation
+    assert len(found["maskrcnn2go"].parameters) > 3
+
+
+def test_every_registered_option_can_be_described() -> None:
+    options = registered(*GROUPS)
+    assert {option.stage for option in options} == set(GROUPS)
+    for option in options:
+        assert option.name in describe(option)
+        assert option.provider == "main"
+        assert not option.documentation.startswith("cannot be used")
+
+
+def test_no_option_imports_open3d_before_it_is_chosen(tmp_path: Path) -> None:
+    """It takes half a second and 170 MB, and a run with the default stages needs none of it."""
+    code = (
+        "import sys; from framework.commands.installation.plugins import *; "
+        "registered(*GROUPS); print('open3d' in sys.modules)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(CHECKOUT)}
+    line = [sys.executable, "-c", code]
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout == "False\n"

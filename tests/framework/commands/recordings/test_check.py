@@ -1,0 +1,62 @@
+"""`python -m framework check`: what it prints and draws, and that what it names to be set mends the recording."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import pytest
+
+from framework.geometry import inverse
+from tests.framework.checking.test_recording_check import DESK
+from tests.support.recordings.damaged import write_damaged
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+
+
+def checked(place: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "framework", "check", *arguments]
+    return subprocess.run(
+        line, cwd=place, env={"PYTHONPATH": str(CHECKOUT)}, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def inverted(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_damaged(tmp_path_factory.mktemp("desk") / "inverted", DESK, pose=inverse)
+
+
+def test_what_it_names_mends_the_recording(inverted: Path, tmp_path: Path) -> None:
+    asked = ("dataset=rgbd_folder", f"dataset.root={inverted}")
+    done = checked(tmp_path, *asked)
+    assert done.returncode == 1
+    assert "WRONG  poses: they are T_camera_world" in done.stdout
+    assert "; set dataset.pose_kind=T_CAMERA_WORLD" in done.stdout
+    assert "ERROR   it will not map as it is read; try it with dataset.pose_kind=T_CAMERA_WORLD" in done.stderr
+    assert "Traceback" not in done.stderr
+    picture = cv2.imread(str(tmp_path / "check.png"))
+    assert picture is not None
+    assert [path.name for path in tmp_path.iterdir()] == ["check.png"]
+    mended = checked(tmp_path, *asked, "dataset.pose_kind=T_CAMERA_WORLD", "out=mended.png")
+    assert (mended.returncode, "WRONG" in mended.stdout) == (0, False), mended.stderr
+    assert (tmp_path / "mended.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("out=2024",), "out must be a path"),
+        (("out=null",), "out must be a path"),
+        (("out=check.jpg",), "out must end in .png"),
+        (("out=nowhere/check.png",), "there is no folder"),
+        (("dataset=rgbd_folder", "dataset.root=nowhere"), "dataset.root: the folder nowhere"),
+        (("dataset=rgbd_folder", "dataset.root=.", "dataset.camera_axes=UNITY"), "camera_axes"),
+    ],
+)
+def test_wrong_arguments_are_one_line(tmp_path: Path, arguments: tuple[str, ...], said: str) -> None:
+    done = checked(tmp_path, *arguments)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr

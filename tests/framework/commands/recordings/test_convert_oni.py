@@ -1,0 +1,145 @@
+"""`python -m framework convert-oni`: what it writes, and what it leaves behind when it cannot go on."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.commands.recordings import convert_oni
+from framework.datasets.scenenn.oni import OniFrame
+from framework.datasets.scenenn.timestamps import read_timestamps
+from framework.errors import DataError
+from tests.framework.datasets.scenenn.test_oni import colors, depths, played, recording
+from tests.support.recordings.oni_file import OniFile
+
+FRAMES = [OniFrame(c, d, 1000 * k + 7, 1000 * k) for k, (c, d) in enumerate(zip(colors(), depths(), strict=True))]
+
+
+@pytest.fixture
+def source(tmp_path):
+    return OniFile(recording()).write(tmp_path / "011.oni")
+
+
+def command(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["convert_oni", *map(str, arguments)])
+    convert_oni.main()
+
+
+def deliver(monkeypatch, count, fault=None):
+    """In place of OpenNI 2, which may not be installed."""
+
+    def read_frames(contents, scratch):
+        yield from FRAMES[:count]
+        if fault:
+            raise fault
+
+    monkeypatch.setattr(convert_oni, "read_frames", read_frames)
+
+
+def names(folder):
+    return sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+
+
+def written(count):
+    numbers = range(1, count + 1)
+    return [
+        *(f"depth/depth{k:05d}.png" for k in numbers),
+        *(f"image/image{k:05d}.png" for k in numbers),
+        "timestamp.txt",
+    ]
+
+
+def check_images(folder, count):
+    for k in range(count):
+        color = cv2.imread(str(folder / f"image/image{k + 1:05d}.png"), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_array_equal(color[..., ::-1], colors()[k])
+        depth = cv2.imread(str(folder / f"depth/depth{k + 1:05d}.png"), cv2.IMREAD_UNCHANGED)
+        assert depth.dtype == np.uint16
+        np.testing.assert_array_equal(depth, depths()[k])
+
+
+@played
+def test_a_recording_becomes_the_images_of_a_scene(tmp_path, monkeypatch, capsys, source):
+    command(monkeypatch, source, tmp_path / "011")
+    assert names(tmp_path / "011") == written(4)
+    check_images(tmp_path / "011", 4)
+    assert (tmp_path / "011/timestamp.txt").read_text().splitlines()[0] == "1 33338 33333"
+    assert f"{tmp_path / '011'}: 4 frames; left out are 0 images" in capsys.readouterr().out
+
+
+def test_colour_and_depth_have_times_of_their_own(tmp_path, monkeypatch, source):
+    deliver(monkeypatch, 3)
+    convert_oni.convert(source, tmp_path / "011")
+    assert (tmp_path / "011/timestamp.txt").read_text() == "1 7 0\n2 1007 1000\n3 2007 2000\n"
+    assert read_timestamps(tmp_path / "011/timestamp.txt") == {1: 0.0, 2: 0.001, 3: 0.002}
+
+
+def test_images_that_are_left_out_are_counted(tmp_path, monkeypatch, capsys, source):
+    deliver(monkeypatch, 3)
+    convert_oni.convert(source, tmp_path / "011")
+    assert "3 frames; left out are 1 images of color and 1 of depth" in capsys.readouterr().out
+
+
+def test_the_folder_may_hold_the_other_files_of_a_scene(tmp_path, monkeypatch, source):
+    folder = tmp_path / "011"
+    folder.mkdir()
+    (folder / "trajectory.log").write_text("0 0 1\n")
+    deliver(monkeypatch, 2)
+    convert_oni.convert(source, folder)
+    assert names(folder) == [*written(2), "trajectory.log"]
+
+
+@pytest.mark.parametrize("file", ["image/image00001.png", "depth/depth00001.png", "timestamp.txt"])
+def test_nothing_is_written_over(tmp_path, monkeypatch, source, file):
+    (tmp_path / "011" / file).parent.mkdir(parents=True)
+    (tmp_path / "011" / file).write_bytes(b"mine")
+    deliver(monkeypatch, 4)
+    with pytest.raises(DataError, match="is there already; remove it, or choose another folder"):
+        convert_oni.convert(source, tmp_path / "011")
+    assert names(tmp_path / "011") == [file]
+
+
+def test_ctrl_c_leaves_whole_frames_and_their_times(tmp_path, monkeypatch, capsys, source):
+    deliver(monkeypatch, 2, KeyboardInterrupt())
+    with pytest.raises(SystemExit, match="130"):
+        command(monkeypatch, source, tmp_path / "011")
+    assert names(tmp_path / "011") == written(2)
+    check_images(tmp_path / "011", 2)
+    assert list(read_timestamps(tmp_path / "011/timestamp.txt")) == [1, 2]
+    assert capsys.readouterr().err.splitlines()[-1] == "interrupted"
+
+
+def test_of_a_damaged_recording_what_was_read_is_kept(tmp_path, monkeypatch, capsys, source):
+    deliver(monkeypatch, 3, DataError("it is damaged"))
+    with pytest.raises(SystemExit, match="1"):
+        command(monkeypatch, source, tmp_path / "011")
+    assert names(tmp_path / "011") == written(3)
+    assert capsys.readouterr().err.splitlines()[-1] == "error: it is damaged"
+
+
+def test_of_a_recording_that_was_cut_off_the_last_good_image_is_named(tmp_path, monkeypatch, capsys, source):
+    source.write_bytes(source.read_bytes()[:-400])
+    deliver(monkeypatch, 3)
+    with pytest.raises(SystemExit, match="1"):
+        command(monkeypatch, source, tmp_path / "011")
+    assert names(tmp_path / "011") == written(3)
+    fault = capsys.readouterr().err.splitlines()[-1]
+    assert fault.startswith(f"error: {source} is cut off or damaged at byte ")
+    assert "up to image00003.png; download it again" in fault
+
+
+def test_a_recording_without_a_frame_is_an_error(tmp_path, monkeypatch, source):
+    deliver(monkeypatch, 0)
+    with pytest.raises(DataError, match="no image of color and of depth that are of the same moment"):
+        convert_oni.convert(source, tmp_path / "011")
+    assert names(tmp_path / "011") == []
+
+
+def test_what_is_no_recording_leaves_nothing_behind(tmp_path, monkeypatch, capsys):
+    (tmp_path / "a.oni").write_bytes(b"PK\3\4 a zip file")
+    with pytest.raises(SystemExit, match="1"):
+        command(monkeypatch, tmp_path / "a.oni", tmp_path / "011")
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {tmp_path / 'a.oni'} is no OpenNI recording")
+    assert not (tmp_path / "011").exists()

@@ -1,0 +1,90 @@
+"""`python -m framework import`: a phone's recording of a kitchen, from the export to the map."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.api import pipeline_of
+from framework.checking.recording_check import check
+from framework.commands.recordings import import_recording
+from framework.config.composition import composed
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.interfaces import RGBDSequence
+from framework.registry import build
+from tests.support.recordings.phone_exports import room_frames, seen_by_phone, write_stray_scanner
+from tests.support.scenes.corner_room import look
+
+
+def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["import", *map(str, arguments)])
+    import_recording.main()
+
+
+def test_it_says_what_it_wrote_and_how_to_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_stray_scanner(tmp_path / "export", room_frames())
+    command(monkeypatch, tmp_path / "export", tmp_path / "out", "--width", "160", "--stride", "2")
+    out, err = capsys.readouterr()
+    assert out.splitlines() == [
+        f"{tmp_path}/out: from Stray Scanner, 2 frames",
+        "up is not up in these images, and detectors find little in them; --turn 180 turns them upright",
+        f"check it: python -m framework check dataset=rgbd_folder dataset.root={tmp_path}/out",
+        f"map it: python -m framework dataset=rgbd_folder dataset.root={tmp_path}/out",
+    ]
+    assert err == ""
+    assert RgbdFolder(tmp_path / "out").camera.width == 160
+
+
+def test_turned_images_have_turned_poses(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The room's y points down and ARKit's up: for a phone, these images stand on their heads."""
+    frames = room_frames()
+    write_stray_scanner(tmp_path / "export", frames)
+    command(monkeypatch, tmp_path / "export", tmp_path / "out", "--turn", "180", "--confidence", "0")
+    assert "--turn" not in capsys.readouterr().out
+    for frame, seen in zip(frames, RgbdFolder(tmp_path / "out"), strict=True):
+        assert seen.T_world_camera is not None
+        depth, _, color, ids = look(seen.camera, seen.T_world_camera)
+        assert np.abs(seen.color.astype(int) - color).mean() < 12
+        assert np.median(np.abs(seen.depth - depth)[(ids == 0) & (seen.depth > 0)]) < 1e-3
+        np.testing.assert_allclose(seen.T_world_camera[:3, 1], -frame.T_world_camera[:3, 1], atol=1e-6)
+        np.testing.assert_allclose(seen.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
+
+
+def test_a_place_that_is_taken_is_told_before_anything_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/camera.json").touch()
+    with pytest.raises(SystemExit) as ended:
+        command(monkeypatch, tmp_path / "nothing", tmp_path / "out")
+    assert ended.value.code == 1
+    assert (
+        capsys.readouterr().err
+        == f"error: {tmp_path}/out is there already, and not empty; choose another folder, or remove it\n"
+    )
+
+
+def test_a_phones_recording_gives_a_map(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """256x192 depth, a video and ARKit's poses, made of a real kitchen: no fault, no frame lost."""
+    kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)
+    write_stray_scanner(tmp_path / "export", list(seen_by_phone(list(kitchen))))
+    command(monkeypatch, tmp_path / "export", tmp_path / "out")
+    config = composed("dataset=rgbd_folder", f"dataset.root={tmp_path / 'out'}", "detector=none")
+    sequence = build(RGBDSequence, config.dataset)
+    found = check(sequence, 5.0)
+    assert not found.faults, found.faults
+    result = pipeline_of(config).run(sequence)
+    assert not any(tracked.pose.lost for tracked in result.tracked)
+    assert len(result.tracked) == 60
+    seen = result.scene.render(kitchen.camera, result.tracked[30].pose.T_world_camera).depth
+    truth = kitchen[30].depth
+    both = (seen > 0) & (truth > 0)
+    assert both.sum() > 0.85 * (truth > 0).sum()
+    assert np.median(np.abs(seen - truth)[both]) < 0.01

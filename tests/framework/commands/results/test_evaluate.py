@@ -1,0 +1,320 @@
+"""`python -m framework evaluate`: stored runs evaluated anew."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.commands.results import evaluate
+from framework.commands.running.run import run
+from framework.config import composition
+from framework.files.directory_lock import locked
+from framework.runs import reevaluation, run_directory
+from framework.runs.provenance import config_hash
+from tests.support import reported_run
+from tests.support.scenes.corner_room import CornerRoom
+
+pytestmark = pytest.mark.usefixtures("fakes_registered")
+CHECKOUT = Path(__file__).resolve().parents[4]
+CONFIG = reported_run.CONFIG | {
+    "dataset": reported_run.CONFIG["dataset"] | {"frames": 4},
+    "fuser": reported_run.CONFIG["fuser"] | {"voxel_size": 0.04},
+}
+CODE = {"evaluation.git_commit": "abcdef0", "evaluation.git_dirty": False}
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The record of a real run, but for its picture."""
+    directory = tmp_path_factory.mktemp("runs") / "run"
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
+        patched.setattr(composition, "_added", [reported_run.FAKES])
+        run(OmegaConf.create(CONFIG), directory, {})
+    return directory
+
+
+@pytest.fixture
+def stored(mapped: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of it, and a known commit of the code that evaluates."""
+    monkeypatch.setattr(reevaluation, "code_version", lambda: {"git_commit": "abcdef0", "git_dirty": False})
+    return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs the command here; returns its status and what it wrote to stdout and stderr."""
+
+    def start(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["evaluate", *map(str, arguments)])
+        status = 0
+        try:
+            evaluate.main()
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+        written = capsys.readouterr()
+        return status, written.out, written.err
+
+    return start
+
+
+def metrics_of(directory: Path) -> dict[str, Any]:
+    metrics: dict[str, Any] = json.loads((directory / "metrics.json").read_text())
+    return metrics
+
+
+def write_metrics(directory: Path, metrics: dict[str, Any]) -> None:
+    (directory / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n")
+
+
+def test_an_untouched_run_gets_its_own_figures_to_the_last_bit(stored: Path, command) -> None:
+    before, time = metrics_of(stored), (stored / "metrics.json").stat().st_mtime_ns
+    assert 0 < before["instances.mean_iou"] < 1
+    assert 0 < before["instances.to_map.mean_iou"] < 1
+    assert command(stored) == (0, f"{stored}: unchanged\n", "")
+    after = metrics_of(stored)
+    assert after == before | CODE
+    assert [key for key in after if key not in CODE] == list(before)
+    assert (stored / "metrics.json").stat().st_mtime_ns == time, "tables take the latest record of a run"
+    assert command(stored) == (0, f"{stored}: unchanged\n", "")
+    assert metrics_of(stored) == after
+
+
+def test_figures_of_other_code_are_replaced_and_all_others_kept(stored: Path, command) -> None:
+    true = metrics_of(stored)
+    old = {key: value for key, value in true.items() if not key.startswith("instances.to_map.")}
+    old |= {"instances.ap50": 0.125, "instances.ap50.sofa": 0.5, "annotation_release": "first", "fps": 3.0}
+    old |= {"trajectory.ate_rmse_m": 0.25, "evaluation.git_commit": "0123456"}
+    write_metrics(stored, old)
+    status, out, err = command(stored)
+    assert (status, err) == (0, "")
+    assert out == f"{stored}: AP50 0.125 -> 1.000, annotation_release first -> not known, 1 other, 5 new\n"
+    assert metrics_of(stored) == true | CODE | {"fps": 3.0, "trajectory.ate_rmse_m": 0.25}
+
+
+def test_the_figures_of_the_other_transfer_can_be_printed(stored: Path, command) -> None:
+    true = metrics_of(stored)
+    write_metrics(stored, true | {"instances.ap50": 0.125, "instances.to_map.ap25": 0.25})
+    assert command(stored, "--transfer", "to_map", "--dry-run")[1].startswith(
+        f"{stored}: AP25 to map 0.250 -> {true['instances.to_map.ap25']:.3f}, 1 other"
+    )
+
+
+def test_last_digits_are_told(stored: Path, command) -> None:
+    true = metrics_of(stored)
+    write_metrics(stored, true | {"instances.mean_iou": true["instances.mean_iou"] + 1e-12})
+    [line] = command(stored)[1].splitlines()
+    assert line.endswith(f"-> {true['instances.mean_iou']!r}")
+
+
+def test_another_truth_is_refused_unless_it_is_asked_for(stored: Path, command) -> None:
+    """A relative dataset.root means another folder elsewhere, and its truth says nothing about this run."""
+    true = metrics_of(stored)
+    write_metrics(stored, true | {"truth_sha256": "0" * 64})
+    status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert (
+        "the true instances of tests.support.scenes.corner_room.CornerRoom are not those that the run was compared with"
+        in err
+    )
+    assert metrics_of(stored)["truth_sha256"] == "0" * 64
+    assert command(stored, "--other-truth")[:2] == (0, f"{stored}: 1 other\n")
+    assert metrics_of(stored) == true | CODE
+
+
+def test_a_record_from_before_truths_had_a_hash_is_evaluated(stored: Path, command) -> None:
+    true = metrics_of(stored)
+    write_metrics(stored, {key: value for key, value in true.items() if key != "truth_sha256"})
+    assert command(stored)[:2] == (0, f"{stored}: 1 new\n")
+    assert metrics_of(stored) == true | CODE
+
+
+def test_a_dry_run_writes_nothing(stored: Path, command) -> None:
+    write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.125})
+    before = {path.name: path.read_bytes() for path in stored.iterdir()}
+    assert "AP50 0.125 -> 1.000" in command("--dry-run", stored)[1]
+    assert {path.name: path.read_bytes() for path in stored.iterdir()} == before
+
+
+def _with_dataset(directory: Path, **parameters: object) -> None:
+    """The same record, had its dataset had these parameters."""
+    config = CONFIG | {
+        "dataset": {"_target_": "tests.support.scenes.corner_room.CornerRoom", "frames": 4, **parameters}
+    }
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    write_metrics(directory, metrics_of(directory) | {"config_hash": config_hash(config)})
+
+
+def _another_config(directory: Path) -> None:
+    (directory / "config.yaml").write_text("seed: 4\n")
+
+
+def _interrupted(directory: Path) -> None:
+    (directory / "metrics.partial.json").write_text('{"partial": "interrupted by Ctrl-C"}')
+    (directory / "metrics.json").unlink()
+
+
+def _one_instance_less(directory: Path) -> None:
+    content = json.loads((directory / "instances.json").read_text())
+    (directory / "instances.json").write_text(json.dumps(content[1:]))
+
+
+def _another_id(directory: Path) -> None:
+    content = json.loads((directory / "instances.json").read_text())
+    (directory / "instances.json").write_text(json.dumps([content[0] | {"id": 77}, *content[1:]]))
+
+
+def _another_size(directory: Path) -> None:
+    content = json.loads((directory / "instances.json").read_text())
+    (directory / "instances.json").write_text(json.dumps([content[0] | {"vertices": 1}, *content[1:]]))
+
+
+def _truncated_mesh(directory: Path) -> None:
+    path = directory / "mesh.ply"
+    path.write_bytes(path.read_bytes()[:-1000])
+
+
+@pytest.mark.parametrize(
+    ("spoil", "said"),
+    [
+        (_another_config, "is not of the config beside it"),
+        (_interrupted, "partial: interrupted by Ctrl-C"),
+        (_one_instance_less, "lists 1 instances, but metrics.json counts 2"),
+        (_another_id, "gives instance 77"),
+        (_another_size, "vertices, but"),
+        (_truncated_mesh, "mesh.ply, byte"),
+        (lambda directory: (directory / "mesh.ply").unlink(), "mesh.ply"),
+        (lambda directory: (directory / "instances.json").unlink(), "instances.json could not be read"),
+        (lambda directory: _with_dataset(directory, truth=False), "true instances that the dataset has no longer"),
+        (lambda directory: _with_dataset(directory, colour=1), "there is no parameter 'colour'"),
+    ],
+)
+def test_what_cannot_be_evaluated_is_refused_in_one_line_and_the_others_go_on(
+    stored: Path, command, spoil: Callable[[Path], None], said: str
+) -> None:
+    spoilt = Path(shutil.copytree(stored, stored.parent / "a spoilt one"))
+    spoil(spoilt)
+    before = {path.name: path.read_bytes() for path in spoilt.iterdir()}
+    status, out, err = command(stored.parent)
+    assert status == 1
+    assert out == f"{stored}: unchanged\n"
+    assert len(err.splitlines()) == 1, err
+    assert err.startswith("refused: ")
+    assert str(spoilt) in err
+    assert said in err
+    assert {path.name: path.read_bytes() for path in spoilt.iterdir()} == before
+
+
+def test_a_folder_without_runs_is_told(stored: Path, tmp_path: Path, command) -> None:
+    status, out, err = command(tmp_path / "nothing", stored)
+    assert (status, out) == (1, f"{stored}: unchanged\n")
+    assert err == f"refused: {tmp_path / 'nothing'}: there is no run at or below it\n"
+
+
+def test_runs_on_the_same_truth_share_it_and_each_is_evaluated_once(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(stored, stored.parent / "second")
+    _with_dataset(Path(shutil.copytree(stored, stored.parent / "other")), stop=3)
+    made = []
+    scene_truth = CornerRoom.scene_truth
+    monkeypatch.setattr(CornerRoom, "scene_truth", lambda self: made.append(len(self)) or scene_truth(self))
+    status, out, _ = command(stored.parent, stored, stored.parent / "second")
+    assert status == 0
+    assert sorted(out.splitlines()) == [f"{stored.parent / name}: unchanged" for name in ("first", "other", "second")]
+    assert sorted(made) == [3, 4]
+
+
+def test_a_run_that_begins_again_meanwhile_is_left_alone(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def begins_again(self: CornerRoom) -> None:
+        (stored / "metrics.json").unlink()
+        return scene_truth(self)
+
+    scene_truth = CornerRoom.scene_truth
+    monkeypatch.setattr(CornerRoom, "scene_truth", begins_again)
+    status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert "the run has begun again meanwhile" in err
+    assert not (stored / "metrics.json").exists()
+
+
+def test_a_run_without_truth_stays_as_it_is(stored: Path, command) -> None:
+    write_metrics(
+        stored, {key: value for key, value in metrics_of(stored).items() if not reevaluation.is_evaluation(key)}
+    )
+    _with_dataset(stored, truth=False)
+    before = (stored / "metrics.json").read_bytes()
+    assert command(stored) == (0, f"{stored}: unchanged\n", "")
+    assert (stored / "metrics.json").read_bytes() == before
+
+
+def test_as_a_process(mapped: Path, tmp_path: Path) -> None:
+    shutil.copytree(mapped, tmp_path / "run")
+    done = subprocess.run(
+        [sys.executable, "-m", "framework", "evaluate", "--config-dir", str(reported_run.FAKES), "run", "absent"],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout == "run: unchanged\n", done.stderr
+    assert done.stderr == "refused: absent: there is no run at or below it\n"
+    assert done.returncode == 1
+
+
+def test_a_run_that_is_at_work_in_the_directory_is_left_alone(stored: Path, command) -> None:
+    """Between its look at the file and its own writing of it, nobody may begin the run again."""
+    write_metrics(stored, metrics_of(stored) | {"instances.ap50": 0.5})
+    before = (stored / "metrics.json").read_bytes()
+    with locked(stored):
+        status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert f"refused: {stored} is in use by process {os.getpid()}" in err
+    assert (stored / "metrics.json").read_bytes() == before
+    assert command(stored)[0] == 0
+
+
+@pytest.mark.parametrize("started", [["-m", "framework"], ["-P", "-m", "framework"]])
+def test_a_record_brings_no_code(started: list[str], stored: Path) -> None:
+    """Somebody sends a folder, and one looks at it in place: modules in it are neither imported nor found."""
+    (stored / "brought.py").write_text(
+        "print('runs')\nfrom tests.support.scenes.corner_room import CornerRoom as Brought\n"
+    )
+    for name in ("numpy", "yaml", "matplotlib", "evo"):  # what the command itself imports
+        (stored / f"{name}.py").write_text("print('runs')\n")
+    _with_dataset(stored, _target_="brought.Brought")
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
+    done = subprocess.run(
+        [sys.executable, *started, "evaluate", "."],
+        cwd=stored,
+        env=environment | {"PYTHONPATH": str(CHECKOUT)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert (done.returncode, done.stdout) == (1, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert "dataset brought.Brought: no registered option of dataset has this _target_" in done.stderr
+
+
+def test_a_stored_config_asks_for_nothing_of_this_machine(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET", "hunter2")
+    _with_dataset(stored, scene="${oc.env:SECRET}")
+    status, out, err = command(stored)
+    assert (status, out) == (1, "")
+    assert "stored resolved, and this one is not: dataset.scene=${oc.env:SECRET}" in err
+    assert "hunter2" not in err

@@ -1,0 +1,133 @@
+"""`instancemap export` as users meet it: words in, files and one-line errors out."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+import instancemap
+from framework.commands.results import export
+from framework.errors import ConfigError
+from tests.support.scenes.exported_room import ExportedRoom
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return ExportedRoom().write(tmp_path_factory.mktemp("runs") / "room")
+
+
+def exported(monkeypatch: pytest.MonkeyPatch, *words: object) -> None:
+    monkeypatch.setattr(sys, "argv", ["instancemap export", *map(str, words)])
+    export.main()
+
+
+def test_it_says_what_it_wrote(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = ("--out", tmp_path, "--resolution", 0.1, "--robot-height", 0.5)
+    exported(monkeypatch, run, "--to", "glb", "floorplan", "graph", *options)
+    said = [Path(line).relative_to(tmp_path).as_posix() for line in capsys.readouterr().out.splitlines()]
+    objects = [f"objects/{name}.glb" for name in ("dining_table_1", "cube_2", "picture_3")]
+    plans = ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
+    assert said == ["scene.glb", *objects, *plans, "scene_graph.json"]
+    assert sorted(path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()) == sorted(
+        said
+    )
+    assert "resolution: 0.1" in (tmp_path / "map.yaml").read_text()
+
+
+def test_one_object_goes_into_the_runs_own_folder(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exported(monkeypatch, run, "--to", "obj", "--object", "cube", "--object", 1, "--triangles", 100)
+    found = sorted((run / "export").rglob("*.obj"))
+    assert [path.name for path in found] == ["cube_2.obj", "dining_table_1.obj"]
+    assert all(len(trimesh.load(path).faces) <= 100 for path in found)
+
+
+def test_without_a_format_it_is_glb(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    exported(monkeypatch, run, "--object", "cube", "--out", tmp_path)
+    assert [path.name for path in tmp_path.rglob("*.*")] == ["cube_2.glb"]
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--to", "stl"), "invalid choice: 'stl'"),
+        (("--to", "glb", "--triangles", "many"), "invalid int value: 'many'"),
+        (("--to", "glb", "--up", "0", "1"), "expected 3 arguments"),
+    ],
+)
+def test_wrong_words_are_told(
+    words: tuple[str, ...], said: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        exported(monkeypatch, run, *words)
+    assert ended.value.code == 2
+    assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ("--to", "glb", "--object", "sofa"),
+            "there is no object 'sofa' in this run; it has cube, dining table, picture",
+        ),
+        (("--to", "glb", "--triangles", "1"), "triangles must be at least 4, found 1"),
+        (("--to", "floorplan", "--resolution", "0"), "resolution"),
+        (("--to", "floorplan", "--robot-height", "nan"), "robot_height"),
+        (("--to", "glb", "--min-confidence", "2"), "min_confidence"),
+        (("--to", "glb", "--up", "0", "nan", "1"), "up must be three numbers, a direction"),
+        (("--to", "glb", "--floor", "nan"), "the floor, must be a height within 10000 m, found nan"),
+        (("--to", "glb", "--out", "/dev/null"), "/dev/null"),
+        (("--to", "floorplan", "--floor=-1e300"), "the floor, must be a height within 10000 m"),
+    ],
+)
+def test_what_cannot_be_exported_is_one_line(
+    words: tuple[str, ...], said: str, run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as ended:
+        exported(monkeypatch, run, *words)
+    assert ended.value.code == 1
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith("error: ")
+    assert said in line
+
+
+def test_from_python_it_is_the_same(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written = instancemap.export(run, "glb", out=tmp_path / "a", objects=["cube"], coloring="class")
+    exported(monkeypatch, run, "--to", "glb", "--out", tmp_path / "b", "--object", "cube", "--colors", "class")
+    assert written == [tmp_path / "a" / "objects" / "cube_2.glb"]
+    assert written[0].read_bytes() == (tmp_path / "b" / "objects" / "cube_2.glb").read_bytes()
+    for wrong, said in (
+        ({"coloring": "rainbow"}, "coloring must be one of appearance, instance, class, found 'rainbow'"),
+        ({"colours": "class"}, "export has no choice 'colours'"),
+    ):
+        with pytest.raises(ConfigError, match=said):
+            instancemap.export(run, "glb", out=tmp_path, **wrong)
+    with pytest.raises(ConfigError, match="a format must be one of glb, ply"):
+        instancemap.export(run, "stl")
+
+
+@pytest.mark.parametrize("damage", ["mesh", "instances", "metrics", "trajectory"])
+def test_damaged_files_are_one_line(
+    damage: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = ExportedRoom().write(tmp_path / "run")
+    if damage == "mesh":
+        (run / "mesh.ply").write_bytes((run / "mesh.ply").read_bytes()[:-7])
+    elif damage == "instances":
+        entries = json.loads((run / "instances.json").read_text())
+        entries[0]["vertices"] += 1
+        (run / "instances.json").write_text(json.dumps(entries))
+    elif damage == "metrics":
+        (run / "metrics.json").write_text('{"map.up.x": 0, "map.up.y": 0, "map.up.z": 0}')
+    else:
+        (run / "trajectory.txt").write_text("1 2 3\n")
+    with pytest.raises(SystemExit):
+        exported(monkeypatch, run, "--to", "glb")
+    [line] = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"error: {run}")

@@ -1,0 +1,236 @@
+"""`python -m framework report`: pages of runs."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from framework.commands.results import report
+from framework.config import composition
+from framework.errors import DataError
+from framework.reporting import run_page
+from framework.reporting.run_page import RunReport
+from tests.support.reported_run import rename_class, write_run
+from tests.support.scenes.corner_room import CornerRoom
+
+pytestmark = pytest.mark.usefixtures("fakes_registered")
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def stored(mapped: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(mapped, tmp_path / "runs" / "first"))
+
+
+@pytest.fixture
+def command(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs the command here; returns its status and what it wrote to stdout and stderr."""
+
+    def start(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["report", *map(str, arguments)])
+        status = 0
+        try:
+            report.main()
+        except SystemExit as ended:
+            status = int(ended.code or 0)
+        written = capsys.readouterr()
+        return status, written.out, written.err
+
+    return start
+
+
+def texts(page: str) -> str:
+    """What a reader sees of a page."""
+    body = page[page.index("<body>") : page.index('<script type="application/json"')]
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]+>", " ", body))
+
+
+def test_a_run_becomes_one_page_the_same_each_time(stored: Path, command) -> None:
+    status, out, err = command(stored)
+    page = stored / "report.html"
+    assert (status, out, err) == (0, f"{page.resolve().as_uri()}\n", "")
+    before = page.read_bytes()
+    assert command(stored, "--out", stored.parent / "again.html")[0] == 0
+    assert (stored.parent / "again.html").read_bytes() == before
+    assert {path.name for path in stored.parent.iterdir()} == {"first", "again.html"}
+    said = texts(before.decode())
+    metrics = json.loads((stored / "metrics.json").read_text())
+    assert "corner_room" in said
+    assert f"AP50 {metrics['instances.ap50']:.2f}" in said
+    assert f"likely, of {metrics['instances.count']}" in said
+    for heading in ("Map", "Objects", "Against the truth", "Trajectory", "Growth", "Stage times", "How it was made"):
+        assert heading in said
+    assert before.count(b"data:image/webp") > 3, "objects, growth and overview.png"
+    assert not re.search(rb'(src|href)="(?!data:)', before)
+
+
+def test_names_of_a_hostile_record_stay_text(stored: Path, command) -> None:
+    rename_class(stored, "<script>alert(1)</script>")
+    assert command(stored)[0] == 0
+    page = (stored / "report.html").read_text()
+    assert "<script>alert" not in page
+    assert page.count("<script>") == 1
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+
+
+def test_without_the_recording_pictures_are_of_the_map_and_it_says_so(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(composition, "_added", [])
+    assert command(stored)[0] == 0
+    page = (stored / "report.html").read_text()
+    assert "The recording could not be read" in texts(page)
+    sources = {one["source"] for one in json.loads(re.findall(r'id="report-data">(.*?)</script>', page)[0])["objects"]}
+    assert sources == {"map"}
+    assert "The single objects cannot be compared any more" in texts(page)
+
+
+def test_a_view_from_above_alone_leaves_no_empty_place_beside_it(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(composition, "_added", [])  # no recording, and so no true way
+    monkeypatch.setattr(run_page, "SMALL_WAY", 0.0)  # the way is large enough among the objects
+    assert command(stored)[0] == 0
+    page = (stored / "report.html").read_text()
+    assert "The camera&#x27;s way from above" in page
+    assert "The same, larger." not in page
+    assert '<div class="column">' not in page
+
+
+def test_another_recording_in_its_place_is_not_taken_for_it(stored: Path, command, tmp_path: Path) -> None:
+    lines = (stored / "trajectory.txt").read_text().splitlines()
+    moved = [f"{float(line.split()[0]) + 5:.9f} {line.partition(' ')[2]}" for line in lines]
+    (stored / "trajectory.txt").write_text("\n".join(moved) + "\n")
+    assert command(stored)[0] == 0
+    assert "the recording is not the one that was mapped" in texts((stored / "report.html").read_text())
+
+
+def test_names_that_are_no_text_are_written_as_their_codes(stored: Path, command) -> None:
+    rename_class(stored, "cup \ud800")
+    assert command(stored)[0] == 0
+    assert "cup \\ud800" in texts((stored / "report.html").read_text())
+
+
+def test_an_object_of_no_class_is_an_object(stored: Path, command) -> None:
+    """As in the map of a fuser that knows no classes."""
+    entries = json.loads((stored / "instances.json").read_text())
+    entries[0] |= {"class": None, "class_probabilities": {}}
+    (stored / "instances.json").write_text(json.dumps(entries))
+    assert command(stored)[0] == 0
+    assert f"object {entries[0]['id']}" in texts((stored / "report.html").read_text())
+
+
+def test_another_run_into_the_folder_takes_the_report_with_it(stored: Path, command) -> None:
+    assert command(stored)[0] == 0
+    write_run(stored, frames=3)
+    assert not (stored / "report.html").exists()
+
+
+def test_a_truth_that_cannot_be_read_is_said(stored: Path, command, monkeypatch: pytest.MonkeyPatch) -> None:
+    def unreadable(_: CornerRoom) -> None:
+        raise DataError("instances.json is not valid JSON")
+
+    monkeypatch.setattr(CornerRoom, "scene_truth", unreadable)
+    assert command(stored)[0] == 0
+    said = texts((stored / "report.html").read_text())
+    assert "cannot be compared any more: instances.json is not valid JSON" in said
+    assert "AP50" in said
+
+
+def test_a_partial_run_says_that_it_is_one(stored: Path, command) -> None:
+    metrics = json.loads((stored / "metrics.json").read_text())
+    (stored / "metrics.json").unlink()
+    (stored / "metrics.partial.json").write_text(json.dumps({"partial": "interrupted by Ctrl-C", **metrics}))
+    for name in ("map.npz", "mesh.ply", "overview.png"):
+        (stored / name).unlink()
+    assert command(stored)[0] == 0
+    said = texts((stored / "report.html").read_text())
+    assert "This run is partial: interrupted by Ctrl-C." in said
+    assert "Nothing was mapped" in said
+
+
+def test_a_run_that_mapped_nothing_has_a_page(stored: Path, command) -> None:
+    (stored / "trajectory.txt").write_text("")
+    (stored / "mesh.ply").unlink()
+    (stored / "instances.json").write_text("[]")
+    (stored / "timings.csv").write_text("frame,stage,milliseconds\n")
+    assert command(stored)[0] == 0
+    said = texts((stored / "report.html").read_text())
+    assert "Nothing was mapped" in said
+    assert "No object was found" in said
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("instances.json", "{}", "instances.json must hold a list of instances"),
+        ("instances.json", '[{"id": 1}]', "entry 1"),
+        ("instances.json", '[{"id": 1, "class": "cup", "confidence": NaN}]', "entry 1"),
+        ("mesh.ply", "ply\n", "mesh.ply"),
+        ("timings.csv", "frame,stage,milliseconds\n0,read,soon\n", "timings.csv, line 2"),
+        ("trajectory.txt", "1 2 3\n", "trajectory.txt, line 1"),
+        ("config.yaml", "seed: 9\n", "config_hash differs"),
+    ],
+)
+def test_a_damaged_record_is_one_line_and_no_page(stored: Path, command, name: str, content: str, said: str) -> None:
+    (stored / name).write_text(content)
+    status, out, err = command(stored)
+    assert (status, out, len(err.splitlines())) == (1, "", 1), err
+    assert said in err
+    assert not (stored / "report.html").exists()
+
+
+@pytest.mark.parametrize(("key", "value"), [("center", [1e300, 0, 0]), ("extent", [float("nan"), 1, 1])])
+def test_boxes_that_no_room_has_are_one_line(stored: Path, command, key: str, value: list[float]) -> None:
+    entries = json.loads((stored / "instances.json").read_text())
+    entries[1]["obb"][key] = value
+    (stored / "instances.json").write_text(json.dumps(entries))
+    status, _, err = command(stored)
+    assert (status, len(err.splitlines())) == (1, 1)
+    assert f"instances.json, entry 2: {key} must hold numbers of shape (3,), up to 1e+06" in err
+
+
+def test_where_the_page_cannot_go_is_told_before_the_map_is_looked_at(
+    stored: Path, command, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(RunReport, "of", pytest.fail)
+    assert "its folder does not exist" in command(stored, "--out", stored / "missing" / "page.html")[2]
+    assert "is no file but a folder" in command(stored, "--out", stored)[2]
+
+
+def test_the_address_is_one_that_a_browser_takes(stored: Path, command) -> None:
+    moved = stored.rename(stored.parent / "my run #2 50%")
+    _, out, _ = command(moved)
+    assert out.endswith("my%20run%20%232%2050%25/report.html\n")
+
+
+def test_what_is_no_run_is_refused(stored: Path, command, tmp_path: Path) -> None:
+    assert "holds no run" in command(tmp_path)[2]
+    assert "each run is to be named once" in command(stored, stored.parent / "." / "first")[2]
+
+
+def test_several_runs_are_set_side_by_side(mapped: Path, stored: Path, command) -> None:
+    second = Path(shutil.copytree(mapped, stored.parent / "sec & ond"))
+    metrics = json.loads((second / "metrics.json").read_text())
+    metrics |= {"instances.ap50": metrics["instances.ap50"] - 0.25, "trajectory.ate_rmse_m": 0.0005, "fps": 1000.0}
+    (second / "metrics.json").write_text(json.dumps(metrics))
+    status, out, err = command(stored, second)
+    assert (status, err) == (0, "")
+    assert [Path(line).name for line in out.splitlines()] == ["report.html", "report.html", "comparison.html"]
+    page = (stored.parent / "comparison.html").read_text()
+    assert 'href="first/report.html"' in page
+    assert 'href="sec%20%26%20ond/report.html"' in page
+    assert "<b>1000.0</b>" in page
+    assert "<small>\u22120.250</small>" in page
+    assert "None: all parameters are the same." in page
+    assert page.count('<script type="text/plain" id="map-') == 2

@@ -1,0 +1,47 @@
+"""What is wrong with a sweep is said before its first run."""
+
+import pytest
+
+from framework.commands.running.choices import MANY, checked_sweep, single_run
+from framework.errors import ConfigError
+
+ROWS = ("ours", "voxblox_pp", "label_count")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "runs"),
+    [
+        ([], 1),
+        (["row=ours"], 1),
+        (["row=ours,label_count", "seed=0,1", "~detector", "+new=1"], 4),
+        (["row=ours,label_count", "seed=0,1,2", "row=ours"], 3),
+        (["seed=range(0,3)", "sequences='a,b'", "row=choice(ours,voxblox_pp)"], 6),
+        (["seed=range(0,3)", "dataset=glob(*)"], 3 * MANY),
+    ],
+)
+def test_sweeps_that_have_runs_are_counted(overrides: list[str], runs: int) -> None:
+    assert checked_sweep(overrides, ROWS) == runs
+
+
+@pytest.mark.parametrize(
+    ("overrides", "message"),
+    [
+        (["row=ours,voxblx_pp"], "there is no row=voxblx_pp; did you mean voxblox_pp? The experiment has ours, vox"),
+        (["row="], "there is no row=. The experiment has ours"),
+        (["row=12"], "there is no row=12. The experiment has ours"),
+        (["seed=range(0,0)", "row=ours"], "seed=range(0,0) has no value: the sweep would be empty"),
+    ],
+)
+def test_sweeps_that_cannot_run_are_refused(overrides: list[str], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        checked_sweep(overrides, ROWS)
+    assert str(caught.value).startswith(message)
+
+
+def test_without_rows_a_row_is_a_key_like_others() -> None:
+    assert checked_sweep(["row=a,b"], ()) == 2
+
+
+def test_the_first_run_of_a_sweep() -> None:
+    overrides = ["row=a,b", "+x@y=range(2,5)", "seed=3", "~tracker", "name='a,b'", "dataset=glob(*)"]
+    assert single_run(overrides) == ["row=a", "+x@y=2", "seed=3", "~tracker", "name='a,b'", "dataset=glob(*)"]

@@ -1,0 +1,112 @@
+"""Sweeps on clusters that take jobs and nodes away: they go on, and end with the table of an undisturbed one."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.framework.commands.running.test_sweep import CHECKOUT, PLACE, begin, begun, end, recorded, wait_until
+
+THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7")  # of four frames each
+TABLES = ("table.md", "table.tex", "table.csv")
+
+
+def tables(directory: Path) -> dict[str, bytes]:
+    return {name: (directory / PLACE / name).read_bytes() for name in TABLES}
+
+
+def mapping(directory: Path) -> dict[int, str]:
+    """The runs that are at work, by the process that says in their directory's lock that it has it."""
+    holders = {}
+    for name in begun(directory):
+        words = (directory / PLACE / name / ".lock_holder").read_text().split()
+        holders[int(words[1])] = name
+    return holders
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The tables of the sweep where nothing happens to it, one run after the other."""
+    directory = tmp_path_factory.mktemp("undisturbed")
+    done = end(begin(directory, *THREE, "threads=1"))
+    assert done.returncode == 0, done.stderr
+    return tables(directory)
+
+
+def test_a_slurm_job_that_is_preempted_is_run_again_and_one_that_is_killed_by_the_same_command(
+    tmp_path: Path, undisturbed: dict[str, bytes]
+) -> None:
+    """By submitit's own queue, with the signal that SLURM sends before it takes a job's node, and with `kill -9`."""
+    pytest.importorskip("hydra_plugins.hydra_submitit_launcher")
+    arguments = ("launcher=submitit_local", *THREE)
+    first = begin(tmp_path, *arguments)
+    wait_until(lambda: len(mapping(tmp_path)) == 3, first)
+    preempted, killed, _ = map(psutil.Process, mapping(tmp_path))
+    preempted.send_signal(signal.SIGUSR2)
+    for process in (*killed.parents()[:1], killed):  # the queue's process for this job, which would end it in peace
+        process.kill()
+    done = end(first)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert "error: the sweep ended early, and the same command goes on with it: Job" in done.stderr
+    logs = [path.read_text() for path in (tmp_path / PLACE).rglob("*_log.err")]
+    assert sum("this job is preempted" in text for text in logs) == 1
+
+    again = end(begin(tmp_path, *arguments))
+    assert again.returncode == 0, again.stderr
+    assert len(recorded(tmp_path)) == 3
+    assert tables(tmp_path) == undisturbed
+    assert not list((tmp_path / PLACE).glob("*/metrics.partial.json"))
+
+
+@pytest.fixture
+def ray_cluster(monkeypatch: pytest.MonkeyPatch) -> Iterator[object]:
+    """A head that runs no jobs, and two nodes of one core each."""
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher")
+    monkeypatch.setenv("RAY_AUTH_MODE", "disabled")
+    monkeypatch.setenv("PYTHONPATH", str(CHECKOUT))
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
+    yield cluster
+    cluster.shutdown()
+
+
+def test_a_ray_node_that_dies_is_replaced_by_another(
+    tmp_path: Path, undisturbed: dict[str, bytes], ray_cluster: object
+) -> None:
+    nodes = [ray_cluster.add_node(num_cpus=1) for _ in range(2)]
+    sweep = begin(tmp_path, "launcher=ray", f"hydra.launcher.ray.init.address={ray_cluster.address}", *THREE)
+    wait_until(lambda: len(mapping(tmp_path)) == 2, sweep)
+    at_work = mapping(tmp_path)
+    ray_cluster.remove_node(nodes[0], allow_graceful=False)
+    done = end(sweep)
+    assert done.returncode == 0, done.stderr
+    assert len(recorded(tmp_path)) == 3
+    assert tables(tmp_path) == undisturbed
+    assert not all(psutil.pid_exists(pid) for pid in at_work), "a run had to be begun again"
+
+
+def test_the_same_command_goes_on_where_ray_gave_up(tmp_path: Path, undisturbed: dict[str, bytes]) -> None:
+    pytest.importorskip("hydra_plugins.hydra_ray_launcher")
+    here = ("launcher=ray", "hydra.launcher.ray.init.num_cpus=1", *THREE)
+    sweep = begin(tmp_path, *here, "hydra.launcher.ray.remote.max_retries=0")
+    wait_until(lambda: recorded(tmp_path) and mapping(tmp_path), sweep)
+    [worker] = mapping(tmp_path)
+    os.kill(worker, signal.SIGKILL)
+    done = end(sweep)
+    assert done.returncode == 1
+    assert "error: the sweep ended early, and the same command goes on with it: " in done.stderr
+    kept = recorded(tmp_path)
+    assert 0 < len(kept) < 3
+
+    again = end(begin(tmp_path, *here))
+    assert again.returncode == 0, again.stderr
+    after = recorded(tmp_path)
+    assert {name: after[name] for name in kept} == kept
+    assert tables(tmp_path) == undisturbed

@@ -1,0 +1,99 @@
+"""`python -m framework detect` as a user meets it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from framework.commands.running.detect import write_detections
+from framework.errors import DataError
+from plugins.detectors.precomputed import Precomputed
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+
+
+def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "detector=fake", "dataset=fake"]
+    line = [sys.executable, "-m", "framework", "detect", *fakes, *arguments]
+    environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    environment["PYTHONPATH"] = str(CHECKOUT)
+    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def test_writes_a_file_that_precomputed_reads(tmp_path: Path) -> None:
+    done = start(tmp_path, "dataset.unreadable=1", "out=found.json")
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["found.json", "found.labels.txt"]
+    assert "frame skipped: frame 1" in done.stderr
+    assert "10 detections in 5 frames of corner_room" in done.stderr
+    assert "mask AP50 1.00, AP 1.00: the mean of 2 classes, 10 true objects" in done.stderr
+    said = dict(re.findall(r"INFO +(.*?)  +(\S+)$", done.stderr, re.MULTILINE))
+    assert (said["found"], said["mask IoU"], said["class right"], said["false detections an image"]) == (
+        *("1.00", "1.00", "1.00", "0.00"),
+    )
+    how = done.stderr.split("read it with: ")[1].split()
+    path, labels = (argument.split("=")[1] for argument in how[1:])
+    detector = Precomputed(Path(path), labels=labels)
+    assert [len(detector.detect(frame)) for frame in CornerRoom()] == [2, 0, 2, 2, 2, 2]
+
+
+def test_what_it_writes_is_what_cocos_evaluation_reads(tmp_path: Path) -> None:
+    from pycocotools.coco import COCO
+
+    path = tmp_path / "found.json"
+    write_detections(path, SphereDetector(), CornerRoom())
+    truth = COCO()
+    truth.dataset = {
+        "info": {},
+        "images": [{"id": k, "height": 72, "width": 96} for k in range(6)],
+        "annotations": [],
+        "categories": [{"id": 1, "name": "chair"}, {"id": 2, "name": "couch"}],
+    }
+    truth.createIndex()
+    results = truth.loadRes(str(path))
+    assert len(results.anns) == 12
+    masks = SphereDetector().detect(CornerRoom()[0]).masks
+    assert results.annToMask(results.loadAnns(results.getAnnIds(imgIds=[0]))[1]).sum() == masks[1].sum()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ([], "out must be given: out=detections.json"),
+        (["out=absent/found.json"], "there is no folder"),
+        (["out=2024"], "out must be a path; quote what looks like a number, found 2024"),
+        (["out=[a,b]"], "out must be a path; quote what looks like a number, found ['a', 'b']"),
+    ],
+)
+def test_a_fault_is_one_line_and_a_status(tmp_path: Path, overrides: list[str], said: str) -> None:
+    done = start(tmp_path, *overrides)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_detector_that_fails_leaves_no_file(tmp_path: Path) -> None:
+    (tmp_path / "found.json").write_text("before")
+    with pytest.raises(DataError, match="no true instances"):
+        write_detections(tmp_path / "found.json", SphereDetector(), CornerRoom(truth=False))
+    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+        write_detections(tmp_path / "found.json", SphereDetector(broken_at=0), CornerRoom(frames=1))
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [("found.json", "before")]
+
+
+def test_a_file_without_detections_is_valid(tmp_path: Path) -> None:
+    class Nothing(SphereDetector):
+        def detect(self, frame):  # type: ignore[no-untyped-def]
+            found = super().detect(frame)
+            return type(found).none(frame.camera.shape, self.classes)
+
+    write_detections(tmp_path / "found.json", Nothing(), CornerRoom())
+    assert json.loads((tmp_path / "found.json").read_text()) == []

@@ -1,0 +1,259 @@
+"""Experiments as a user meets them, and the rows of those that come with the project."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.core.hydra_config import HydraConfig
+from omegaconf import DictConfig, OmegaConf, open_dict
+
+from framework.commands.running.experiment import with_row
+from framework.errors import ConfigError
+from framework.files.search_paths import CONF
+from framework.interfaces import ClusterRefiner, MapFuser
+from framework.registry import build
+from framework.runs.provenance import config_hash
+from framework.synthetic.benchmark import SCENES
+from framework.tables.published import read_published
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+FAKES = CHECKOUT / "tests" / "support" / "fake_conf"
+EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
+ONLY_THE_USER_KNOWS = ("dataset.root=somewhere", "detector.weights=somewhere")
+
+
+def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    line = [sys.executable, "-m", "framework", "--config-dir", str(FAKES), "experiment=fake_ablation", *arguments]
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    environment = clean | {"PYTHONPATH": str(CHECKOUT)}
+    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def table(directory: Path) -> dict[str, dict[str, str]]:
+    with (directory / "table.csv").open() as file:
+        return {line["row"]: line for line in csv.DictReader(file)}
+
+
+def figures(line: dict[str, str], column: str) -> list[float | None]:
+    names = ("mean", "sd", "n", "difference", "se", "pairs")
+    return [float(line[f"{column}.{name}"]) if line[f"{column}.{name}"] else None for name in names]
+
+
+def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path) -> None:
+    """The values are those of the experiment's own comment: all 8 frames or 4 of them, `seed` of which are lost."""
+    first = start(tmp_path)
+    out = tmp_path / "outputs" / "fake_ablation"
+    assert first.returncode == 1, "the broken row's runs failed"
+    assert first.stderr.count("ERROR") == 2
+    assert "Traceback" not in first.stderr
+    metrics = {path.parent.name: path for path in out.glob("*/metrics.json")}
+    assert set(metrics) == {f"row={row},seed={seed}" for row in ("all", "half") for seed in (1, 3)}
+
+    lines = table(out)
+    assert list(lines) == ["all", "half"]
+    assert figures(lines["all"], "frames") == [8, 0, 2, 0, 0, 2]
+    assert figures(lines["all"], "frames_lost") == [2, pytest.approx(2**0.5), 2, 0, 0, 2]
+    assert figures(lines["half"], "frames_lost") == [2, pytest.approx(2**0.5), 2, 0, 0, 2]  # cancels in each pair
+    assert figures(lines["half"], "frames") == [4, 0, 2, -4, 0, 2]
+    text = (out / "table.md").read_text()
+    assert text in first.stdout
+    assert "| half | 2 | 4.00 ± 0.00 |" in " ".join(text.split())
+    assert "Without a complete run: broken." in text
+    assert "Not complete: row=broken,seed=3: failed: dataset" in text
+    assert "half: refiner=identity dataset.frames=4" in text
+    assert (out / "table.tex").read_text().count("\\begin{tabular}") == 2
+    assert {path.name for path in out.glob("figure.*")} == {"figure.png", "figure.pdf"}
+    assert "not in the picture: row=broken,seed=1: failed: " in first.stdout
+    config = OmegaConf.load(out / "row=half,seed=3" / "config.yaml")
+    assert (config.row, config.seed, config.dataset.frames) == ("half", 3, 4)
+    assert config.refiner._target_ == "plugins.refiners.identity.Identity"
+    assert json.loads(metrics["row=half,seed=3"].read_text())["choice.refiner"] == "identity"
+
+    written = {name: path.stat().st_mtime_ns for name, path in metrics.items()}
+    metrics["row=half,seed=3"].unlink()  # as a kill leaves it: what is written last is not there
+    again = start(tmp_path, "row=all,half", "table.columns=[frames]")
+    assert again.returncode == 0, again.stderr
+    assert again.stderr.count("kept: the complete record in") == 3
+    assert again.stderr.count("mapping corner_room") == 1
+    kept = {name for name, path in metrics.items() if path.stat().st_mtime_ns == written[name]}
+    assert kept == set(metrics) - {"row=half,seed=3"}
+    assert figures(table(out)["half"], "frames") == [4, 0, 2, -4, 0, 2]
+    assert "frames_lost.mean" not in table(out)["half"]
+
+
+def test_a_column_is_a_sequence(tmp_path: Path) -> None:
+    """Names with zeros in front stay names; what the table looks like is in no directory's name."""
+    done = start(tmp_path, "experiment=fake_scenes", "table.over=[seed]")
+    assert done.returncode == 0, done.stderr
+    lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
+    assert "| system | poses | 011 | 078 | mean |" in lines
+    assert "| Rival | ground truth | **2.00** | **2.00** | **2.00** |" in lines
+    assert "| Rival | ground truth | -1.000 | -1.000 | -1.000 ± 0.000 | 2 |" in lines
+    out = tmp_path / "outputs" / "fake_scenes"
+    assert (out / "dataset.scene=078,row=rival,seed=1,tracker=fake" / "metrics.json").exists()
+
+
+# What a job is made of
+
+
+def composed(overrides: list[str], *directories: Path) -> tuple[DictConfig, Any]:
+    """A job's config and Hydra's own, as in a sweep's job."""
+    with initialize_config_dir(str(directories[0] if directories else CONF), version_base="1.3"):
+        config = compose("config", overrides=overrides, return_hydra_config=True)
+        HydraConfig.instance().set_config(config)
+        own = HydraConfig.get()
+        with open_dict(config):
+            del config["hydra"]
+        return with_row(config, own)
+
+
+def test_a_row_may_be_called_by_a_number() -> None:
+    assert OmegaConf.create("{rows: {ours: [], 2: []}, all: '${all_of:${rows}}'}").all == "ours,2"
+
+
+@pytest.mark.parametrize("experiment", EXPERIMENTS)
+def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) -> None:
+    """The command's own way of composing a row; the stages that the rows change are built, too."""
+    hashes: dict[str, str] = {}
+    with_parent = experiment.endswith(("_replica", "_scannet"))
+    paths = [f"++{path}" for path in ONLY_THE_USER_KNOWS] if with_parent else []
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        rows = compose("config", overrides=[f"experiment={experiment}"]).rows
+    for row in list(rows)[:2] if with_parent else rows:  # the others are those of the parent
+        config, choices = composed([f"experiment={experiment}", f"row={row}", "seed=1", *paths])
+        resolved = OmegaConf.to_container(config, resolve=True)
+        assert isinstance(resolved, dict)
+        hashes[row] = config_hash({str(key): value for key, value in resolved.items()})
+        build(ClusterRefiner, config.refiner)  # type: ignore[type-abstract]
+        build(MapFuser, config.fuser)  # type: ignore[type-abstract]
+        assert choices["experiment"] == experiment
+        assert config.dataset.seed == 1
+        assert config.row == row
+    assert len(set(hashes.values())) == len(hashes), "two rows are the same"
+
+
+def test_the_row_is_what_its_overrides_say() -> None:
+    config, choices = composed(["experiment=ablation_refiner", "row=chain_with_kmeans", "seed=4"])
+    assert config.refiner.links.gmm_em._target_ == "plugins.refiners.kmeans.KMeans"
+    assert (choices["refiner"], config.seed, config.dataset.stride, config.fuser.voxel_size) == ("chain", 4, 2, 0.02)
+    assert "hydra" not in config
+
+
+def test_the_recorded_flat_wins_over_the_rooms() -> None:
+    config, choices = composed(["experiment=ablation_fuser_replica", "row=label_count"])
+    assert (choices["dataset"], choices["detector"], choices["fuser"]) == ("rgbd_folder", "maskrcnn2go", "label_count")
+    assert (config.dataset.share, config.dataset.stride, config.fuser.voxel_size) == (0.85, 1, 0.05)
+    assert config.fuser.storage == "EXACT"
+
+
+@pytest.mark.parametrize("experiment", ["table1_runtime", "table2_class_ap", "table3_map", "figure3_stage_times"])
+def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
+    """A network that knows real pictures, no rendered truth, the paper's sequences, and a folder of its own."""
+    overrides = [f"experiment={experiment}", "sequences=scenenn", "dataset.root=DIR"]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        asked = compose("config", overrides=overrides, return_hydra_config=True)
+        HydraConfig.instance().set_config(asked)
+        assert asked.hydra.sweep.dir.endswith(f"/{experiment}_scenenn")
+    assert asked.hydra.runtime.choices.detector == "mask_rcnn"
+    assert asked.dataset.frame_truth is False
+    sequences = asked.hydra.sweeper.params["dataset.scene"].split(",")
+    assert set(sequences) <= set(read_published("table3").sequences)
+    assert len(sequences) == (5 if experiment in ("table1_runtime", "figure3_stage_times") else 10)
+
+
+@pytest.mark.parametrize("experiment", ["table3_map", "figure4_progress", "figure5_refinement", "ablation_overlap"])
+def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
+    assert (config.hydra.runtime.choices.detector, config.dataset.frame_truth) == ("simulated_yolo11n", True)
+    assert config.sequences.all.split(",") == list(SCENES)
+    assert not set(SCENES) & set(read_published("table3").sequences)
+    assert set(config.hydra.sweeper.params["dataset.scene"].split(",")) <= set(config.sequences.all.split(","))
+
+
+@pytest.mark.parametrize(("sequences", "stop"), [("benchmark", 40), ("scenenn", 1000)])
+def test_what_is_in_progress_depends_on_how_long_the_sequences_are(sequences: str, stop: int) -> None:
+    config, _ = composed(["experiment=figure4_progress", f"sequences={sequences}", "row=third"])
+    assert config.dataset.stop == stop
+
+
+def test_variants_that_are_to_rank_alike_are_the_same_in_all_places() -> None:
+    rows = {}
+    for place in ("rooms", "replica", "scannet"):
+        config, choices = composed([f"experiment=ranks_{place}", "row=ours", "detector=none"])
+        rows[place] = OmegaConf.to_container(config.rows)
+        assert choices["tracker"] == "ground_truth"
+        assert choices["detector"] == "none"
+    assert rows["rooms"] == rows["replica"] == rows["scannet"]
+    assert len(rows["rooms"]) >= 12
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        asked = compose(
+            "config", overrides=["experiment=ranks_scannet", "detector=rf_detr_seg"], return_hydra_config=True
+        )
+        HydraConfig.instance().set_config(asked)
+        assert asked.hydra.sweep.dir.endswith("/ranks_scannet_rf_detr_seg")
+    assert (asked.dataset.share, asked.fuser.voxel_size, asked.hydra.sweeper.params.seed) == (0.85, 0.02, "0,1,2,3")
+
+
+def test_the_command_line_wins_over_the_experiment() -> None:
+    config, _ = composed(["experiment=ablation_fuser", "row=label_count", "fuser.voxel_size=0.04", "tracker=icp_only"])
+    assert config.fuser.voxel_size == 0.04
+    assert config.tracker._target_ == "plugins.trackers.voxel_hashing_icp.VoxelHashingIcp"
+
+
+def test_a_picture_that_cannot_be_drawn_is_told_before_anything_runs() -> None:
+    with pytest.raises(ConfigError, match=r"figure\.kind must be one of"):
+        composed(["experiment=figure4_progress", "row=whole", "figure.kind=pie"])
+
+
+def test_a_row_that_is_not_there_is_told() -> None:
+    with pytest.raises(ConfigError, match=r"there is no row=chian; did you mean chain\? The experiment has chain"):
+        composed(["experiment=ablation_refiner", "row=chian"])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["row=half,hafl"], "error: there is no row=hafl; did you mean half? The experiment has "),
+        (
+            ["row=half,whole", "fuser.capcity=3"],
+            "error: Could not override 'fuser.capcity'. There is no fuser.cap",
+        ),
+        (["seed=range(0,0)"], "error: seed=range(0,0) has no value: the sweep would be empty"),
+    ],
+)
+def test_what_is_wrong_with_a_sweep_is_told_before_its_first_run(
+    tmp_path: Path, arguments: list[str], said: str
+) -> None:
+    done = start(tmp_path, *arguments)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith(said)
+    assert len(done.stderr.splitlines()) == 1
+    assert not list(tmp_path.rglob("config.yaml"))
+
+
+def test_a_run_without_experiment_is_left_alone() -> None:
+    config, choices = composed(["refiner=kmeans"])
+    assert "row" not in config
+    assert not config.get("resume")
+    assert choices["refiner"] == "kmeans"
+
+
+def test_what_an_experiment_compares_its_runs_for_changes_no_result() -> None:
+    told = {
+        "row": "a",
+        "rows": {"a": []},
+        "sequences": {"all": "b"},
+        "resume": True,
+        "table": {"over": ["seed"]},
+        "figure": {"zoom": True},
+    }
+    assert config_hash({"seed": 1}) == config_hash({"seed": 1} | told)

@@ -1,0 +1,190 @@
+"""A map from before is gone on with: to the byte as if it had never been put away, or not at all."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.api import Mapper, load_map
+from framework.data import Frame, Pose
+from framework.datasets.frames.sequence_reader import Recording
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.datasets.tum_rgbd import TumRgbd
+from framework.errors import ConfigError, DataError
+from framework.evaluation.trajectory import evaluate
+from framework.geometry import inverse, rotation_angle
+from framework.tracking.keyframes_file import read_places, write_places
+from tests.support.scenes.corner_room import CornerRoom
+
+GIVEN = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
+TRACKED = ("detector=none", "fuser.voxel_size=0.02")
+DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
+
+
+def put_away(mapper: Mapper, place: Path) -> Path:
+    """What a run leaves of its map."""
+    place.mkdir()
+    mapper.scene.save(place / "map.npz")
+    if places := mapper.pipeline.tracker.places():
+        write_places(place / "keyframes.npz", places)
+    return place
+
+
+def mapped(frames: Iterable[Frame], *overrides: str) -> tuple[Mapper, list[Pose]]:
+    mapper = Mapper(*overrides)
+    return mapper, [mapper.add(frame) for frame in frames]
+
+
+@pytest.mark.parametrize("fuser", ["bayesian_tsdf", "label_count", "max_confidence", "last_write"])
+def test_it_is_the_map_of_one_run_to_the_byte(tmp_path: Path, room: CornerRoom, fuser: str) -> None:
+    stages = (*GIVEN, f"fuser={fuser}")
+    first, _ = mapped([room[k] for k in range(3)], *stages)
+    before = put_away(first, tmp_path / "first")
+    continued, _ = mapped([room[k] for k in range(3, len(room))], *stages, f"map={before}")
+    whole, _ = mapped(room, *stages)
+    continued.scene.save(tmp_path / "continued.npz")
+    whole.scene.save(tmp_path / "whole.npz")
+    assert (tmp_path / "continued.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_frames_of_another_recording_count_on(tmp_path: Path, room: CornerRoom) -> None:
+    """Both number their frames from 0: an object that both show was seen in the frames of both."""
+    first, _ = mapped(room, *GIVEN)
+    again, _ = mapped(room, *GIVEN, f"map={put_away(first, tmp_path / 'first')}")
+    for key, instance in first.instances().items():
+        assert again.instances()[key].observations == 2 * instance.observations
+        assert again.instances()[key].first_frame == instance.first_frame
+        assert again.instances()[key].last_frame == len(room) + instance.last_frame
+
+
+def ate_mm(recording: Recording, poses: list[Pose]) -> float:
+    return 1000 * evaluate([recording.contents.frames[k].T_world_camera for k in recording.chosen], poses).ate_rmse_m
+
+
+def check_halves(tmp_path: Path, recording: Recording) -> None:
+    """The second half, continued, is tracked as if there had been no break."""
+    half = len(recording) // 2
+    whole, poses = mapped(recording, *TRACKED)
+    first, in_first = mapped([recording[k] for k in range(half)], *TRACKED)
+    put_away(first, tmp_path / "first")
+    continued, in_second = mapped(
+        [recording[k] for k in range(half, len(recording))], *TRACKED, f"map={tmp_path / 'first'}"
+    )
+    assert not any(pose.lost for pose in [*poses, *in_first, *in_second])
+    assert ate_mm(recording, [*in_first, *in_second]) < ate_mm(recording, poses) + 5
+    assert continued.scene.voxel_count == pytest.approx(whole.scene.voxel_count, rel=0.02)
+
+
+def test_the_desk_is_gone_on_with(tmp_path: Path) -> None:
+    check_halves(tmp_path, DESK)
+
+
+def test_the_kitchen_is_gone_on_with(tmp_path: Path, shared_data: Path) -> None:
+    check_halves(tmp_path, RgbdFolder(shared_data / "redkitchen", stride=3))
+
+
+@pytest.mark.parametrize("tracker", ["voxel_hashing_icp", "pycolmap_pnp"])
+def test_a_recording_of_another_place_leaves_the_map_as_it_was(tmp_path: Path, shared_data: Path, tracker: str) -> None:
+    stages = (*TRACKED, f"tracker={tracker}")
+    desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *stages)
+    before = put_away(desk, tmp_path / "desk")
+    elsewhere, poses = mapped(RgbdFolder(shared_data / "redkitchen", stride=30), *stages, f"map={before}")
+    assert all(pose.lost for pose in poses)
+    assert len(poses) == 10
+    elsewhere.scene.save(tmp_path / "after.npz")
+    assert (tmp_path / "after.npz").read_bytes() == (before / "map.npz").read_bytes()
+
+
+def test_a_lost_camera_enters_the_map_when_it_sees_what_is_there(tmp_path: Path) -> None:
+    desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *TRACKED)
+    before = put_away(desk, tmp_path / "desk")
+    black = replace(DESK[5], color=np.zeros_like(DESK[5].color))
+    empty = replace(DESK[5], depth=np.zeros_like(DESK[5].depth))
+    _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"map={before}")
+    assert [pose.lost for pose in poses] == [True, True, False, False]
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("fuser.voxel_size=0.05",), "made with fuser.voxel_size 0.04, and cannot be gone on with by 0.05"),
+        (("fuser.max_depth=4",), "fuser.max_depth"),
+        (("fuser=label_count",), "keeps labels as"),
+        (("fuser=object_volumes",), "ObjectVolumes cannot go on"),
+        (("tracker=voxel_hashing_icp",), "has left no keyframes"),
+        (("tracker=open3d_odometry",), "Open3dOdometry cannot find itself"),
+    ],
+)
+def test_what_cannot_go_on_says_so(tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str) -> None:
+    first, _ = mapped([room[0]], *GIVEN)
+    before = put_away(first, tmp_path / "first")
+    with pytest.raises(ConfigError, match=said):
+        Mapper(*GIVEN, *overrides, f"map={before}")
+
+
+def test_a_map_that_is_not_there(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"map: there is no .*map\.npz: expected the directory of a run"):
+        Mapper(*GIVEN, f"map={tmp_path}")
+    with pytest.raises(ConfigError, match="map must be a path"):
+        Mapper(*GIVEN, "map=7")
+
+
+def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
+    desk, _ = mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)
+    places = desk.pipeline.tracker.places()
+    path = tmp_path / "keyframes.npz"
+    assert read_places(path) == {}
+    write_places(path, places)
+    back = read_places(path)
+    assert list(back) == sorted(places)
+    for name, array in places.items():
+        np.testing.assert_array_equal(back[name], array)
+        assert back[name].dtype == array.dtype
+    again = Mapper(*TRACKED).pipeline.tracker
+    again.recall(back, desk.scene)
+    for name, array in again.places().items():
+        np.testing.assert_array_equal(array, places[name])
+    scaled = np.array(places["poses"]) * 2
+    for damage in (
+        {"counts": places["counts"][:-1]},
+        {"counts": -np.asarray(places["counts"], np.int32)},
+        {"points_world": places["points_world"][:-1]},
+        {"poses": scaled},
+        {"descriptors": np.asarray(places["descriptors"]).astype(np.int32)},
+    ):
+        with pytest.raises(DataError):
+            Mapper(*TRACKED).pipeline.tracker.recall({**places, **damage}, desk.scene)
+    with pytest.raises(DataError, match="keyframes are"):
+        Mapper(*TRACKED).pipeline.tracker.recall({"poses": places["poses"]}, desk.scene)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(DataError, match=r"keyframes\.npz"):
+        read_places(path)
+
+
+def test_a_map_with_views_of_two_recordings_is_stored_and_read(tmp_path: Path, room: CornerRoom) -> None:
+    first, _ = mapped(room, *GIVEN)
+    again, _ = mapped(room, *GIVEN, f"map={put_away(first, tmp_path / 'first')}")
+    again.scene.save(tmp_path / "again.npz")
+    assert list(load_map(tmp_path / "again.npz").instances()) == list(again.instances())
+
+
+def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
+    """Without true poses: those of the second recording are of the first one's world all the same."""
+    unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
+    first, poses = mapped(unposed[:25], *TRACKED)
+    own, in_its_world = mapped(unposed[20:], *TRACKED, f"world={put_away(first, tmp_path / 'first')}")
+    assert not any(pose.lost for pose in in_its_world)
+    for k in range(5):
+        apart = inverse(poses[20 + k].T_world_camera) @ in_its_world[k].T_world_camera
+        assert np.linalg.norm(apart[:3, 3]) < 0.01
+        assert rotation_angle(apart[:3, :3]) < 0.01
+    alone, _ = mapped(unposed[20:], *TRACKED)
+    assert own.scene.voxel_count == pytest.approx(alone.scene.voxel_count, rel=0.05)
+    with pytest.raises(ConfigError, match="map and world exclude each other"):
+        Mapper(*TRACKED, f"world={tmp_path / 'first'}", f"map={tmp_path / 'first'}")
+    with pytest.raises(DataError, match="world: there is no"):
+        Mapper(*TRACKED, f"world={tmp_path}")

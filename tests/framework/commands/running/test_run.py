@@ -1,0 +1,308 @@
+"""How a run ends: completed, partial or with nothing to keep, and what its place is."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from framework.files.directory_lock import locked
+from framework.runs.stored_runs import MAPPED
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+SMALL = ("trajectory.txt", "timings.csv", "instances.json")
+ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=100000", "fuser.note=note")
+PATIENCE_S = 120
+
+
+def begin(directory: Path, *arguments: str, before: Callable[[], object] | None = None) -> subprocess.Popen[str]:
+    """A run of stages that do nothing much, in `directory`; `before` is called in its process."""
+    line = [
+        sys.executable,
+        "-m",
+        "framework",
+        "--config-dir",
+        str(CHECKOUT / "tests" / "support" / "fake_conf"),
+        *FAKES,
+    ]
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    return subprocess.Popen(
+        [*line, *arguments],
+        cwd=directory,
+        env=clean | {"PYTHONPATH": str(CHECKOUT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=before,
+    )
+
+
+def end(process: subprocess.Popen[str]) -> tuple[int, str]:
+    """Exit status and stderr."""
+    try:
+        _, stderr = process.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        raise
+    return process.returncode, stderr
+
+
+def wait_for(file: Path, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not file.exists():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def figures(directory: Path, name: str = "metrics.partial.json") -> dict[str, object]:
+    read: dict[str, object] = json.loads((directory / name).read_text())
+    return read
+
+
+def ignore_ctrl_c() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+@pytest.mark.parametrize("background", [False, True])
+def test_a_signal_leaves_a_partial_record(tmp_path: Path, number: signal.Signals, background: bool) -> None:
+    """Also where a script has started the run in the background, which ignores Ctrl-C then."""
+    place = tmp_path / "run"
+    process = begin(tmp_path, *ENDLESS, f"hydra.run.dir={place}", before=ignore_ctrl_c if background else None)
+    wait_for(tmp_path / "note", process)
+    process.send_signal(number)
+    status, stderr = end(process)
+    assert status == 128 + number
+    assert "Traceback" not in stderr
+    assert f"ended by {number.name}: ending after this frame; a second time ends at once" in stderr
+    assert stderr.splitlines()[-1] == f"ended by {number.name}"
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
+    assert figures(place)["partial"] == f"ended by {number.name}"
+    assert not (place / "metrics.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("kind", "said"),
+    [
+        ("OSError", "OSError: weights.bin: Input/output error"),
+        ("ValueError", "ValueError: operands could not be broadcast together"),
+        ("MemoryError", "MemoryError: Unable to allocate 40 GiB"),
+        ("masks", "masks"),
+    ],
+)
+def test_a_fault_of_a_stage_leaves_a_partial_record(tmp_path: Path, kind: str, said: str) -> None:
+    place = tmp_path / "run"
+    status, stderr = end(begin(tmp_path, "detector=faulty", f"detector.kind={kind}", f"hydra.run.dir={place}"))
+    assert status == 3
+    assert said in stderr.splitlines()[-1] or said in stderr
+    assert "ERROR" in stderr
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.partial.json"}
+    left = figures(place)
+    assert said in str(left["partial"])
+    assert left["frames"] in (3, 4)  # the detector fails before the frame is taken, masks when they are lifted
+    assert len((place / "trajectory.txt").read_text().splitlines()) in (3, 4)
+
+
+def test_a_folder_that_is_deleted_meanwhile_is_made_again(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *ENDLESS, "dataset.frames=100", f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    config = (place / "config.yaml").read_bytes()
+    shutil.rmtree(place)
+    assert end(process)[0] == 0
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.json"}
+    assert (place / "config.yaml").read_bytes() == config
+
+
+def test_a_fault_before_anything_is_mapped_leaves_nothing_to_keep(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    status, _ = end(begin(tmp_path, "detector=faulty", "detector.at=0", f"hydra.run.dir={place}"))
+    assert status == 1
+    assert {path.name for path in place.iterdir()}.isdisjoint({*MAPPED, "metrics.partial.json", "metrics.json"})
+
+
+def test_a_stage_that_ends_the_process_leaves_a_partial_record(tmp_path: Path) -> None:
+    """As submitit does when its job is preempted."""
+    place = tmp_path / "run"
+    status, _ = end(begin(tmp_path, "detector=faulty", "detector.kind=SystemExit", f"hydra.run.dir={place}"))
+    assert status == 7
+    assert figures(place)["frames"] == 3
+
+
+def test_on_a_full_disk_the_small_files_are_written(tmp_path: Path) -> None:
+    """No file may have more than 64 KiB here: what the kernel answers then is what it answers on a full disk."""
+    place = tmp_path / "run"
+    place.mkdir()
+    (place / "mesh.ply").write_text("of an earlier run")
+    status, stderr = end(
+        begin(
+            tmp_path,
+            f"hydra.run.dir={place}",
+            before=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (2**16, 2**16)),
+        )
+    )
+    assert status == 3
+    assert "Traceback" not in stderr
+    left = {path.name for path in place.iterdir()}
+    assert left >= {*SMALL, "metrics.partial.json"}
+    assert left.isdisjoint({"mesh.ply", "map.npz", "metrics.json"})
+    assert not list(place.glob(".*partial*"))
+    fault = str(figures(place)["partial"])
+    assert fault.startswith(f"{place / 'mesh.ply'} could not be written: ")
+    assert fault.endswith("the disk may be full")
+    assert figures(place)["instances.ap50"] == 1.0
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_the_record_is_written_lets_it_be_finished(tmp_path: Path, number: signal.Signals) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, "fuser.slow_save_s=1", f"hydra.run.dir={place}")
+    wait_for(place / "metrics.partial.json", process)
+    process.send_signal(number)
+    status, stderr = end(process)
+    assert status == 0, stderr
+    assert "ending once the record is written; a second time ends at once" in stderr
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.json"}
+    assert not (place / "metrics.partial.json").exists()
+
+
+def test_a_second_one_leaves_what_is_written_whole(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, "fuser.slow_save_s=30", f"hydra.run.dir={place}")
+    wait_for(place / "mesh.ply", process)
+    time.sleep(0.2)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        process.send_signal(number)
+        time.sleep(0.3)
+    status, stderr = end(process)
+    assert status == 143, stderr
+    left = {path.name for path in place.iterdir()}
+    assert left >= {*SMALL, "mesh.ply", "metrics.partial.json"}
+    assert left.isdisjoint({"map.npz", "metrics.json"})
+    assert not list(place.glob(".*partial*"))
+    assert figures(place)["partial"] == "its record was not finished"
+
+
+LIVE = ("dataset=live", "dataset.frames_sent=100000", "fuser.capacity=100000", "fuser.note=note")
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_is_the_end_of_a_live_video(tmp_path: Path, number: signal.Signals) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *LIVE, f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    process.send_signal(number)
+    status, stderr = end(process)
+    assert status == 0, stderr
+    assert "mapping live_room: live until Ctrl-C" in stderr
+    assert "partial" not in stderr
+    assert {path.name for path in place.iterdir()} >= {*MAPPED, "metrics.json"}
+    assert not (place / "metrics.partial.json").exists()
+    left = figures(place, "metrics.json")
+    assert left["frames_dropped"] == 0
+    assert isinstance(left["latency_ms"], float)
+    assert left["frames"] == len((place / "trajectory.txt").read_text().splitlines()) > 0
+
+
+def test_a_second_signal_leaves_a_live_video_partial(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    process = begin(tmp_path, *LIVE, "fuser.slow_s=2", f"hydra.run.dir={place}")
+    wait_for(tmp_path / "note", process)
+    time.sleep(0.5)  # in the middle of the second frame
+    for number in (signal.SIGTERM, signal.SIGTERM):
+        process.send_signal(number)
+        time.sleep(0.05)
+    status, stderr = end(process)
+    assert status == 143, stderr
+    assert figures(place)["partial"] == "ended by SIGTERM"
+
+
+def test_a_live_video_that_breaks_down_leaves_a_partial_record(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    status, stderr = end(begin(tmp_path, "dataset=live", "dataset.fails_after=3", f"hydra.run.dir={place}"))
+    assert status == 3
+    assert "the cable is out" in stderr.splitlines()[-1]
+    assert figures(place)["frames"] == 3
+
+
+def test_in_a_sweep_a_signal_while_a_record_is_written_ends_it_after_that(tmp_path: Path) -> None:
+    sweep = (
+        "hydra.mode=MULTIRUN",
+        "seed=1,2",
+        "fuser.slow_save_s=1",
+        f"hydra.sweep.dir={tmp_path}",
+        "hydra.sweep.subdir=${seed}",
+    )
+    process = begin(tmp_path, *sweep, before=ignore_ctrl_c)
+    wait_for(tmp_path / "1" / "metrics.partial.json", process)
+    process.send_signal(signal.SIGTERM)
+    status, stderr = end(process)
+    assert status == 143, stderr
+    assert (tmp_path / "1" / "metrics.json").exists()
+    assert not (tmp_path / "2").exists()
+
+
+def test_in_a_sweep_the_fault_of_a_run_goes_on_with_the_next(tmp_path: Path) -> None:
+    sweep = ("hydra.mode=MULTIRUN", "detector=faulty", "detector.at=3,99", f"hydra.sweep.dir={tmp_path}")
+    status, _ = end(begin(tmp_path, *sweep, "hydra.sweep.subdir=${detector.at}"))
+    assert status == 1
+    assert (tmp_path / "3" / "metrics.partial.json").exists()
+    assert (tmp_path / "99" / "metrics.json").exists()
+
+
+def test_a_run_that_is_refused_changes_nothing(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    assert end(begin(tmp_path, "seed=1", f"hydra.run.dir={place}"))[0] == 0
+    before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file() and path.name != ".lock_holder"}
+    assert place / ".hydra" / "overrides.yaml" in before
+    with locked(place):
+        status, stderr = end(begin(tmp_path, "seed=2", f"hydra.run.dir={place}"))
+    assert (status, len(stderr.splitlines())) == (1, 1)
+    assert f"error: {place} is in use by process {os.getpid()} on " in stderr
+    assert {path: path.read_bytes() for path in before} == before
+    assert {path for path in place.rglob("*") if path.is_file()} - set(before) == {place / ".lock_holder"}
+
+
+def test_a_pipe_for_a_log_is_refused(tmp_path: Path) -> None:
+    place = tmp_path / "run"
+    place.mkdir()
+    os.mkfifo(place / "instancemap.log")
+    status, stderr = end(begin(tmp_path, f"hydra.run.dir={place}"))
+    assert status == 1
+    assert "instancemap.log" in stderr
+    assert "Traceback" not in stderr
+
+
+def test_a_place_that_nobody_chose_is_named_after_the_dataset(tmp_path: Path) -> None:
+    assert end(begin(tmp_path))[0] == 0
+    [place] = (tmp_path / "outputs").iterdir()
+    assert place.name.endswith("_fake")
+    assert (place / "metrics.json").is_file()
+
+
+def test_runs_and_sweeps_of_the_same_moment_have_places_of_their_own(tmp_path: Path) -> None:
+    runs = [begin(tmp_path, "hydra.run.dir=${new_directory:runs/now}") for _ in range(2)]
+    assert [end(process)[0] for process in runs] == [0, 0]
+    assert {path.parent.name for path in tmp_path.glob("runs/*/metrics.json")} == {"now", "now_2"}
+    sweeps = [begin(tmp_path, "hydra.mode=MULTIRUN", "hydra.sweep.dir=${new_directory:sweeps/now}") for _ in range(2)]
+    assert [end(process)[0] for process in sweeps] == [0, 0]
+    assert {path.parent.parent.name for path in tmp_path.glob("sweeps/*/*/metrics.json")} == {"now", "now_2"}
+
+
+def test_what_was_being_written_when_a_run_was_killed_is_removed(tmp_path: Path) -> None:
+    torn, mine = tmp_path / ".mesh.4711-0123abcd.partial.ply", tmp_path / ".mine.partial.ply"
+    torn.touch()
+    mine.touch()
+    assert end(begin(tmp_path, f"hydra.run.dir={tmp_path}"))[0] == 0
+    assert (torn.exists(), mine.exists()) == (False, True)

@@ -1,0 +1,115 @@
+"""`python -m framework show-refinement` as a user meets it."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from PIL import Image
+
+from framework.commands.running.show_refinement import TRIED, called, detected
+from framework.data import Detections, Frame
+from framework.errors import ConfigError, DataError, FrameError
+from tests.support.scenes.corner_room import CornerRoom, SphereDetector
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+
+
+def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), "detector=fake", "dataset=fake"]
+    line = [sys.executable, "-m", "framework", "show-refinement", *fakes, *arguments]
+    environment = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    environment["PYTHONPATH"] = str(CHECKOUT)
+    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def test_draws_one_frame(tmp_path: Path) -> None:
+    done = start(tmp_path, "refiner=largest_component", "frame=2", "out=refinement.png")
+    assert done.returncode == 0, done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["refinement.png"]
+    assert Image.open(tmp_path / "refinement.png").width > 1500
+    assert "refinement.png: 2 detections in frame 2 of corner_room" in done.stderr
+
+
+def test_without_detections_it_says_so_and_draws(tmp_path: Path) -> None:
+    done = start(tmp_path, "refiner=gmm_em", "detector=none", "out=refinement.png")
+    assert done.returncode == 0, done.stderr
+    assert "nothing was detected" in done.stderr
+    assert (tmp_path / "refinement.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ([], "out must be given: out=refinement.png"),
+        (["out=absent/refinement.png"], "there is no folder"),
+        (["out=refinement.jpg"], "out must end in .png, found refinement.jpg"),
+        (["out=r.png", "frame=6"], "frame must be in [0, 5], a position among the frames of corner_room"),
+        (["out=r.png", "frame=1", "dataset.unreadable=1"], "frame 1: depth/000001.png is truncated"),
+    ],
+)
+def test_a_fault_is_one_line_and_a_status(tmp_path: Path, overrides: list[str], said: str) -> None:
+    done = start(tmp_path, *overrides)
+    assert done.returncode == 1
+    assert said in done.stderr
+    assert len(done.stderr.splitlines()) == 1, done.stderr
+    assert not list(tmp_path.iterdir())
+
+
+class FoundOnlyIn(SphereDetector):
+    """Finds both spheres in one frame, nothing elsewhere."""
+
+    def __init__(self, index: int) -> None:
+        super().__init__()
+        self.index = index
+
+    def detect(self, frame: Frame) -> Detections:
+        found = super().detect(frame)
+        return found if frame.index == self.index else Detections.none(frame.camera.shape, self.classes)
+
+
+def test_without_a_position_the_frame_with_most_detections_is_taken() -> None:
+    position, frame, found = detected(CornerRoom(), FoundOnlyIn(4), None)
+    assert (position, frame.index, len(found)) == (4, 4, 2)
+    position, _, _ = detected(CornerRoom(), SphereDetector(), None)
+    assert position == 0, "the first of equals"
+    position, frame, found = detected(CornerRoom(frames=60, start=2, stride=2), FoundOnlyIn(2), None)
+    assert (position, frame.index, len(found)) == (0, 2, 2)
+
+
+def test_frames_that_cannot_be_used_are_passed_over_unless_they_are_asked_for() -> None:
+    position, _, _ = detected(CornerRoom(unreadable=0), SphereDetector(), None)
+    assert position == 1
+    with pytest.raises(FrameError, match="truncated"):
+        detected(CornerRoom(unreadable=0), SphereDetector(), 0)
+    with pytest.raises(DataError, match="none of the 1 frames that were tried can be used"):
+        detected(CornerRoom(frames=1, unreadable=0), SphereDetector(), None)
+
+
+@pytest.mark.parametrize("position", [-1, 6, "first", 1.0, True])
+def test_a_position_that_there_is_not_is_refused(position: object) -> None:
+    with pytest.raises(ConfigError, match=r"frame must be in \[0, 5\]"):
+        detected(CornerRoom(), SphereDetector(), position)
+
+
+def test_a_long_video_costs_a_few_frames() -> None:
+    class Counted(SphereDetector):
+        calls = 0
+
+        def detect(self, frame: Frame) -> Detections:
+            Counted.calls += 1
+            return super().detect(frame)
+
+    detected(CornerRoom(frames=1000), Counted(), None)
+    assert Counted.calls == TRIED
+
+
+def test_the_refiner_is_called_as_on_the_command_line() -> None:
+    overrides = ["refiner=chain", "refiner.links.gmm_em=null", "refiner@refiner.links.x=kmeans", "frame=3", "seed=1"]
+    assert called("chain", overrides) == "refiner=chain refiner.links.gmm_em=null refiner@refiner.links.x=kmeans"
+    added = "+refiner@refiner.links.last=largest_component"
+    assert called("chain", [added, "~refiner.links.gmm_em", "seed=1"]) == f"refiner=chain {added} ~refiner.links.gmm_em"
+    assert called("gmm_em", []) == "refiner=gmm_em"

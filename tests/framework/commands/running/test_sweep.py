@@ -1,0 +1,347 @@
+"""Sweeps as a user meets them: run by every launcher, killed in the middle, and started twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+from hydra import compose, initialize_config_dir
+from hydra.errors import MissingConfigException
+from omegaconf import OmegaConf
+
+from framework.commands.running.sweep import jobs_at_once
+from framework.config.composition import one_line
+from framework.files.directory_lock import locked
+from framework.files.search_paths import CONF
+from framework.runs.provenance import config_hash
+from framework.runs.run_directory import MAPPED
+
+CHECKOUT = Path(__file__).resolve().parents[4]
+FAILED = "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
+PLACE = Path("outputs") / "fake_ablation"
+BY_JOBLIB = ("launcher=joblib", "hydra.launcher.n_jobs=2")
+FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+SLOW = "dataset.slow_s=0.1"  # so that a worker that is killed is in the middle of a run, not of handing in its result
+SIX = ("row=half,broken", "seed=1,2,3", SLOW)  # the broken ones fail
+RUNS = {f"{SLOW},row=half,seed={seed}" for seed in (1, 2, 3)}
+PATIENCE_S = 180
+
+
+def begin(directory: Path, *arguments: str, sweep: str = "experiment=fake_ablation") -> subprocess.Popen[str]:
+    """The fake experiment or another sweep, with its own process group: what a terminal makes of a command."""
+    fakes = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), sweep]
+    clean = {key: value for key, value in os.environ.items() if key != "HYDRA_FULL_ERROR"}
+    environment = clean | {"PYTHONPATH": str(CHECKOUT), "RAY_AUTH_MODE": "disabled"}  # else Ray writes into the home
+    return subprocess.Popen(
+        [sys.executable, "-m", "framework", *fakes, *arguments],
+        cwd=directory,
+        env=environment,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+
+
+def end(process: subprocess.Popen[str]) -> subprocess.CompletedProcess[str]:
+    try:
+        out, errors = process.communicate(timeout=PATIENCE_S)
+    except subprocess.TimeoutExpired:
+        os.killpg(process.pid, signal.SIGKILL)
+        raise
+    return subprocess.CompletedProcess(process.args, process.returncode, out, errors)
+
+
+def wait_until(condition: Callable[[], object], process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert process.poll() is None, process.communicate()[1]
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def recorded(directory: Path) -> dict[str, int]:
+    """When the runs were completed, by their directory's name."""
+    return {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/metrics.json")}
+
+
+def begun(directory: Path) -> dict[str, int]:
+    """When the runs began that have not been completed, by their directory's name."""
+    began = {path.parent.name: path.stat().st_mtime_ns for path in (directory / PLACE).glob("*/config.yaml")}
+    return {name: began[name] for name in set(began) - set(recorded(directory))}
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, subprocess.CompletedProcess[str]]:
+    """A sweep by joblib that nobody disturbs, with a row whose runs fail; and where it is."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    directory = tmp_path_factory.mktemp("whole")
+    return directory, end(begin(directory, *BY_JOBLIB, *SIX))
+
+
+def test_joblib_runs_all_and_the_failed_do_not_stop_the_others(
+    whole: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    directory, done = whole
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("ERROR") == 3, "each failed run tells it once"
+    assert "ERROR   #4 dataset" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith(
+        "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
+    )
+    assert set(recorded(directory)) == RUNS
+    text = (directory / PLACE / "table.md").read_text()
+    assert text in done.stdout
+    assert f"Not complete: {SLOW},row=broken,seed=1: failed: dataset" in text
+    assert "threads=1" in text, "how fast the runs were depends on it"
+
+
+def test_another_launcher_goes_on_where_the_first_ended(
+    whole: tuple[Path, subprocess.CompletedProcess[str]],
+) -> None:
+    directory, _ = whole
+    before = recorded(directory)
+    again = end(begin(directory, "row=half", "seed=1,2,3", SLOW, "threads=2"))
+    assert again.returncode == 0, again.stderr
+    assert again.stderr.count("kept: the complete record in") == 3
+    assert recorded(directory) == before
+
+
+def test_a_killed_sweep_goes_on_to_the_same_table(
+    whole: tuple[Path, subprocess.CompletedProcess[str]], tmp_path: Path
+) -> None:
+    """First one of its workers is killed, then all of it at once."""
+    first = begin(tmp_path, *BY_JOBLIB, *SIX)
+    wait_until(lambda: recorded(tmp_path) and begun(tmp_path), first)
+    workers = [child for child in psutil.Process(first.pid).children() if "LokyProcess" in " ".join(child.cmdline())]
+    workers[0].kill()
+    done = end(first)
+    assert done.returncode == 1
+    assert "Traceback" not in done.stderr
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("error: the sweep ended early, and the same command goes on with it: A worker process")
+    assert "SIGKILL" in last
+    assert (tmp_path / PLACE / "table.md").read_text() in done.stdout
+    kept = recorded(tmp_path)
+    assert 0 < len(kept) < len(RUNS)
+
+    left = begun(tmp_path)
+    second = begin(tmp_path, *BY_JOBLIB, *SIX)
+    wait_until(lambda: begun(tmp_path) != left, second)
+    os.killpg(second.pid, signal.SIGKILL)
+    end(second)
+
+    third = end(begin(tmp_path, *BY_JOBLIB, *SIX))
+    assert third.stderr.count("kept: the complete record in") >= len(kept)
+    after = recorded(tmp_path)
+    assert set(after) == RUNS
+    assert {name: after[name] for name in kept} == kept
+    for name in ("table.md", "table.tex", "table.csv"):
+        assert (tmp_path / PLACE / name).read_bytes() == (whole[0] / PLACE / name).read_bytes()
+
+
+def test_a_sweep_without_an_experiment_has_one_place_and_tells_what_failed(tmp_path: Path) -> None:
+    """Its place is named after the time, which workers must not read anew."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    done = end(begin(tmp_path, *FAKES, "dataset.frames=few,many", "launcher=joblib", sweep="-m"))
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].startswith(
+        "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
+    )
+    [place] = (tmp_path / "multirun").iterdir()
+    assert len(list(place.glob("*dataset.frames=*/instancemap.log"))) == 2
+    assert not list(place.glob("*launcher*"))
+
+
+def swept(directory: Path, *arguments: str) -> tuple[subprocess.CompletedProcess[str], dict[str, int]]:
+    """A sweep without an experiment, in one place; and when its runs were completed, by what their names end with."""
+    done = end(begin(directory, *FAKES, "dataset.frames=3", "hydra.sweep.dir=s", *arguments, sweep="-m"))
+    assert done.returncode == 0, done.stderr
+    runs = (directory / "s").glob("*/metrics.json")
+    return done, {path.parent.name.partition("refiner=fake,")[2]: path.stat().st_mtime_ns for path in runs}
+
+
+def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
+    """With whatever else that changes no result: it is not in the name of a run's directory."""
+    _, first = swept(tmp_path, "seed=1,2")
+    assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
+    harmless = ("threads=1", "ahead=0", "detection_cache=read_write", f"detection_cache_dir={tmp_path}", "viewer=none")
+    done, second = swept(tmp_path, "seed=1,2,3", "resume=true", "debug=false", *harmless)
+    assert done.stderr.count("kept: the complete record in") == 2
+    assert set(second) == {*first, "seed=3,tracker=fake"}
+    assert {name: second[name] for name in first} == first
+
+
+def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp_path: Path) -> None:
+    """As those of a sweep that times them; workers name them alike."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    _, first = swept(tmp_path, "threads=1,2", "ahead=0")
+    assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
+    done, second = swept(tmp_path, "threads=1,2", "resume=true", *BY_JOBLIB)
+    assert second == first
+    assert done.stderr.count("kept: the complete record in") == 2
+
+
+@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
+def test_ctrl_c_and_kill_leave_no_worker_behind(tmp_path: Path, told: signal.Signals) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "dataset.slow_s=1")
+    wait_until(lambda: len(begun(tmp_path)) == 2, process)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(told)
+    sent = time.monotonic()
+    done = end(process)
+    assert time.monotonic() - sent < 15
+    assert done.returncode == 128 + told
+    assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
+    assert not psutil.wait_procs(family, timeout=10)[1]
+
+
+ENDLESS = ("dataset.frames=100000", "dataset.slow_s=0.01", "fuser.capacity=100000")
+
+
+@pytest.mark.parametrize(
+    ("told", "all_at_once", "n_jobs", "seeds", "at_work"),
+    [
+        (signal.SIGINT, False, 2, "1,2,3", 2),
+        (signal.SIGTERM, True, 2, "1,2,3", 2),
+        (signal.SIGINT, True, 3, "1,2", 2),  # more than there is work for
+        (signal.SIGINT, False, 1, "1,2", 1),  # which joblib starts no worker for
+    ],
+)
+def test_a_signal_leaves_a_partial_record_of_each_run_in_work(
+    tmp_path: Path, told: signal.Signals, all_at_once: bool, n_jobs: int, seeds: str, at_work: int
+) -> None:
+    """A terminal sends Ctrl-C to the workers, too; `kill` does not."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    by_joblib = (*BY_JOBLIB, f"hydra.launcher.n_jobs={n_jobs}")
+    process = begin(tmp_path, *by_joblib, "row=all", f"seed={seeds}", *ENDLESS, "fuser.note=${seed}.note")
+    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == at_work, process)
+    if all_at_once:
+        os.killpg(process.pid, told)
+    else:
+        process.send_signal(told)
+    done = end(process)
+    assert done.returncode == 128 + told
+    ending = "once the runs in work have left their records" if n_jobs > 1 else "after this frame"
+    assert done.stderr.count(f"ending {ending}; a second time ends at once") == 1
+    assert done.stderr.splitlines()[-1] in ("interrupted by Ctrl-C", "ended by SIGTERM")
+    assert "Traceback" not in done.stderr
+    partial = list((tmp_path / PLACE).glob("*/metrics.partial.json"))
+    assert len(partial) == at_work
+    for file in partial:
+        how = "ended by SIGTERM" if n_jobs > 1 else "interrupted by Ctrl-C"
+        assert json.loads(file.read_text())["partial"] == how
+        assert {path.name for path in file.parent.iterdir()} >= set(MAPPED)
+
+
+def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    slow_record = ("fuser.slow_save_s=100", "fuser.note=${seed}.note")
+    process = begin(tmp_path, *BY_JOBLIB, "row=all", "seed=1,2", *ENDLESS, *slow_record)
+    wait_until(lambda: len(list(tmp_path.glob("*.note"))) == 2, process)
+    family = psutil.Process(process.pid).children(recursive=True)
+    process.send_signal(signal.SIGINT)
+    wait_until(lambda: len(list((tmp_path / PLACE).glob("*/mesh.ply"))) == 2, process)
+    process.send_signal(signal.SIGINT)
+    sent = time.monotonic()
+    done = end(process)
+    assert time.monotonic() - sent < 15
+    assert done.returncode == 128 + signal.SIGINT
+    assert not psutil.wait_procs(family, timeout=10)[1]
+    partial = [json.loads(path.read_text()) for path in (tmp_path / PLACE).glob("*/metrics.partial.json")]
+    assert [each["frames"] > 0 for each in partial] == [True, True]
+
+
+def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) -> None:
+    """`kill -9` of the sweep alone leaves its workers to their runs."""
+    pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
+    arguments = (*BY_JOBLIB, "row=half", "dataset.slow_s=1")
+    first = begin(tmp_path, *arguments)
+    wait_until(lambda: len(begun(tmp_path)) == 2, first)
+    workers = psutil.Process(first.pid).children(recursive=True)
+    for worker in workers:
+        worker.suspend()  # until others wait for it, however slow the machine is
+    first.kill()
+    again = begin(tmp_path, *arguments)
+    logs = (tmp_path / PLACE).glob
+    wait_until(lambda: sum("waiting for" in log.read_text() for log in logs("*/instancemap.log")) == 2, again)
+    for worker in workers:
+        worker.resume()
+    done = end(again)
+    for worker in workers:
+        worker.kill()  # idle by now, for some minutes
+    first.communicate()
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count("waiting for process") == 2
+    assert done.stderr.count("kept: the complete record in") == 2
+    assert "mapping" not in done.stderr
+
+
+def test_two_sweeps_do_not_share_a_place(tmp_path: Path) -> None:
+    with locked(tmp_path / PLACE):
+        done = end(begin(tmp_path))
+    assert (done.returncode, done.stdout) == (1, "")
+    assert len(done.stderr.splitlines()) == 1
+    assert f"error: {tmp_path / PLACE} is in use by process {os.getpid()} on " in done.stderr
+    assert not (tmp_path / PLACE / "multirun.yaml").exists()
+
+
+@pytest.mark.parametrize(
+    ("package", "arguments"),
+    [
+        ("hydra_plugins.hydra_submitit_launcher", ["launcher=submitit_local"]),
+        ("hydra_plugins.hydra_ray_launcher", ["launcher=ray", "hydra.launcher.ray.init.num_cpus=2"]),
+    ],
+)
+def test_the_launchers_of_clusters_run_here(tmp_path: Path, package: str, arguments: list[str]) -> None:
+    pytest.importorskip(package)
+    done = end(begin(tmp_path, *arguments, "row=half,broken", "seed=1"))
+    assert done.returncode == 1, done.stderr
+    assert set(recorded(tmp_path)) == {"row=half,seed=1"}
+    assert OmegaConf.load(tmp_path / PLACE / "row=half,seed=1" / "config.yaml").threads == 1
+    assert "Traceback" not in done.stderr
+    assert "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames" in done.stderr
+    assert (tmp_path / PLACE / "table.md").read_text() in done.stdout
+
+
+# Without a process
+
+
+def test_a_launcher_that_is_not_installed_is_told_with_its_extra() -> None:
+    error = MissingConfigException("?", missing_cfg_file="hydra/launcher/submitit_slurm", options=["basic"])
+    assert one_line(error).endswith("pip install instancemap[slurm]")
+
+
+@pytest.mark.parametrize(("threads", "jobs"), [(1, 12), (5, 2), (12, 1), (13, 1), (0, 1)])
+def test_jobs_get_as_many_threads_as_there_are_cores(monkeypatch: pytest.MonkeyPatch, threads: int, jobs: int) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
+    assert jobs_at_once(threads) == jobs
+
+
+@pytest.mark.parametrize(
+    ("launcher", "node"), [("joblib", "n_jobs"), ("slurm", "cpus_per_task"), ("ray", "ray.remote.num_cpus")]
+)
+def test_a_launcher_knows_the_threads_of_a_job(launcher: str, node: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of twelve cores; threads=0 are all of them: a job that counted for no core would never be one too many."""
+    pytest.importorskip(f"hydra_plugins.hydra_{launcher.replace('slurm', 'submitit')}_launcher")
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: range(12))
+    for threads in (3, 0):
+        with initialize_config_dir(str(CONF), version_base="1.3"):
+            own = compose("config", [f"launcher={launcher}", f"threads={threads}"], return_hydra_config=True)
+        cores = threads or 12
+        assert OmegaConf.select(own.hydra.launcher, node) == (12 // cores if launcher == "joblib" else cores)
+        assert own.hydra.job.env_set.TQDM_DISABLE == "1"
+
+
+def test_threads_change_no_result() -> None:
+    assert config_hash({"seed": 1, "threads": 0}) == config_hash({"seed": 1, "threads": 8})

@@ -1,0 +1,122 @@
+"""Whatever the YAML of --config-dir says: an option is built, or refused in one line.
+
+`INSTANCEMAP_FUZZ=2000 pytest tests/framework/config/test_config_fuzzing.py` tries so many.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+
+from framework.config import composition
+from framework.config.composition import composed
+from framework.errors import DataError, InstanceMapError
+from framework.interfaces import Detector
+from framework.registry import build
+from tests.support.recordings.damaged_files import EXAMPLES, damaged
+
+OPTION = b"""\
+defaults:
+  - _self_
+_target_: plugins.detectors.precomputed.Precomputed
+path: /nowhere/results.json # of a program
+labels: coco
+category_ids: FROM_ONE
+score_threshold: 0.1
+spread: 1.0
+"""
+TOKENS = (
+    *(
+        b"\t",
+        b"\n\t- a",
+        b": ",
+        b"- ",
+        b"? ",
+        b"!!python/object/apply:os.abort []",
+        b"!!binary x",
+        b"---\n",
+        b"%YAML 9\n",
+    ),
+    *(b"&a ", b"*a", b"<<: *a\n", b"{" * 200, b"[" * 200, b"${", b"${seed}", b"${oc.env:HOME}", b"${" * 50, b"\x00"),
+    *(b"${oc.decode:x}", b"${a:${b:c}}", b"1e999", b"9" * 5000, b"2001-99-99", b"\xff\xfe", b"_target_: os.abort\n"),
+    *(
+        b"defaults: [/nowhere]\n",
+        b"defaults: 3\n",
+        b"  - /detector: none\n",
+        b"hydra: {}\n",
+        b"# @package a.b\n",
+        b"~: 1\n",
+    ),
+)
+SLOWEST = 5.0  # s of this process: others may keep the machine busy
+BOMB = "a0: &a0 [x]\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
+
+
+@pytest.fixture
+def option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    (tmp_path / "detector").mkdir()
+    monkeypatch.setattr(composition, "_added", [tmp_path])
+    return tmp_path / "detector" / "mine.yaml"
+
+
+def line_of(option: Path, content: bytes) -> str:
+    """The line that refuses the option; "" = it was built. Fails for everything else that can happen."""
+    option.write_bytes(content)
+    began = time.process_time()
+    try:
+        build(Detector, composed("~dataset", "detector=mine").get("detector"))  # type: ignore[type-abstract]
+    except InstanceMapError as error:
+        line = str(error)
+    else:
+        line = ""
+    assert time.process_time() - began < SLOWEST
+    assert line.isprintable()
+    assert len(line) < 1000
+    return line
+
+
+def test_an_option_is_composed(option: Path) -> None:
+    assert "/nowhere/results.json could not be read" in line_of(option, OPTION)
+
+
+@settings(max_examples=EXAMPLES // 2, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck))
+@given(content=damaged(OPTION, TOKENS))
+def test_a_damaged_option_is_built_or_refused(content: bytes, option: Path) -> None:
+    line_of(option, content)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("_target_: a.B\n\tpath: b\n", "found a tab character"),
+        (BOMB, "stands for more than 200000 keys and values"),
+        ("a: &a [*a]\n", "*a stands for nothing, or for what it is in"),
+        ("a: " + "[" * 1000 + "]" * 1000, "more than 50 deep"),
+        ("a: " + "[" * 100_000, "more than 50 deep"),
+        ("a: !!python/object/apply:os.abort []", "could not determine a constructor"),
+        ("x" * (2**22 + 1), "more than the 4194304 that such a file can have"),
+        ("\udcff", "could not be read as text"),
+    ],
+    ids=range(8),
+)
+def test_a_fault_of_a_file_is_one_line_that_names_it(content: str, said: str, option: Path) -> None:
+    line = line_of(option, content.encode(errors="surrogateescape"))
+    assert said in line
+    assert line.startswith(str(option))
+
+
+def test_what_is_no_file_is_no_option(option: Path) -> None:
+    option.symlink_to("/dev/zero")
+    with pytest.raises(InstanceMapError, match="there is no detector=mine"):
+        composed("~dataset", "detector=mine")
+
+
+def test_a_stored_config_is_checked_likewise(tmp_path: Path) -> None:
+    from framework.runs.stored_runs import read_yaml
+
+    (tmp_path / "config.yaml").write_text(BOMB)
+    with pytest.raises(DataError, match=r"config\.yaml: it stands for more than"):
+        read_yaml(tmp_path / "config.yaml")

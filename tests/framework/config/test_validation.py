@@ -1,0 +1,36 @@
+"""The rows of experiments, as people write them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.config.validation import checked_rows
+from framework.errors import ConfigError
+
+
+def test_the_overrides_of_each_row() -> None:
+    config = OmegaConf.create("{kind: gmm_em, rows: {ours: [], 2: ['refiner=${kind}', fuser.overlap=0.1]}}")
+    found = checked_rows(config.rows)
+    assert found == {"ours": [], "2": ["refiner=gmm_em", "fuser.overlap=0.1"]}
+    assert checked_rows(None) == checked_rows({}) == {}
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ({"mine": None}, r"rows.mine must be a list of overrides, like \[refiner=identity\], found None"),
+        ({"mine": "refiner=kmeans"}, "rows.mine must be a list of overrides, .* found 'refiner=kmeans'"),
+        ({"mine": {"refiner": "kmeans"}}, "rows.mine must be a list"),
+        ({"mine": [{"refiner": "kmeans"}]}, "rows.mine must be a list"),
+        (["refiner=kmeans"], "rows must have names with overrides"),
+        ("mine", "rows must have names with overrides"),
+    ],
+)
+def test_rows_that_are_written_otherwise_are_one_line(rows: Any, message: str) -> None:
+    for node in (rows, OmegaConf.create({"rows": rows}).rows):
+        with pytest.raises(ConfigError, match=message) as caught:
+            checked_rows(node)
+        assert "\n" not in str(caught.value)

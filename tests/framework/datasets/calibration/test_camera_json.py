@@ -1,0 +1,44 @@
+"""Cameras in JSON; every fault of a value is in the tests of the readers that use it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from framework.data import Camera
+from framework.datasets.calibration.camera_json import camera_of, distortion_of, read_json_object
+from framework.datasets.calibration.undistortion import Distortion
+from framework.errors import DataError
+
+KEYS = ("w", "h", "fx", "fy", "cx", "cy", "s")
+
+
+def test_keys_are_in_the_order_of_the_camera() -> None:
+    content = {"s": 1000, "cy": 7, "cx": 8, "fy": 9, "fx": 10, "h": 16, "w": 24.0, "model": "Kinect"}
+    assert camera_of(Path("c.json"), content, KEYS) == (Camera(24, 16, 10, 9, 8, 7), 1000)
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"c\.json could not be read: No such file"):
+        read_json_object(tmp_path / "c.json")
+    (tmp_path / "c.json").write_bytes(b"\xff")
+    with pytest.raises(DataError, match="is not valid JSON"):
+        read_json_object(tmp_path / "c.json")
+
+
+def test_the_distortion_of_a_lens() -> None:
+    assert distortion_of(Path("c.json"), {}) is None
+    content = {"distortion": [0.1, -0.2, 0, 0.001, 1]}
+    assert distortion_of(Path("c.json"), content) == Distortion(k1=0.1, k2=-0.2, p1=0, p2=0.001, k3=1)
+
+
+@pytest.mark.parametrize("value", [0.1, [0.1, 0.2, 0, 0], [0.1] * 8, {"k1": 0.1}, None])
+def test_a_distortion_of_other_than_five_numbers_is_refused(value: object) -> None:
+    with pytest.raises(DataError, match=r"c\.json: distortion must be \[k1, k2, p1, p2, k3\], found"):
+        distortion_of(Path("c.json"), {"distortion": value})
+
+
+def test_a_coefficient_that_is_no_number_is_named() -> None:
+    with pytest.raises(DataError, match=r"c\.json: distortion\[2\] must be a number"):
+        distortion_of(Path("c.json"), {"distortion": [0.1, 0, "0.2", 0, 0]})

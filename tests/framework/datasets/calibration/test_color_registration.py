@@ -1,0 +1,57 @@
+"""Colour moved between two cameras at one place: exact on images whose values are known everywhere."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Camera
+from framework.datasets.calibration.color_registration import ColorRegistration
+from framework.errors import DataError
+
+COLOR = Camera(1296 // 8, 968 // 8, 1170.2 / 8, 1169.1 / 8, 80.5, 60.2)
+DEPTH = Camera(640 // 8, 480 // 8, 577.9 / 8, 576.5 / 8, 39.6, 29.4)
+
+
+def ramp(camera: Camera) -> np.ndarray:
+    """The direction in which each pixel looks, as colour: x / z and y / z, scaled."""
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    return np.stack([128 + 200 * x, 128 + 200 * y, np.full_like(x, 77)], axis=-1)
+
+
+def test_each_pixel_has_the_colour_of_the_direction_in_which_it_looks() -> None:
+    image, registration = np.round(ramp(COLOR)).astype(np.uint8), ColorRegistration(COLOR, DEPTH)
+    found, negative = registration.apply(image), registration.apply(255 - image)
+    assert np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2  # of 255; a shift by one pixel is 2.8
+    both = (found + (255.0 - negative)) / 2  # OpenCV rounds halves up: that cancels
+    assert np.abs((both - ramp(DEPTH))[2:-2, 2:-2].mean(axis=(0, 1))).max() < 0.02
+
+
+def test_the_same_camera_gives_the_same_image() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (*DEPTH.shape, 3)).astype(np.uint8)
+    np.testing.assert_array_equal(ColorRegistration(DEPTH, DEPTH).apply(image), image)
+
+
+def test_a_pixel_is_the_mean_of_what_it_covers() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (48, 64, 3)).astype(np.uint8)
+    double = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    single = double.scaled(0.5)
+    blocks = image.reshape(24, 2, 32, 2, 3).mean(axis=(1, 3))
+    assert np.abs(ColorRegistration(double, single).apply(image) - blocks).max() <= 0.5
+
+
+def test_where_no_colour_was_seen_the_nearest_is_repeated() -> None:
+    wide = Camera(32, 24, 10.0, 10.0, 15.5, 11.5)
+    narrow = Camera(32, 24, 20.0, 20.0, 15.5, 11.5)
+    image = np.zeros((24, 32, 3), np.uint8)
+    image[:, :16], image[:, 16:] = 50, 200
+    found = ColorRegistration(narrow, wide).apply(image)
+    assert (found[:, :8] == 50).all()
+    assert (found[:, 24:] == 200).all()
+
+
+@pytest.mark.parametrize("color", [Camera(32, 24, 9e5, 9e5, 16, 12), Camera(40000, 24, 5000, 30, 16, 12)])
+def test_cameras_that_do_not_belong_together_are_refused_before_anything_is_allocated(color: Camera) -> None:
+    with pytest.raises(DataError, match="cannot be moved"):
+        ColorRegistration(color, DEPTH)

@@ -1,0 +1,187 @@
+"""Depth cameras, by fakes of their libraries: what is asked of these, and what their faults become."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Generator
+from contextlib import closing
+from dataclasses import dataclass
+from itertools import islice
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+from framework.data import Frame
+from framework.datasets.calibration.undistortion import Distortion, Undistortion
+from framework.datasets.cameras import device_frames
+from framework.datasets.cameras.orbbec import Orbbec
+from framework.datasets.cameras.realsense import RealSense
+from framework.errors import ConfigError, DataError, FrameError
+from framework.interfaces import LiveVideo
+from tests.support.scenes.corner_room import CAMERA, CornerRoom
+from tests.support.scenes.fake_cameras import SERIAL, UNIT, FakeCamera, orbbec_module, realsense_module
+
+
+@dataclass(frozen=True)
+class Brand:
+    """A reader, and a fake of its library."""
+
+    name: str
+    reader: type[RealSense] | type[Orbbec]
+    library: str
+    module: Callable[[FakeCamera], ModuleType]
+    depth_size: tuple[int, int]  # that is asked for; 0 = any
+    nothing_there: str  # what is said
+
+    def video(self, **parameters: object) -> LiveVideo:
+        size = {"width": CAMERA.width, "height": CAMERA.height}
+        return self.reader(**size | parameters)  # type: ignore[arg-type]
+
+
+BRANDS = [
+    Brand("realsense", RealSense, "pyrealsense2", realsense_module, (96, 72), "No device connected"),
+    Brand("orbbec", Orbbec, "pyorbbecsdk", orbbec_module, (0, 0), "no device is connected"),
+]
+
+
+@pytest.fixture(params=BRANDS, ids=lambda brand: brand.name)
+def brand(request: pytest.FixtureRequest) -> Brand:
+    brand: Brand = request.param
+    return brand
+
+
+@pytest.fixture
+def device(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> FakeCamera:
+    camera = FakeCamera()
+    monkeypatch.setitem(sys.modules, brand.library, brand.module(camera))
+    return camera
+
+
+def sent(video: LiveVideo, frames: int) -> Generator[Frame]:
+    with closing(video.frames()) as readers:
+        for reader in islice((reader for reader in readers if reader), frames):
+            yield reader()
+
+
+def test_frames_are_the_cameras_registered_to_colour(brand: Brand, device: FakeCamera) -> None:
+    found = list(sent(brand.video(), 3))
+    assert [frame.index for frame in found] == [0, 1, 2]
+    for frame, true in zip(found, CornerRoom(), strict=False):
+        assert frame.camera == CAMERA
+        np.testing.assert_array_equal(frame.color, true.color)
+        np.testing.assert_allclose(frame.depth, true.depth, atol=UNIT)
+    assert device.registered == 3
+    assert not device.running
+
+
+def test_what_is_asked_of_the_device(brand: Brand, device: FakeCamera) -> None:
+    video = brand.video(serial=SERIAL, fps=60)
+    assert video.name == f"{brand.name}_{SERIAL}"
+    assert not device.started, "nothing before frames are asked for"
+    assert len(list(sent(video, 1))) == len(list(sent(video, 1))) == 1
+    for asked in device.started:
+        assert asked["color"] == (96, 72, "rgb", 60)
+        assert asked["depth"] == (*brand.depth_size, "depth", 60)
+    assert len(device.started) == 2
+
+
+def test_far_readings_are_none(brand: Brand, device: FakeCamera) -> None:
+    [frame] = sent(brand.video(max_depth=2.5), 1)
+    assert 2.4 < frame.depth.max() <= 2.5
+    [whole] = sent(brand.video(max_depth=0.0), 1)
+    assert whole.depth.max() > 2.9
+
+
+def test_a_lens_is_undone_where_its_model_is_ours_and_told_where_it_is_not(
+    brand: Brand, device: FakeCamera, caplog: pytest.LogCaptureFixture
+) -> None:
+    device.coeffs = (0.1, -0.05, 0.01, 0.02, 0.001)
+    [as_it_is] = sent(brand.video(), 1)
+    np.testing.assert_array_equal(as_it_is.color, CornerRoom()[0].color)
+    told = f"{brand.name}: its lens distortion, inverse, is of another model than ours and is not undone"
+    assert caplog.messages == [told]
+    device.model = "brown"
+    [undone] = sent(brand.video(), 1)
+    lens = Undistortion(CAMERA, Distortion(*device.coeffs))
+    np.testing.assert_array_equal(undone.color, lens.smooth(CornerRoom()[0].color))
+    np.testing.assert_allclose(undone.depth, lens.exact(CornerRoom()[0].depth), atol=UNIT)
+    assert caplog.messages == [told]
+
+
+def test_a_missing_package_is_one_line(brand: Brand, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, brand.library, None)
+    with pytest.raises(
+        ConfigError, match=rf"^{brand.library}, .* is not there: pip install instancemap\[{brand.name}\]$"
+    ):
+        next(brand.video().frames())
+
+
+def test_a_device_that_is_not_there_is_one_line(brand: Brand, device: FakeCamera) -> None:
+    device.plugged_in = False
+    with pytest.raises(DataError, match=f"a device with 96x72 at 30 Hz could not be started: {brand.nothing_there}$"):
+        next(brand.video().frames())
+
+
+@pytest.mark.parametrize(
+    ("parameters", "said"), [({"serial": "999"}, "the device 999 with 96x72"), ({"width": 640}, "a device with 640x72")]
+)
+def test_a_device_that_cannot_do_that_is_one_line(
+    brand: Brand, device: FakeCamera, parameters: dict[str, object], said: str
+) -> None:
+    with pytest.raises(DataError, match=f"{said} at 30 Hz could not be started: ") as caught:
+        next(brand.video(**parameters).frames())
+    assert "\n" not in str(caught.value)
+    assert not device.running
+
+
+def test_a_cable_that_is_pulled_out_ends_it(brand: Brand, device: FakeCamera, monkeypatch: pytest.MonkeyPatch) -> None:
+    device.unplugged_at = 2
+    with pytest.raises(DataError, match="Device disconnected"):
+        list(sent(brand.video(), 3))
+    assert not device.running
+    device.unplugged_at = -1
+    monkeypatch.setattr(device_frames, "LONGEST_SILENCE", 0.3)
+    with pytest.raises(DataError, match=r"no frame has come for 0\.3 s"):
+        list(sent(brand.video(), 9))
+    assert not device.running
+
+
+def test_a_camera_may_be_silent_for_a_while_again_and_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=100.0, monotonic=lambda: clock.now)
+    monkeypatch.setattr(device_frames, "time", clock)
+    said: list[str | None] = []
+    coming = iter(["first", None, "second", None, "third", None, None])
+    with pytest.raises(DataError, match="it: no frame has come for 5 s"):  # noqa: PT012
+        for images in device_frames.images_of("it", lambda: next(coming)):
+            said.append(images)
+            clock.now += 3.0
+    assert said == ["first", None, "second", None, "third", None]
+
+
+def test_it_says_something_while_nothing_comes(brand: Brand, device: FakeCamera) -> None:
+    device.frames = 0
+    with closing(brand.video().frames()) as readers:
+        assert [next(readers), next(readers)] == [None, None]
+
+
+def test_a_frame_without_depth_is_of_no_use_and_the_next_one_is(brand: Brand, device: FakeCamera) -> None:
+    device.without_depth = 1
+    with closing(brand.video().frames()) as readers:
+        first, second, third = (reader for reader in (next(readers) for _ in range(3)) if reader)
+    with pytest.raises(FrameError, match="frame 1: the camera has sent no depth"):
+        second()
+    assert [first().index, third().index] == [0, 2]
+
+
+def test_orbbec_waits_for_a_first_depth(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its units are known from there."""
+    monkeypatch.setitem(sys.modules, "pyorbbecsdk", orbbec_module(FakeCamera(without_depth=0)))
+    [frame] = sent(BRANDS[1].video(), 1)
+    np.testing.assert_allclose(frame.depth, CornerRoom()[1].depth, atol=UNIT)
+
+
+@pytest.mark.parametrize("parameter", [{"width": 0}, {"height": 10_000}, {"fps": 0}, {"max_depth": -1.0}], ids=str)
+def test_parameters_have_bounds(brand: Brand, parameter: dict[str, object]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(parameter))):
+        brand.video(**parameter)

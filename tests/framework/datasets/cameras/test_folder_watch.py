@@ -1,0 +1,277 @@
+"""A folder that fills while it is watched: whole frames only, in order, and nothing that came is without a word."""
+
+from __future__ import annotations
+
+import json
+import os
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+
+from framework.data import Frame, Pose
+from framework.datasets.cameras import folder_watch
+from framework.datasets.cameras.folder_watch import FolderWatch
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import ConfigError, DataError, FrameError
+from framework.interfaces import FrameReader, PoseTracker, SceneMap
+from plugins.detectors.none import NoDetections
+from tests.framework.test_pipeline import mapped, pipeline
+from tests.support.scenes.corner_room import CAMERA, CornerRoom, pose_at
+
+CALIBRATION = {"width": CAMERA.width, "height": CAMERA.height, "fx": 90, "fy": 90, "cx": 47.5, "cy": 35.5}
+ROOM = CornerRoom(frames=30)
+
+
+def encoded(k: int) -> dict[str, bytes]:
+    """The bytes of both files of frame k."""
+    frame = ROOM[k % len(ROOM)]
+    color = cv2.imencode(".jpg", frame.color[..., ::-1])[1]
+    return {
+        f"color/{k:06d}.jpg": color.tobytes(),
+        f"depth/{k:06d}.png": cv2.imencode(".png", (frame.depth * 1000).astype(np.uint16))[1].tobytes(),
+    }
+
+
+def write(folder: Path, *numbers: int) -> None:
+    for k in numbers:
+        for name, data in encoded(k).items():
+            (folder / name).write_bytes(data)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for name in ("color", "depth"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000}))
+    return tmp_path
+
+
+class Watched:
+    """What a watch has said since one last asked."""
+
+    def __init__(self, folder: Path, **parameters: float) -> None:
+        self.over = False
+        self._frames = FolderWatch(folder, poll_interval=0.001, **parameters).frames()
+
+    def readers(self) -> Iterator[FrameReader]:
+        """Those of one look, to the None after it."""
+        while (reader := next(self._frames, self)) is not None:
+            if isinstance(reader, Watched):
+                self.over = True
+                return
+            yield reader
+
+    def look(self) -> list[int | str]:
+        """The frames that can be read by their numbers, of the others what is said."""
+        return [outcome(reader) for reader in self.readers()]
+
+
+def outcome(reader: FrameReader) -> int | str:
+    try:
+        return reader().index
+    except FrameError as error:
+        assert "\n" not in str(error)
+        return str(error)
+
+
+def test_frames_are_those_of_a_recording_of_the_same_files(folder: Path) -> None:
+    watched, before = Watched(folder), time.time()
+    assert watched.look() == []
+    found: list[Frame] = []
+    for k in range(3):
+        write(folder, k)
+        found += [reader() for reader in watched.readers()]
+    for live, recorded in zip(found, RgbdFolder(folder), strict=True):
+        assert (live.index, live.camera) == (recorded.index, recorded.camera)
+        np.testing.assert_array_equal(live.color, recorded.color)
+        np.testing.assert_array_equal(live.depth, recorded.depth)
+    times = [before, *(frame.timestamp for frame in found), time.time()]
+    assert times == sorted(set(times))
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.999])
+@pytest.mark.parametrize("late", ["color", "depth"])
+def test_a_frame_counts_when_both_of_its_files_are_whole(folder: Path, late: str, share: float) -> None:
+    watched, files = Watched(folder), encoded(4)
+    [slow] = [name for name in files if name.startswith(late)]
+    [fast] = files.keys() - {slow}
+    (folder / fast).write_bytes(files[fast])
+    assert watched.look() == []
+    (folder / slow).write_bytes(files[slow][: int(share * len(files[slow]))])
+    assert watched.look() == watched.look() == []
+    with (folder / slow).open("ab") as file:
+        file.write(files[slow][int(share * len(files[slow])) :])
+    assert watched.look() == [4]
+    assert watched.look() == []
+
+
+def test_a_frame_that_is_overtaken_is_told_once(folder: Path) -> None:
+    watched, files = Watched(folder), encoded(1)
+    color, depth = files
+    write(folder, 0)
+    (folder / color).write_bytes(files[color])
+    assert watched.look() == [0]
+    write(folder, 2)
+    missing = f"{folder / color}: the other image of this frame was not there when frame 2 was"
+    assert watched.look() == [missing, 2]
+    (folder / depth).write_bytes(files[depth])
+    assert watched.look() == []
+    (folder / "depth/000003.png").write_bytes(files[depth][:99])
+    (folder / "color/000003.jpg").write_bytes(files[color])
+    assert watched.look() == []
+    write(folder, 4)
+    assert watched.look() == [
+        f"{folder}/depth/000003.png is truncated: it ends after 99 bytes without its end marker",
+        4,
+    ]
+
+
+def test_numbers_that_go_back_are_told(folder: Path) -> None:
+    watched = Watched(folder)
+    write(folder, 7)
+    assert watched.look() == [7]
+    write(folder, 3)
+    assert watched.look() == [f"{folder}/color/000003.jpg came after frame 7"]
+    write(folder, 9)
+    assert watched.look() == [9]
+
+
+def test_what_was_there_before_comes_first_and_the_newest_last(folder: Path) -> None:
+    write(folder, *range(12))
+    watched = Watched(folder)
+    assert watched.look() == list(range(12))
+
+
+def test_files_may_be_removed(folder: Path) -> None:
+    watched = Watched(folder)
+    write(folder, 0, 1)
+    first, second = watched.readers()
+    assert outcome(first) == 0
+    (folder / "color/000001.jpg").unlink()
+    assert "color/000001.jpg could not be read: No such file" in str(outcome(second))
+    for path in (folder / "depth").iterdir():
+        path.unlink()
+    write(folder, 2)
+    assert watched.look() == [2]
+
+
+def test_other_files_are_no_frames(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+    watched = Watched(folder)
+    for name in (".000000.jpg", "000000.jpg.part", "preview.jpg", f"{2**53}.jpg"):
+        (folder / "color" / name).write_bytes(b"?")
+    assert watched.look() == watched.look() == []
+    assert sorted(message.partition(" is no frame")[0] for message in caplog.messages) == [
+        f"{folder}/color/{2**53}.jpg",
+        f"{folder}/color/preview.jpg",
+    ]
+    for k in (4, 3):
+        (folder / "color" / f"1305031102.1753{k}.jpg").write_bytes(b"?")
+        (folder / "depth" / f"130503110{k}.175304.png").write_bytes(b"?")
+    with pytest.raises(DataError, match="differ in more than one number"):
+        watched.look()
+
+
+def test_images_of_another_size_are_of_no_use(folder: Path) -> None:
+    (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, "width": 97}))
+    write(folder, 0)
+    assert str(*Watched(folder).look()).endswith("says 97x72; colour, depth and camera must agree")
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_it_ends_when_it_is_told_with_what_was_there(folder: Path, half: bool) -> None:
+    watched = Watched(folder)
+    assert watched.look() == []
+    write(folder, 5)
+    if half:
+        (folder / "depth/000006.png").write_bytes(b"?")
+    (folder / "end").touch()
+    left = [f"{folder}/depth/000006.png: the other image of this frame was not there in the end"] if half else []
+    assert watched.look() == [5, *left]
+    assert watched.over
+
+
+def test_it_ends_when_nothing_comes_for_long(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = SimpleNamespace(now=100.0, time=time.time, sleep=lambda _: None, monotonic=lambda: clock.now)
+    monkeypatch.setattr(folder_watch, "time", clock)
+    watched = Watched(folder, idle_timeout=5.0)
+    for k in range(3):
+        write(folder, k)
+        assert watched.look() == [k]
+        clock.now += 4.0
+        assert watched.look() == []
+    assert not watched.over
+    clock.now += 2.0
+    assert watched.look() == []
+    assert watched.over
+
+
+def test_it_waits_for_its_camera(folder: Path) -> None:
+    whole = (folder / "camera.json").read_text()
+    (folder / "camera.json").unlink()
+    write(folder, 0)
+    watched = Watched(folder)
+    assert watched.look() == []
+    (folder / "camera.json").write_text(whole[:20])
+    assert watched.look() == []
+    (folder / "camera.json").write_text(whole)
+    assert watched.look() == [0]
+
+
+@pytest.mark.parametrize(
+    ("text", "said"), [(None, "No such file"), ("{", "not valid JSON"), ("{}", "'width' is missing")]
+)
+def test_a_camera_that_does_not_come_is_an_error(folder: Path, text: str | None, said: str) -> None:
+    (folder / "camera.json").unlink()
+    if text is not None:
+        (folder / "camera.json").write_text(text)
+    watched = Watched(folder, camera_timeout=0)
+    with pytest.raises(DataError, match=said):  # noqa: PT012
+        while True:
+            watched.look()
+
+
+@pytest.mark.parametrize(
+    "parameter",
+    [{"idle_timeout": -1}, {"camera_timeout": float("nan")}, {"poll_interval": 0.2}, {"max_depth": -1}],
+    ids=str,
+)
+def test_parameters_have_bounds(folder: Path, parameter: dict[str, float]) -> None:
+    with pytest.raises(ConfigError, match=next(iter(parameter))):
+        FolderWatch(folder, **parameter)
+
+
+@dataclass
+class Known(PoseTracker):
+    """By the frame's number."""
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        return Pose(pose_at(frame.index))
+
+
+def test_a_folder_that_is_written_is_mapped(folder: Path) -> None:
+    """By a writer that is slow, writes its files in place, and ends."""
+
+    def writer() -> None:
+        for k in range(len(ROOM)):
+            for name, data in encoded(k).items():
+                with (folder / name).open("wb", buffering=0) as file:
+                    for part in range(0, len(data), 2000):
+                        file.write(data[part : part + 2000])
+                        time.sleep(0.0005)
+        os.close(os.open(folder / "end", os.O_CREAT))
+
+    writing = threading.Thread(target=writer)
+    writing.start()
+    result = pipeline(detector=NoDetections(), tracker=Known()).run(FolderWatch(folder))
+    writing.join()
+    assert result.live is not None
+    assert result.frames + result.live.frames_dropped == len(ROOM)
+    assert result.frames_skipped == 0
+    assert len(mapped(result).vertices) == result.frames > 0

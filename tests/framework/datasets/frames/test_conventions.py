@@ -1,0 +1,135 @@
+"""Recordings whose poses, units or image pairs are not as their format says, read as they are meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from framework.data import Float64, UInt8, UInt16
+from framework.datasets.frames.conventions import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
+from framework.datasets.frames.stored_frames import RecordedFrame
+from framework.datasets.tum_rgbd import TumRgbd
+from framework.errors import ConfigError, FrameError
+from framework.geometry import inverse
+
+
+def some_pose(seed: int) -> Float64:
+    chosen = np.random.default_rng(seed)
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    T[:3, 3] = chosen.normal(size=3)
+    return T
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_each_reading_finds_the_pose_that_was_meant(seed: int) -> None:
+    T_world_camera = some_pose(seed)
+    np.testing.assert_array_equal(PoseReading().pose(T_world_camera), T_world_camera)
+    inverted = PoseReading(pose_kind=PoseKind.T_CAMERA_WORLD)
+    np.testing.assert_allclose(inverted.pose(inverse(T_world_camera)), T_world_camera, atol=1e-12)
+    in_mm = T_world_camera.copy()
+    in_mm[:3, 3] *= 1000
+    np.testing.assert_allclose(PoseReading(pose_unit=0.001).pose(in_mm), T_world_camera, atol=1e-12)
+    x, y, z, w = Rotation.from_matrix(T_world_camera[:3, :3]).as_quat()
+    misread = T_world_camera.copy()
+    misread[:3, :3] = Rotation.from_quat((w, x, y, z)).as_matrix()  # the file's w x y z, taken for x y z w
+    scalar_first = PoseReading(quaternion_order=QuaternionOrder.WXYZ)
+    np.testing.assert_allclose(scalar_first.pose(misread), T_world_camera, atol=1e-12)
+
+
+def test_the_axes_are_those_that_the_systems_say() -> None:
+    """What is ahead, to the right and below in the image, in the axes of each."""
+    right, below, ahead = np.eye(3)
+    for axes, expected in {
+        CameraAxes.OPENCV: ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        CameraAxes.OPENGL: ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+        CameraAxes.ROS: ((0, -1, 0), (0, 0, -1), (1, 0, 0)),
+    }.items():
+        np.testing.assert_array_equal([axes.R_axes_camera @ v for v in (right, below, ahead)], expected)
+        assert np.linalg.det(axes.R_axes_camera) == pytest.approx(1)
+        T_world_axes = some_pose(3)
+        T_world_camera = PoseReading(camera_axes=axes).pose(T_world_axes)
+        np.testing.assert_allclose(T_world_camera[:3, :3] @ ahead, T_world_axes[:3, :3] @ np.array(expected[2]))
+        np.testing.assert_array_equal(T_world_camera[:3, 3], T_world_axes[:3, 3])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"depth_scale": 0.5}, "dataset.depth_scale"),
+        ({"depth_scale": -1.0}, "depth_scale"),
+        ({"depth_delay": 1001}, "delay"),
+    ],
+)
+def test_impossible_readings_are_refused(wrong: dict[str, float], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        DepthReading(**wrong)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="pose_unit"):
+        PoseReading(pose_unit=0.0)
+    with pytest.raises(ConfigError, match="pose_delay"):
+        PoseReading(pose_delay=-1001)
+
+
+class Image:
+    """One that says which it is."""
+
+    def __init__(self, k: int) -> None:
+        self.color_name, self.depth_name = f"color {k}", f"depth {k}"
+        self.k = k
+
+    def color(self) -> UInt8:
+        return np.full((2, 2, 3), self.k, np.uint8)
+
+    def depth(self) -> UInt16:
+        return np.full((2, 2), self.k, np.uint16)
+
+
+@pytest.mark.parametrize("delay", [-2, 0, 1])
+def test_a_delay_pairs_colour_with_the_depth_that_belongs_to_it(delay: int) -> None:
+    frames = DepthReading(depth_delay=delay).frames([RecordedFrame(Image(k), k / 30) for k in range(5)])
+    for k, frame in enumerate(frames):
+        if 0 <= k + delay < 5:
+            assert not frame.fault
+            assert (frame.images.color()[0, 0, 0], frame.images.depth()[0, 0]) == (k, k + delay)
+            assert (frame.images.color_name, frame.images.depth_name) == (f"color {k}", f"depth {k + delay}")
+            assert frame.timestamp == k / 30
+        else:
+            assert f"{delay} frames away" in frame.fault
+
+
+@pytest.mark.parametrize("delay", [-2, 0, 1])
+def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
+    stored = [RecordedFrame(Image(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
+    stored[3] = RecordedFrame(Image(3), 3 / 30, fault="line 3 is no pose")
+    for k, frame in enumerate(PoseReading(pose_delay=delay).frames(stored)):
+        assert (frame.images.color()[0, 0, 0], frame.timestamp) == (k, k / 30)
+        if not 0 <= k + delay < 5:
+            assert frame.fault == f"no pose is {delay} frames away"
+            assert frame.T_world_camera is None
+        elif 3 in (k, k + delay):
+            assert frame.fault == "line 3 is no pose"
+        else:
+            assert not frame.fault
+            np.testing.assert_array_equal(frame.T_world_camera, some_pose(k + delay))
+            assert frame.up is stored[k].up
+
+
+def test_a_recording_is_read_as_it_is_meant() -> None:
+    desk = {"root": Path("data/desk"), "scene": "rgbd_dataset_freiburg1_rpy"}
+    plain = TumRgbd(**desk)  # type: ignore[arg-type]
+    meant = TumRgbd(
+        **desk,  # type: ignore[arg-type]
+        pose_reading=PoseReading(PoseKind.T_CAMERA_WORLD, CameraAxes.OPENGL, pose_delay=2),
+        depth_reading=DepthReading(depth_scale=10_000, depth_delay=1),
+    )
+    first, then = plain[2], meant[0]
+    assert first.T_world_camera is not None
+    assert then.T_world_camera is not None
+    np.testing.assert_allclose(then.T_world_camera, inverse(first.T_world_camera) @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    np.testing.assert_array_equal(then.color, plain[0].color)
+    np.testing.assert_allclose(then.depth, plain[1].depth / 2, rtol=1e-6)
+    with pytest.raises(FrameError, match="no pose is 2 frames away"):
+        meant[len(meant) - 1]

@@ -1,0 +1,173 @@
+"""Models by id, with a hub of the test's own."""
+
+import hashlib
+import json
+import shutil
+import threading
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from framework.detection.hub.hub_model import TOKENIZER, find_model
+from framework.errors import DataError
+
+constants = pytest.importorskip("huggingface_hub.constants")
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+WEIGHTS = bytes(range(256)) * 5000
+FILES = {
+    "config.json": b"{}",
+    "preprocessor_config.json": b"{ }",
+    "model.safetensors": WEIGHTS,
+    "README.md": b"read me",
+}
+
+
+@pytest.fixture
+def hub(tmp_path, monkeypatch):
+    """Serves the model somebody/something as huggingface.co does, and notes what it was asked for."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_HEAD(self):
+            self.answer(send=False)
+
+        def do_GET(self):
+            self.answer(send=True)
+
+        def answer(self, send):
+            path = self.path.partition("?")[0]
+            name = path.removeprefix("/somebody/something/resolve/main/")
+            if path == "/api/models/somebody/something/revision/main":
+                self.reply(json.dumps(listing(http.files)).encode(), send)
+            elif name in http.files:
+                http.sent += [name] * send
+                served = http.served.get(name, http.files[name])
+                self.reply(served, send, ETag=digest(http.files[name]), **{"X-Repo-Commit": COMMIT})
+            else:
+                self.send_error(404)
+
+        def reply(self, content, send, **headers):
+            self.send_response(200)
+            for key, value in {"Content-Length": str(len(content)), **headers}.items():
+                self.send_header(key, value)
+            self.end_headers()
+            if send:
+                self.wfile.write(content)
+
+        def log_message(self, *_):
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as http:
+        http.files, http.served, http.sent = dict(FILES), {}, []
+        thread = threading.Thread(target=http.serve_forever)
+        thread.start()
+        http.address = f"http://127.0.0.1:{http.server_port}"
+        monkeypatch.setattr(constants, "ENDPOINT", http.address)
+        template = http.address + "/{repo_id}/resolve/{revision}/{filename}"
+        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", template)
+        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", False)
+        for name in ("INSTANCEMAP_OFFLINE", "HF_HUB_OFFLINE", "TRANSFORMERS_OFFLINE"):
+            monkeypatch.delenv(name, raising=False)
+        monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+        yield http
+        http.shutdown()
+        thread.join()
+
+
+def digest(content):
+    return hashlib.sha256(content).hexdigest()
+
+
+def listing(files):
+    """What the hub says of a model: a large file has a SHA-256."""
+    siblings = []
+    for name, content in files.items():
+        large = (
+            {"lfs": {"sha256": digest(content), "size": len(content), "pointerSize": 130}}
+            if len(content) > 1000
+            else {}
+        )
+        siblings.append({"rfilename": name, "size": len(content), "blobId": "0" * 40, **large})
+    return {"id": "somebody/something", "sha": COMMIT, "tags": ["license:apache-2.0"], "siblings": siblings}
+
+
+def fault(model="somebody/something"):
+    with pytest.raises(DataError) as caught:
+        find_model(model, "main")
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_a_model_is_downloaded_once_with_its_licence_and_size_said(hub, caplog):
+    with caplog.at_level("INFO", "framework"):
+        folder = find_model("somebody/something", "main")
+    assert f"downloading somebody/something, 1 MB, licence apache-2.0, from {hub.address} into" in caplog.text
+    assert (folder / "model.safetensors").read_bytes() == WEIGHTS
+    assert folder.name == COMMIT
+    wanted = ["config.json", "preprocessor_config.json", "model.safetensors"]
+    assert hub.sent == wanted
+    hub.server_close()  # whether it answers does not matter any more
+    assert find_model("somebody/something", "main") == folder
+    assert hub.sent == wanted
+
+
+def test_weights_in_several_files(hub):
+    hub.files["model-00001-of-00002.safetensors"] = hub.files.pop("model.safetensors")
+    hub.files["model-00002-of-00002.safetensors"] = b"more"
+    names = {"a": "model-00001-of-00002.safetensors", "b": "model-00002-of-00002.safetensors"}
+    hub.files["model.safetensors.index.json"] = json.dumps({"weight_map": names}).encode()
+    folder = find_model("somebody/something", "main")
+    assert {file.name for file in folder.iterdir()} == {*hub.files} - {"README.md"}
+    (folder / "model-00002-of-00002.safetensors").resolve().unlink()  # as one that was interrupted
+    hub.sent.clear()
+    assert find_model("somebody/something", "main") == folder
+    assert hub.sent == ["model-00002-of-00002.safetensors"]
+    (folder / "model.safetensors.index.json").write_text("[]")
+    assert f"is damaged: delete {folder.parents[1]}, and run again" in fault()
+
+
+def test_a_tokenizer_comes_in_one_file_or_in_the_two_of_older_models(hub):
+    with pytest.raises(DataError, match=r"has no tokenizer\.json and no tokenizer_config\.json"):
+        find_model("somebody/something", "main", TOKENIZER)
+    hub.files |= dict.fromkeys(("vocab.json", "merges.txt", "tokenizer_config.json"), b"{}")
+    folder = find_model("somebody/something", "main", TOKENIZER)
+    assert {file.name for file in folder.iterdir()} == {*hub.files} - {"README.md"}
+    hub.sent.clear()
+    assert find_model("somebody/something", "main", TOKENIZER) == folder
+    assert not hub.sent
+    shutil.rmtree(folder.parents[1])
+    hub.files["tokenizer.json"] = b"{}"
+    names = {file.name for file in find_model("somebody/something", "main", TOKENIZER).iterdir()}
+    assert names == {*hub.files} - {"README.md", "vocab.json", "merges.txt"}
+
+
+def test_what_was_not_published_is_not_kept(hub):
+    hub.served["model.safetensors"] = bytes(len(WEIGHTS))
+    assert "model.safetensors is not what was published" in fault()
+    hub.served.clear()
+    assert (find_model("somebody/something", "main") / "model.safetensors").read_bytes() == WEIGHTS
+
+
+@pytest.mark.parametrize("value", ["1", "true"])
+def test_offline_nothing_is_asked_for(hub, monkeypatch, value):
+    monkeypatch.setenv("HF_HUB_OFFLINE", value)
+    assert "HF_HUB_OFFLINE forbids to download it: unset that, or give a local folder" in fault()
+    assert not hub.sent
+    monkeypatch.setenv("HF_HUB_OFFLINE", "0")
+    folder = find_model("somebody/something", "main")
+    monkeypatch.setenv("HF_HUB_OFFLINE", value)
+    assert find_model("somebody/something", "main") == folder
+
+
+def test_faults_are_one_line(hub):
+    assert "check the name and the network" in fault("somebody/else")
+    assert "is neither a folder nor a model id" in fault("no//such")
+    del hub.files["preprocessor_config.json"]
+    assert "has no preprocessor_config.json" in fault()
+    del hub.files["model.safetensors"]
+    assert "has no preprocessor_config.json and no model.safetensors" in fault()
+
+
+def test_a_folder_is_itself(tmp_path):
+    assert find_model(str(tmp_path), "main") == tmp_path

@@ -1,0 +1,42 @@
+"""Torch's threads, as threads of the pipeline find them."""
+
+import threading
+
+import torch
+
+from framework.detection.runtimes.device import one_torch_thread
+
+PATIENCE_S = 10.0
+
+
+def test_threads_that_take_one_torch_thread_at_once_leave_the_number_as_it_was():
+    """Torch gives the number that was set last to threads that are new to it, or have not asked yet."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    first_is_in, second_is_in = threading.Event(), threading.Event()
+    seen = []
+
+    def come_and_leave_first() -> None:
+        with one_torch_thread():
+            seen.append(torch.get_num_threads())
+            first_is_in.set()
+            assert second_is_in.wait(PATIENCE_S)
+
+    def come_and_leave_second() -> None:
+        assert first_is_in.wait(PATIENCE_S)
+        with one_torch_thread():
+            second_is_in.set()
+            first.join(PATIENCE_S)
+            seen.append(torch.get_num_threads())
+
+    first, second = (threading.Thread(target=work) for work in (come_and_leave_first, come_and_leave_second))
+    new = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+    try:
+        for thread in (first, second):
+            thread.start()
+        second.join(2 * PATIENCE_S)
+        new.start()
+        new.join()
+        assert (seen, torch.get_num_threads()) == ([1, 1, 2], 2)
+    finally:
+        torch.set_num_threads(before)

@@ -1,0 +1,174 @@
+"""ONNX networks: what they compute, and whatever does not fit is said in one line."""
+
+import sys
+
+import cv2
+import numpy as np
+import pytest
+from onnx import TensorProto, helper, numpy_helper
+
+from framework.detection.hub.weights_file import find_file
+from framework.detection.runtimes.onnx_network import OnnxNetwork
+from framework.errors import ConfigError, DataError
+from tests.support.networks.tiny_networks import constant_network, doubling_network, save
+
+
+@pytest.mark.parametrize(
+    ("shape", "element", "dtype"),
+    [
+        ((1, 3, 4, 6), TensorProto.FLOAT, np.float32),
+        ((1, 4, 6, 3), TensorProto.FLOAT, np.float32),
+        ((1, 4, 6, 3), TensorProto.UINT8, np.uint8),
+    ],
+)
+def test_the_image_arrives_as_it_is(tmp_path, shape, element, dtype):
+    network = OnnxNetwork(doubling_network(tmp_path / "n.onnx", shape, element), "", "cpu", 0)
+    image = np.random.default_rng(1).integers(0, 256, (4, 6, 3)).astype(dtype)
+    assert network.shape == (4, 6)
+    (doubled,) = network(image).values()
+    expected = 2.0 * image[None] if network.channels_last else 2.0 * image.transpose(2, 0, 1)[None]
+    np.testing.assert_array_equal(doubled, expected)
+
+
+def test_outputs_keep_their_names(tmp_path):
+    rng = np.random.default_rng(2)
+    outputs = {"scores": rng.random((1, 5)), "boxes": rng.random((1, 5, 4)), "last": rng.random((1, 2, 3, 4))}
+    network = OnnxNetwork(constant_network(tmp_path / "n.onnx", (1, 3, 8, 8), outputs), "", "cpu", 0)
+    found = network(np.zeros((8, 8, 3), np.float32))
+    assert list(found) == list(outputs)
+    for name, value in outputs.items():
+        assert found[name].dtype == np.float32
+        np.testing.assert_array_equal(found[name], value.astype(np.float32))
+
+
+def test_the_size_of_an_input_that_takes_any(tmp_path):
+    path = doubling_network(tmp_path / "n.onnx", (1, 3, "h", "w"))
+    network = OnnxNetwork(path, "", "cpu", 32)
+    assert network.shape == (32, 32)
+    assert network(np.ones((32, 32, 3), np.float32))["doubled"].shape == (1, 3, 32, 32)
+    with pytest.raises(ConfigError, match=r"detector\.input_size must be given in px: .*\(1, 3, any, any\) float32"):
+        OnnxNetwork(path, "", "cpu", 0)
+    fixed = doubling_network(tmp_path / "f.onnx", (1, 3, 8, 8))
+    with pytest.raises(ConfigError, match=r"detector\.input_size must be 0 or the network's own, found 32"):
+        OnnxNetwork(fixed, "", "cpu", 32)
+
+
+def test_what_to_install_where_onnxruntime_is_missing_is_said(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(ConfigError, match=r"pip install instancemap\[onnx\]"):
+        OnnxNetwork(doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8)), "", "cpu", 0)
+
+
+def test_it_takes_as_many_threads_as_opencv(tmp_path, monkeypatch):
+    import onnxruntime
+
+    taken = []
+    start = onnxruntime.InferenceSession
+    monkeypatch.setattr(
+        onnxruntime, "InferenceSession", lambda p, o, **k: taken.append(o.intra_op_num_threads) or start(p, o, **k)
+    )
+    threads = cv2.getNumThreads()
+    try:
+        cv2.setNumThreads(1)
+        OnnxNetwork(doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8)), "", "cpu", 0)
+    finally:
+        cv2.setNumThreads(threads)
+    assert taken == [1]
+
+
+def test_cuda_where_there_is_none_is_refused(tmp_path):
+    import onnxruntime
+
+    if "CUDAExecutionProvider" in onnxruntime.get_available_providers():
+        pytest.skip("onnxruntime has CUDA here")
+    path = doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8))
+    with pytest.raises(ConfigError, match=r"detector\.device must be cpu or auto .*, found cuda"):
+        OnnxNetwork(path, "", "cuda", 0)
+
+
+def test_files_that_are_not_it(tmp_path):
+    with pytest.raises(DataError, match=r"detector\.weights: there is no file .*absent\.onnx"):
+        find_file(tmp_path / "absent.onnx")
+    path = doubling_network(tmp_path / "n.onnx", (1, 3, 8, 8))
+    with pytest.raises(DataError, match=r"n\.onnx has the sha256 [0-9a-f]{64}, expected 0{64}"):
+        OnnxNetwork(path, "0" * 64, "cpu", 0)
+    sha256 = OnnxNetwork(path, "", "cpu", 0).sha256
+    assert OnnxNetwork(path, sha256.upper(), "cpu", 0).sha256 == sha256
+    path.write_bytes(b"no network")
+    with pytest.raises(DataError, match=r"n\.onnx is not an ONNX file"):
+        OnnxNetwork(path, "", "cpu", 0)
+
+
+def test_a_network_that_onnxruntime_refuses_is_named(tmp_path):
+    image = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 8, 8))
+    node = helper.make_node("NoSuchThing", ["images"], ["y"], domain="nobody")
+    graph = helper.make_graph(
+        [node], "g", [image], [helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 3, 8, 8))]
+    )
+    path = tmp_path / "n.onnx"
+    path.write_bytes(
+        helper.make_model(
+            graph, opset_imports=[helper.make_opsetid("", 13), helper.make_opsetid("nobody", 1)]
+        ).SerializeToString()
+    )
+    with pytest.raises(DataError, match=r"n\.onnx is not an ONNX file that onnxruntime can load: ") as refused:
+        OnnxNetwork(path, "", "cpu", 0)(np.zeros((8, 8, 3), np.float32))
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 8, 8), (2, 3, 8, 8), (3, 8, 8)])
+def test_an_input_that_is_no_image_is_refused(tmp_path, shape):
+    with pytest.raises(DataError, match="expected one image"):
+        OnnxNetwork(doubling_network(tmp_path / "n.onnx", shape), "", "cpu", 0)
+
+
+def test_an_input_of_another_type_is_refused(tmp_path):
+    path = doubling_network(tmp_path / "n.onnx", (1, 4, 4, 3), TensorProto.BOOL)
+    with pytest.raises(DataError, match=r"one of float32, float16, uint8, found images \(1, 4, 4, 3\) tensor\(bool\)"):
+        OnnxNetwork(path, "", "cpu", 0)
+
+
+def test_weights_that_are_listed_as_inputs_are_none(tmp_path):
+    """As they had to be before version 4 of the format."""
+    image, weight = (helper.make_tensor_value_info(n, TensorProto.FLOAT, (1, 3, 4, 4)) for n in ("images", "weight"))
+    path = save(
+        tmp_path / "n.onnx",
+        [helper.make_node("Add", ["images", "weight"], ["y"])],
+        [weight, image],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 3, 4, 4))],
+        [numpy_helper.from_array(np.ones((1, 3, 4, 4), np.float32), "weight")],
+    )
+    assert OnnxNetwork(path, "", "cpu", 0)(np.ones((4, 4, 3), np.float32))["y"].max() == 2
+
+
+def test_whatever_is_cut_off_or_mixed_up_it_answers_in_one_line(tmp_path):
+    path = constant_network(tmp_path / "n.onnx", (1, 3, 4, 4), {"y": np.zeros((2, 4))})
+    content = path.read_bytes()
+    rng = np.random.default_rng(0)
+    damaged = [content[:n] for n in range(0, len(content) - 1, 3)]
+    damaged += [rng.integers(0, 256, 64, np.uint8).tobytes() for _ in range(300)]
+    refused = 0
+    for part in damaged:
+        path.write_bytes(part)
+        try:
+            OnnxNetwork(path, "", "cpu", 0)
+        except DataError as error:
+            assert str(error).startswith(f"{path} is not an ONNX file that onnxruntime can load: ")
+            assert "\n" not in str(error)
+            refused += 1
+    assert refused > 0.9 * len(damaged)
+
+
+def test_numbers_that_are_not_finite_are_an_error(tmp_path):
+    image = helper.make_tensor_value_info("images", TensorProto.FLOAT, (1, 3, 4, 4))
+    path = save(
+        tmp_path / "n.onnx",
+        [helper.make_node("Log", ["images"], ["y"])],
+        [image],
+        [helper.make_tensor_value_info("y", TensorProto.FLOAT, (1, 3, 4, 4))],
+        [],
+    )
+    network = OnnxNetwork(path, "", "cpu", 0)
+    network(np.ones((4, 4, 3), np.float32))
+    with pytest.raises(DataError, match="the output y holds values that are not finite"):
+        network(np.zeros((4, 4, 3), np.float32))

@@ -1,0 +1,127 @@
+"""What makes two detectors the same."""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+import pytest
+
+from framework.detection.stored import fingerprint as module
+from framework.detection.stored.fingerprint import content_hash, fingerprint
+from framework.errors import ConfigError
+
+
+class Color(Enum):
+    RED = 1
+    BLUE = 2
+
+
+@dataclass
+class Network:
+    """A detector's parameters."""
+
+    weights: Path = Path()
+    threshold: float = 0.5
+    color: Color = Color.RED
+    device: str = "cpu"
+    labels: str = "coco"
+
+
+@dataclass
+class Other(Network):
+    pass
+
+
+def test_equal_ones_are_equal() -> None:
+    assert fingerprint(Network()) == fingerprint(Network())
+
+
+@pytest.mark.parametrize("changed", [Network(threshold=0.5000001), Network(color=Color.BLUE), Other()])
+def test_class_and_parameters_count(changed: Network) -> None:
+    assert fingerprint(changed) != fingerprint(Network())
+
+
+def test_the_bytes_of_a_file_count_and_its_name_does_not(tmp_path: Path) -> None:
+    for name, content in (("a.npz", b"weights"), ("b.npz", b"weights"), ("c.npz", b"Weights")):
+        (tmp_path / name).write_bytes(content)
+    a, b, c = (fingerprint(Network(tmp_path / name)) for name in ("a.npz", "b.npz", "c.npz"))
+    assert a == b != c
+    assert a != fingerprint(Network())
+
+
+def test_every_file_of_a_folder_counts_with_its_name(tmp_path: Path) -> None:
+    folder = tmp_path / "weights"
+    (folder / "deep").mkdir(parents=True)
+    (folder / "deep" / "a").write_bytes(b"1")
+    seen = [content_hash(folder)]
+    (folder / "deep" / "a").write_bytes(b"2")
+    seen.append(content_hash(folder))
+    (folder / "deep" / "a").rename(folder / "deep" / "b")
+    seen.append(content_hash(folder))
+    (folder / "empty").write_bytes(b"")
+    seen.append(content_hash(folder))
+    assert len(set(seen)) == 4
+
+
+def test_a_relative_path_is_looked_for_in_the_working_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "weights").write_bytes(b"1")
+    monkeypatch.chdir(tmp_path)
+    assert content_hash(Path("weights")) == content_hash(tmp_path / "weights")
+
+
+def test_a_path_that_is_not_there_cannot_be_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is no .*absent.*fingerprint"):
+        fingerprint(Network(tmp_path / "absent"))
+
+
+def test_code_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same class path and parameters, after an edit of the module."""
+    path = tmp_path / "mine.py"
+    code = "from dataclasses import dataclass\n@dataclass\nclass Mine:\n    a: int = 1\n"
+    seen = []
+    for text in (code, code + "    # edited\n"):
+        path.write_text(text)
+        spec = importlib.util.spec_from_file_location("mine", path)
+        assert spec is not None
+        assert spec.loader is not None
+        mine = importlib.util.module_from_spec(spec)
+        monkeypatch.setitem(sys.modules, "mine", mine)
+        spec.loader.exec_module(mine)
+        seen.append(fingerprint(mine.Mine()))
+    assert seen[0] != seen[1]
+
+
+def test_all_of_detection_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    hashed: list[Path] = []
+    monkeypatch.setattr(module, "path_hash", lambda path: str(hashed.append(path)))
+    fingerprint(Network())
+    folder = Path(module.__file__).parent
+    assert {path for path in folder.rglob("*.py") if path.stat().st_size} <= set(hashed)
+    assert folder / "mask_rcnn" / "roi_align.py" in hashed
+
+
+def test_code_without_a_file_cannot_be_told() -> None:
+    notebook = type("Mine", (), {"__module__": "a_notebook"})
+    with pytest.raises(ConfigError, match="Mine has no source file"):
+        fingerprint(dataclass(notebook)())
+
+
+def test_the_device_that_auto_means_counts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(module, "_device", lambda: "cpu")
+    on_cpu = fingerprint(Network(device="auto"))
+    monkeypatch.setattr(module, "_device", lambda: "NVIDIA H200")
+    assert fingerprint(Network(device="auto")) != on_cpu
+
+
+def test_a_name_that_is_a_file_counts_by_its_content(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Labels may be `coco` or a file; a model a name or a folder."""
+    monkeypatch.chdir(tmp_path)
+    before = fingerprint(Network(labels="labels.txt"))
+    (tmp_path / "labels.txt").write_text("chair")
+    chair = fingerprint(Network(labels="labels.txt"))
+    (tmp_path / "labels.txt").write_text("bed")
+    assert len({before, chair, fingerprint(Network(labels="labels.txt"))}) == 3

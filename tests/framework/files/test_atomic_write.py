@@ -1,0 +1,158 @@
+"""What every reader of whole files does with one that is too large, or begins with a byte order mark."""
+
+from __future__ import annotations
+
+import errno
+import os
+from codecs import BOM_UTF8
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from framework.api import load_map
+from framework.datasets.calibration.camera_json import read_json_object
+from framework.datasets.scannet.scannet_annotation import read_label_table
+from framework.datasets.scannet.sens_file import open_sens
+from framework.datasets.scenenn.intrinsics import read_intrinsics
+from framework.datasets.scenenn.scenenn_annotation import read_annotation
+from framework.datasets.scenenn.timestamps import read_timestamps
+from framework.datasets.scenenn.trajectory_log import read_trajectory_log
+from framework.detection.mask_rcnn.checkpoint import read_network
+from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
+from framework.detection.stored.coco_results import CategoryIds, read_results
+from framework.errors import ConfigError, DataError, FrameError
+from framework.files.atomic_write import read_bytes, read_text, written_whole
+from framework.files.hashing import path_hash
+from framework.files.image_files import read_color, read_uint16
+from framework.files.json_file import read_json
+from framework.files.matrix_file import read_matrix_lines
+from framework.files.ply import read_ply
+from framework.files.tum_trajectory import read_tum
+from framework.runs.stored_runs import read_yaml
+from framework.runs.timings_file import read_timings
+from framework.vocabulary.label_spaces import COCO, read_labels
+
+
+@pytest.mark.parametrize(
+    ("read", "most"),
+    [
+        (read_text, 2**28),
+        (read_tum, 2**28),
+        (read_matrix_lines, 2**28),
+        (read_timestamps, 2**28),
+        (read_trajectory_log, 2**28),
+        (read_json_object, 2**28),
+        (read_ply, 2**32),
+        (read_color, 2**28),
+        (read_uint16, 2**28),
+    ],
+)
+def test_a_file_that_is_too_large_is_refused_before_it_is_read(
+    tmp_path: Path, read: Callable[[Path], object], most: int
+) -> None:
+    with (tmp_path / "large").open("wb") as file:
+        file.truncate(most + 1)
+    with pytest.raises(DataError, match=rf"large has {most + 1} bytes, more than the {most} that") as caught:
+        read(tmp_path / "large")
+    assert isinstance(caught.value, FrameError) == (read in (read_color, read_uint16))
+
+
+@pytest.mark.parametrize(
+    ("read", "content"),
+    [
+        (read_text, b"of 2016\n"),
+        (read_tum, b"0.5 1 2 3 0 0 0 1\n"),
+        (read_matrix_lines, b"1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n"),
+        (read_timestamps, b"1 0 0\n"),
+        (read_trajectory_log, b"0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
+        (read_intrinsics, b"fx 1\nfy 2\ncx 3\ncy 4\n"),
+        (read_json_object, b'{"width": 3}'),
+        (read_label_table, b"raw_category\tnyu40class\ndesk\tdesk\n"),
+        (read_annotation, b'<?xml version="1.0"?><annotation><label id="1"/></annotation>'),
+        (lambda path: read_labels(str(path)), b"cup\nchair\n"),
+        (lambda path: read_results(path, COCO, CategoryIds.FROM_ONE), b"[]"),
+    ],
+)
+def test_a_byte_order_mark_is_left_out(tmp_path: Path, read: Callable[[Path], object], content: bytes) -> None:
+    plain, marked = tmp_path / "plain", tmp_path / "marked"
+    plain.write_bytes(content)
+    marked.write_bytes(BOM_UTF8 + content)
+    assert repr(read(marked)).replace("marked", "plain") == repr(read(plain))
+
+
+READERS = (
+    *(read_text, read_tum, read_matrix_lines, read_timestamps, read_trajectory_log, read_json_object, read_ply),
+    *(read_color, read_uint16, read_json, read_yaml, read_timings, read_annotation, read_intrinsics, path_hash),
+    *(load_map, open_sens, read_network, read_pickle, lambda path: read_bytes(path, 10)),
+    lambda path: read_results(path, COCO, CategoryIds.FROM_ONE),
+)
+
+
+@pytest.mark.parametrize("read", READERS)
+@pytest.mark.parametrize("kind", ["pipe", "/dev/zero", "/dev/null", "folder"])
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path, read: Callable[[Path], object], kind: str) -> None:
+    """A pipe to which nobody writes would be waited for, and zeros never end."""
+    path = tmp_path / "name"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        if read is path_hash:
+            return  # which takes folders
+        path.mkdir()
+    else:
+        path.symlink_to(kind)
+    with pytest.raises(DataError, match=f"{path} is no file but a") as caught:
+        read(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_labels_are_no_device(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "labels.txt")
+    with pytest.raises(ConfigError, match="labels must be one of"):
+        read_labels(str(tmp_path / "labels.txt"))
+
+
+@pytest.mark.parametrize("kind", ["pipe", "/dev/full", "/dev/null", "folder"])
+def test_only_files_are_replaced(tmp_path: Path, kind: str) -> None:
+    path = tmp_path / "out.json"
+    if kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "folder":
+        path.mkdir()
+    else:
+        path.symlink_to(kind)
+    before = path.stat().st_mode
+    with pytest.raises(DataError, match="is no file but a"), written_whole(path) as temporary:
+        temporary.write_text("{}")
+    assert path.stat().st_mode == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_link_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    for target in (tmp_path / "real" / "there.txt", tmp_path / "real" / "not_yet.txt"):
+        link = tmp_path / f"to_{target.name}"
+        link.symlink_to(target)
+        with written_whole(link) as temporary:
+            assert temporary.parent == target.parent
+            temporary.write_text("new")
+        assert link.is_symlink()
+        assert target.read_text() == "new"
+        assert not target.is_symlink()
+
+
+def test_where_nothing_can_be_written_the_file_is_named_that_was_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not its temporary name: on a disk that is only to be read it cannot be removed either."""
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(Path, "unlink", refused)
+    with (
+        pytest.raises(DataError, match=r"page\.html could not be written: Read-only"),
+        written_whole(tmp_path / "page.html"),
+    ):
+        refused()

@@ -1,0 +1,528 @@
+"""ROS bags of a small room in all their kinds: what is found in them, and what is said of damage."""
+
+from __future__ import annotations
+
+import json
+import re
+import sqlite3
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+pytest.importorskip("rosbags")
+
+from framework.data import Camera
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import ConfigError, DataError
+from framework.geometry import exp_se3
+from framework.importing.bags.ros_topics import Topics
+from framework.importing.folder_writer import Writing, write_folder
+from framework.importing.formats import open_source
+from tests.support.recordings.phone_exports import ROOM, T_COLOR_DEPTH, write_jpeg
+from tests.support.recordings.ros_bags import (
+    COUNT,
+    START,
+    T_CAMERA_ROS,
+    BagWriter,
+    add_camera_of_ros,
+    add_realsense,
+    compressed_depth,
+    millimetres,
+    png,
+    seen,
+    time_of,
+)
+from tests.support.scenes.corner_room import look, pose_at
+
+KINDS = {"ros1.bag": True, "ros2_folder": False, "mcap_folder": False}
+DEPTH_CAMERA = Camera(424, 240, 210.0, 210.0, 211.0, 119.0)
+
+
+def check_room(folder: Path, posed: bool = True, within: float = 2e-3, holes: float = 0.0) -> RgbdFolder:
+    sequence = RgbdFolder(folder)
+    assert (sequence.camera, len(sequence)) == (ROOM, COUNT)
+    for k, frame in enumerate(sequence):
+        color, depth = seen(k)
+        if posed:
+            assert frame.timestamp == pytest.approx(time_of(k), abs=1e-6)
+            np.testing.assert_allclose(frame.T_world_camera, pose_at(k), atol=1e-6)
+        assert np.abs(frame.color.astype(int) - color).mean() < 4
+        read = frame.depth > 0
+        assert read.mean() >= 1 - holes
+        assert np.median(np.abs(frame.depth - depth)[read]) < within
+        assert (np.abs(frame.depth - depth)[read] > 0.03).mean() < 0.05
+    return sequence
+
+
+def imported(path: Path, out: Path, **topics: str) -> list[str]:
+    return write_folder(open_source(path, Topics(**topics)), out, Writing()).faults
+
+
+def add_poses(bag: BagWriter, topic: str = "/pose") -> None:
+    for k in range(COUNT):
+        bag.add_pose(time_of(k), topic, pose_at(k))
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_camera_of_ros_with_poses(tmp_path: Path, name: str) -> None:
+    bag = BagWriter(ros1=KINDS[name])
+    add_camera_of_ros(bag)
+    add_poses(bag)
+    assert not imported(bag.write(tmp_path / name), tmp_path / "out")
+    check_room(tmp_path / "out")
+
+
+@pytest.mark.parametrize(("folder", "suffix"), [("mcap_folder", ".mcap"), ("plain", ".db3")])
+def test_the_file_in_the_folder_alone(tmp_path: Path, folder: str, suffix: str) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    [file] = bag.write(tmp_path / folder).glob(f"*{suffix}")
+    assert not imported(file, tmp_path / "out")
+    assert not (tmp_path / "out/poses.txt").exists()
+    check_room(tmp_path / "out", posed=False)
+
+
+@pytest.mark.parametrize(
+    ("child", "T_camera_child"), [("camera_color_optical_frame", np.eye(4)), ("base", T_CAMERA_ROS)]
+)
+def test_odometry_is_read_in_the_axes_that_its_frame_has(
+    tmp_path: Path, child: str, T_camera_child: np.ndarray
+) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for k in range(COUNT):
+        bag.add_odometry(time_of(k), "/odom", pose_at(k) @ T_camera_child, child)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out")
+
+
+def test_poses_are_interpolated(tmp_path: Path) -> None:
+    """A walk of 1 m/s along x, of which two poses are known."""
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    for x in (0.0, 0.13):
+        T = np.eye(4)
+        T[0, 3] = x
+        bag.add_pose(time_of(0) - 0.01 + x, "/pose", T)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    walked = [frame.T_world_camera[0, 3] for frame in RgbdFolder(tmp_path / "out")]
+    assert walked == pytest.approx([0.01 + k / 30 for k in range(COUNT)], abs=2e-6)
+
+
+def test_frames_far_from_all_poses_are_left_out(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.add_pose(time_of(0) - 0.08, "/pose", np.eye(4))
+    faults = imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert len(faults) == COUNT - 1
+    assert "has no pose" in faults[0]
+
+
+@pytest.mark.parametrize("encoding", ["bgr8", "rgba8", "bgra8", "mono8"])
+def test_encodings_of_colour(tmp_path: Path, encoding: str) -> None:
+    bag = BagWriter()
+    color, depth = seen(0)
+    stored = {
+        "bgr8": color[..., ::-1],
+        "rgba8": np.dstack([color, color[..., :1]]),
+        "bgra8": np.dstack([color[..., ::-1], color[..., :1]]),
+        "mono8": color[..., 1],
+    }[encoding]
+    bag.add_image(time_of(0), "/rgb/image", stored, encoding, padding=3)
+    bag.add_image(time_of(0), "/depth/image", millimetres(depth), "16UC1")
+    bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    [frame] = RgbdFolder(tmp_path / "out")
+    expected = color if encoding != "mono8" else np.repeat(color[..., 1:2], 3, axis=2)
+    assert np.abs(frame.color.astype(int) - expected).mean() < 4
+
+
+@pytest.mark.parametrize(
+    "kind", ["16UC1", "mono16", "Z16", "32FC1", "big-endian", "compressed", "packed mm", "packed m"]
+)
+def test_encodings_of_depth(tmp_path: Path, kind: str) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        color, depth = seen(k)
+        bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
+        bag.add_camera(time_of(k), "/rgb/camera_info", ROOM)
+        stored, topic = millimetres(depth), "/depth/image"
+        match kind:
+            case "32FC1":
+                bag.add_image(time_of(k), topic, np.where(depth > 0, depth, np.nan).astype("<f4"), kind)
+            case "big-endian":
+                bag.add_image(time_of(k), topic, stored.astype(">u2"), "16UC1")
+            case "compressed":
+                bag.add_compressed(time_of(k), f"{topic}/compressed", png(stored), "16UC1; png compressed")
+            case "packed mm":
+                bag.add_compressed(
+                    time_of(k), f"{topic}/compressedDepth", bytes(12) + png(stored), "16UC1; compressedDepth png"
+                )
+            case "packed m":
+                bag.add_compressed(time_of(k), f"{topic}/compressedDepth", *compressed_depth(depth))
+            case _:
+                bag.add_image(time_of(k), topic, stored, kind, padding=2)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+@pytest.mark.parametrize("kind", ["jpeg", "png"])
+def test_compressed_colour(tmp_path: Path, kind: str) -> None:
+    bag = BagWriter(ros1=True)
+    for k in range(COUNT):
+        color, depth = seen(k)
+        write_jpeg(tmp_path / "image.jpg", color)
+        data = (tmp_path / "image.jpg").read_bytes() if kind == "jpeg" else png(color[..., ::-1])
+        bag.add_compressed(time_of(k), "/camera/rgb/image_raw/compressed", data, f"rgb8; {kind} compressed bgr8")
+        bag.add_image(time_of(k), "/camera/depth/image_raw", millimetres(depth), "16UC1")
+        bag.add_camera(time_of(k), "/camera/rgb/camera_info", ROOM)
+    assert not imported(bag.write(tmp_path / "a.bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+def test_realsense_recordings_are_registered(tmp_path: Path) -> None:
+    bag = BagWriter(ros1=True)
+    add_realsense(bag, DEPTH_CAMERA)
+    assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False, within=5e-3, holes=0.05)  # readings are moved to the nearest pixel
+
+
+def test_depth_of_another_camera_is_refused(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag, "depth")
+    bag.messages = [entry for entry in bag.messages if entry[1] != "/camera/depth/camera_info"]
+    bag.add_camera(time_of(0), "/camera/depth/camera_info", DEPTH_CAMERA)
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises(
+        DataError, match=r"is of another camera than /camera/color/image_raw .* record depth that is reg"
+    ):
+        open_source(path)
+
+
+def test_depth_of_the_same_camera_in_another_size_is_taken(tmp_path: Path) -> None:
+    bag = BagWriter()
+    half = ROOM.scaled(0.5)
+    for k in range(COUNT):
+        bag.add_image(time_of(k), "/camera/color/image_raw", seen(k)[0], "rgb8")
+        bag.add_image(time_of(k), "/camera/depth/image_raw", millimetres(look(half, pose_at(k))[0]), "16UC1")
+        bag.add_camera(time_of(k), "/camera/color/camera_info", ROOM)
+        bag.add_camera(time_of(k), "/camera/depth/camera_info", half)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+def test_a_lens_is_written_for_who_reads_the_folder(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM, lens=[0.1, -0.2, 0.001, 0.002, 0.05])
+    imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert json.loads((tmp_path / "out/camera.json").read_text())["distortion"] == [0.1, -0.2, 0.001, 0.002, 0.05]
+    assert RgbdFolder(tmp_path / "out").calibration.lens is not None
+
+
+def test_a_lens_of_another_model_is_told(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.messages = [entry for entry in bag.messages if not entry[1].endswith("camera_info")]
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM, "equidistant", [0.1] * 4)
+    imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert "a lens of the model 'equidistant' is not undone" in caplog.text
+
+
+def test_headers_of_another_clock_fall_back_to_the_times_of_recording(tmp_path: Path) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        color, depth = seen(k)
+        bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8", stamp=0)
+        bag.add_image(time_of(k) + 0.001, "/camera/depth_registered/image", millimetres(depth), "16UC1", stamp=0)
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+def test_images_without_a_partner_in_time_are_no_frames(tmp_path: Path) -> None:
+    bag = BagWriter()
+    color, depth = seen(0)
+    for k in range(COUNT):
+        bag.add_image(time_of(k), "/camera/color/image_raw", color, "rgb8")
+    bag.add_image(time_of(2) + 0.003, "/camera/depth_registered/image", millimetres(depth), "16UC1")
+    bag.add_camera(time_of(0), "/camera/color/camera_info", ROOM)
+    path = bag.write(tmp_path / "bag")
+    assert open_source(path).count == 1
+    far = BagWriter(messages=[(t + 10 * ("depth" in topic), topic, *rest) for t, topic, *rest in bag.messages])
+    for _, topic, _, message in far.messages:
+        if "depth" in topic:
+            message.header.stamp.sec += 10
+    with pytest.raises(DataError, match=r"none of 4 images of /camera/color/image_raw is within 0\.02 s of one of 1"):
+        open_source(far.write(tmp_path / "far"))
+
+
+# Topics
+
+
+def two_cameras() -> BagWriter:
+    bag = BagWriter()
+    color, depth = seen(0)
+    for side in ("left", "right"):
+        bag.add_image(time_of(0), f"/{side}/color/image", color, "rgb8")
+        bag.add_image(time_of(0), f"/{side}/depth/image", millimetres(depth), "16UC1")
+        bag.add_camera(time_of(0), f"/{side}/color/camera_info", ROOM)
+        bag.add_pose(time_of(0), f"/{side}/pose", pose_at(0))
+    return bag
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({}, r"several topics may be its depth: /left/depth/image, /right/depth/image; choose one with --depth"),
+        ({"depth": "/left/depth/image"}, r"several topics may be its color: .* choose one with --color"),
+        (
+            {"depth": "/left/depth/image", "color": "/left/color/image"},
+            r"several topics with poses: /left/pose, /right/pose; choose one with --poses",
+        ),
+        (
+            {"depth": "/left/depth/image", "color": "/left/color/image", "poses": "/left/color/image"},
+            r"--poses must be a topic of nav_msgs/msg/Odometry or .*; /left/color/image is sensor_msgs/msg/Image",
+        ),
+        (
+            {"depth": "/nowhere", "color": "/left/color/image", "poses": "/left/pose"},
+            "--depth must be .* is nothing of",
+        ),
+    ],
+)
+def test_what_names_do_not_tell_is_asked(tmp_path: Path, given: dict[str, str], said: str) -> None:
+    path = two_cameras().write(tmp_path / "bag")
+    with pytest.raises(ConfigError, match=said):
+        open_source(path, Topics(**given))
+
+
+def test_what_is_given_is_taken(tmp_path: Path) -> None:
+    path = two_cameras().write(tmp_path / "bag")
+    given = {"depth": "/right/depth/image", "color": "/left/color/image", "poses": "/left/pose"}
+    assert not imported(path, tmp_path / "out", **given, camera_info="/right/color/camera_info")
+    assert len(RgbdFolder(tmp_path / "out")) == 1
+
+
+def test_registered_depth_and_uncompressed_colour_come_first(tmp_path: Path) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    color, depth = seen(0)
+    bag.add_image(time_of(0), "/camera/depth/image_rect_raw", millimetres(2 * depth), "16UC1")
+    bag.add_image(time_of(0), "/camera/infra1/image_rect_raw", color[..., 0], "mono8")
+    bag.add_compressed(time_of(0), "/camera/color/image_raw/compressed", b"no picture", "jpeg")
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    check_room(tmp_path / "out", posed=False)
+
+
+@pytest.mark.parametrize(
+    ("left_out", "said"), [("/color/image", "no topic can be its color"), ("camera_info", "has no")]
+)
+def test_what_is_missing_is_said(tmp_path: Path, left_out: str, said: str) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    bag.messages = [entry for entry in bag.messages if left_out not in entry[1]]
+    path = bag.write(tmp_path / "bag")
+    with pytest.raises((ConfigError, DataError), match=said):
+        open_source(path)
+
+
+def test_phones_have_no_topics(tmp_path: Path) -> None:
+    (tmp_path / "a.r3d").touch()
+    with pytest.raises(ConfigError, match="has no topics: --color, --poses are for ROS bags"):
+        open_source(tmp_path / "a.r3d", Topics(color="/a", poses="/b"))
+
+
+# Gravity
+
+UP_WORLD = np.array([0.0, -1.0, 0.0])  # the room's y points down
+R_IMU_CAMERA = Rotation.from_euler("xyz", [0.3, -1.2, 2.0]).as_matrix()
+
+
+def add_accelerometer(
+    bag: BagWriter, topic: str = "/camera/imu", frame_id: str = "imu", length: float = 9.81, late: float = 0.0
+) -> None:
+    """At 300 Hz, on the camera, which turns slowly; trembling of 4 m/s^2 at 50 Hz."""
+    for n in range(-30, 10 * COUNT + 30):
+        acceleration = length * UP_WORLD + np.array([4.0, 0, 0]) * np.sin(2 * np.pi * n / 6)
+        measured = R_IMU_CAMERA @ pose_at(n / 10)[:3, :3].T @ acceleration
+        bag.add_imu(START + n / 300 + late, topic, measured, frame_id)
+
+
+def stands(R: np.ndarray) -> np.ndarray:
+    T = exp_se3(np.array([0.1, 0.2, -0.1, 0, 0, 0]))
+    T[:3, :3] = R
+    return T
+
+
+def check_up(folder: Path, within: float = 1.0) -> None:
+    for k, frame in enumerate(RgbdFolder(folder)):
+        assert np.degrees(np.arccos(frame.up @ pose_at(k)[:3, :3].T @ UP_WORLD)) < within
+
+
+@pytest.mark.parametrize("name", ["ros1.bag", "ros2_folder"])
+def test_an_accelerometer_tells_up_in_the_cameras_axes(tmp_path: Path, name: str) -> None:
+    """Over a chain of frames, both up and down it; a gyroscope's topic has no acceleration."""
+    bag = BagWriter(ros1=KINDS[name])
+    add_camera_of_ros(bag)
+    add_accelerometer(bag)
+    bag.add_imu(time_of(0), "/camera/gyro/sample", np.zeros(3), "imu")
+    base = Rotation.random(random_state=1).as_matrix()
+    bag.add_static(
+        ("base", "/camera_color_optical_frame", stands(base)),
+        ("base", "imu_mount", stands(base @ R_IMU_CAMERA.T)),
+        ("imu_mount", "imu", stands(np.eye(3))),
+        ("elsewhere", "base", stands(np.eye(3))),
+    )
+    assert not imported(bag.write(tmp_path / name), tmp_path / "out")
+    check_up(tmp_path / "out")
+
+
+def test_realsenses_accelerometer_tells_up(tmp_path: Path) -> None:
+    bag = BagWriter(ros1=True)
+    add_realsense(bag, DEPTH_CAMERA)
+    add_accelerometer(bag, "/device_0/sensor_2/Accel_0/imu/data", "2")
+    T_color_reference = T_COLOR_DEPTH
+    bag.add_transform("/device_0/sensor_2/Accel_0/tf/0", stands(R_IMU_CAMERA @ T_color_reference[:3, :3]))
+    assert not imported(bag.write(tmp_path / "recorded.bag"), tmp_path / "out")
+    check_up(tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (
+            {"frame_id": "unheard_of"},
+            "how /camera/imu stands to the camera of /camera/color/image_raw is not in the bag",
+        ),
+        ({"length": 0.0}, r"/camera/imu measures 3\.46 m/s\^2, not gravity"),
+        ({"late": 100.0}, r"/camera/imu measured nothing within 0\.05 s of a frame"),
+    ],
+)
+def test_an_accelerometer_that_cannot_tell_is_said_in_one_line(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, changed: dict[str, Any], said: str
+) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_accelerometer(bag, **changed)
+    bag.add_static(("imu", "camera_color_optical_frame", stands(R_IMU_CAMERA)))
+    assert not imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert not (tmp_path / "out/gravity.txt").exists()
+    [line] = [record.getMessage() for record in caplog.records if "accelerometer" in record.getMessage()]
+    assert re.search(f"no accelerometer tells which way is up: {said}", line)
+    assert "\n" not in line
+
+
+def test_damaged_messages_of_an_accelerometer_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    add_accelerometer(bag)
+    bag.add_static(("imu", "camera_color_optical_frame", stands(R_IMU_CAMERA)))
+    for number, (time, topic, kind, message) in enumerate(bag.messages):
+        if topic == "/camera/imu" and number % 3 == 0:
+            lost = replace(message, linear_acceleration=bag.vector(np.full(3, np.nan)))
+            bag.messages[number] = (time, topic, kind, lost)
+    path = bag.write(tmp_path / "plain")
+    [file] = path.glob("*.db3")
+    with sqlite3.connect(file) as database:
+        [[topic]] = database.execute("SELECT id FROM topics WHERE name = '/camera/imu'")
+        database.execute("UPDATE messages SET data = x'0001' WHERE topic_id = ? AND id % 5 = 0", [topic])
+    assert not imported(path, tmp_path / "out")
+    assert re.search(r"[1-9]\d* messages of /camera/imu are damaged and left out", caplog.text)
+    check_up(tmp_path / "out", within=10)
+
+
+# Damage
+
+
+def spoilt(message: Any, name: str) -> Any:
+    fields = {
+        "encoding": {"encoding": "yuv422"},
+        "height": {"height": 10_000},
+        "step": {"step": 5},
+        "width": {"width": 2**31},
+        "data": {"data": message.data[:-7]},
+        "stamp": {},
+    }[name]
+    return replace(message, **fields)
+
+
+@pytest.mark.parametrize("topic", ["/camera/color/image_raw", "/camera/aligned_depth_to_color/image_raw"])
+@pytest.mark.parametrize("name", ["encoding", "height", "step", "width", "data"])
+def test_a_damaged_message_is_one_frame(tmp_path: Path, topic: str, name: str) -> None:
+    bag = BagWriter()
+    add_camera_of_ros(bag)
+    number = [k for k, entry in enumerate(bag.messages) if entry[1] == topic][1]
+    time, _, kind, message = bag.messages[number]
+    bag.messages[number] = (time, topic, kind, spoilt(message, name))
+    [fault] = imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert topic in fault
+    assert re.search("is damaged: .* px of|must be one of", fault)
+    assert len(RgbdFolder(tmp_path / "out")) == COUNT - 1
+
+
+@pytest.mark.parametrize("depth", [b"", b"123", bytes(12), bytes(12) + b"\x89PNG\r\n\x1a\n" + bytes(40)])
+def test_a_damaged_packed_image_is_one_frame(tmp_path: Path, depth: bytes) -> None:
+    bag = BagWriter()
+    for k in range(COUNT):
+        color, metric = seen(k)
+        bag.add_image(time_of(k), "/rgb/image", color, "rgb8")
+        data = depth if k == 1 else bytes(12) + png(millimetres(metric))
+        bag.add_compressed(time_of(k), "/depth/image/compressedDepth", data, "16UC1; compressedDepth png")
+    bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
+    [fault] = imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+    assert "/depth/image/compressedDepth" in fault
+
+
+def test_depth_packed_by_rvl_is_said(tmp_path: Path) -> None:
+    bag = BagWriter()
+    bag.add_image(time_of(0), "/rgb/image", seen(0)[0], "rgb8")
+    bag.add_compressed(time_of(0), "/depth/image/compressedDepth", bytes(100), "16UC1; compressedDepth rvl")
+    bag.add_camera(time_of(0), "/rgb/camera_info", ROOM)
+    with pytest.raises(
+        DataError, match=r"no frame can be used; .* depth compressed by RVL is not read; record it as png"
+    ):
+        imported(bag.write(tmp_path / "bag"), tmp_path / "out")
+
+
+@pytest.mark.parametrize("name", KINDS)
+@pytest.mark.parametrize("share", [0.0, 0.02, 0.5, 0.98])
+def test_a_torn_bag_is_said_in_one_line_or_gives_what_it_has(tmp_path: Path, name: str, share: float) -> None:
+    bag = BagWriter(ros1=KINDS[name])
+    add_camera_of_ros(bag)
+    path = bag.write(tmp_path / name)
+    file = path if path.is_file() else next(entry for entry in path.iterdir() if entry.suffix in (".db3", ".mcap"))
+    file.write_bytes(file.read_bytes()[: int(share * file.stat().st_size)])
+    try:
+        imported(path, tmp_path / "out")
+    except DataError as error:
+        assert str(path) in str(error)
+        assert "\n" not in str(error)
+        assert not (tmp_path / "out/camera.json").exists()
+    else:
+        assert 0 < len(RgbdFolder(tmp_path / "out")) <= COUNT
+
+
+def test_a_flipped_byte_amid_the_images_costs_what_it_hits(tmp_path: Path) -> None:
+    bag = BagWriter(ros1=True)
+    add_camera_of_ros(bag)
+    path = bag.write(tmp_path / "a.bag")
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF
+    path.write_bytes(bytes(data))
+    assert len(imported(path, tmp_path / "out")) <= 1
+    assert len(RgbdFolder(tmp_path / "out")) >= COUNT - 1
+
+
+def test_a_missing_package_names_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "a.bag").touch()
+    monkeypatch.setitem(sys.modules, "rosbags", None)
+    with pytest.raises(
+        ConfigError, match=r"rosbags, which reads ROS bags, is not there: pip install instancemap\[ros\]"
+    ):
+        open_source(tmp_path / "a.bag")

@@ -1,0 +1,146 @@
+"""Polycam and 3D Scanner App, which store each frame in files of its own: as they write them, and damaged."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import DataError
+from framework.geometry import exp_se3
+from framework.importing.folder_writer import Writing, write_folder
+from framework.importing.formats import open_source
+from tests.support.recordings.phone_exports import check_imported, room_frames, write_polycam, write_scanner_app
+
+FRAMES = room_frames()
+DRIFT = exp_se3([0.05, 0.02, 0.01, 0.03, -0.02, 0.01])
+WRITERS = {"3D Scanner App": write_scanner_app, "Polycam": write_polycam}
+
+
+@pytest.fixture(params=WRITERS)
+def export(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, Path]:
+    WRITERS[request.param](tmp_path / "export", FRAMES)
+    return request.param, tmp_path / "export"
+
+
+def write(path: Path, tmp_path: Path, least: int = 1) -> list[str]:
+    return write_folder(open_source(path), tmp_path / "out", Writing(confidence=least)).faults
+
+
+@pytest.mark.parametrize("least", [0, 1, 2])
+def test_the_room_is_where_it_is(export: tuple[str, Path], tmp_path: Path, least: int) -> None:
+    name, path = export
+    source = open_source(path)
+    assert (source.format, source.count) == (name, len(FRAMES))
+    assert not write(path, tmp_path, least)
+    check_imported(tmp_path / "out", FRAMES, least=least)
+
+
+def test_optimised_poses_and_undistorted_images_of_polycam_are_taken(tmp_path: Path) -> None:
+    drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera, color=255 - frame.color) for frame in FRAMES]
+    write_polycam(tmp_path / "export", drifted)
+    write_polycam(tmp_path / "export", FRAMES, "corrected_")
+    assert not write(tmp_path / "export/keyframes", tmp_path)
+    check_imported(tmp_path / "out", FRAMES, tells_up=False)
+    for frame, seen in zip(drifted, RgbdFolder(tmp_path / "out"), strict=True):  # of ARKit's own world
+        np.testing.assert_allclose(frame.T_world_camera[:3, :3] @ seen.up, [0, 1, 0], atol=1e-6)
+
+
+def test_optimised_poses_of_polycam_without_such_images(tmp_path: Path) -> None:
+    """As in exports of which the app has left out the images, and of the camera all but the pose."""
+    drifted = [replace(frame, T_world_camera=DRIFT @ frame.T_world_camera) for frame in FRAMES]
+    write_polycam(tmp_path / "export", drifted)
+    write_polycam(tmp_path / "export", FRAMES, "corrected_")
+    for path in (tmp_path / "export/keyframes/corrected_images").iterdir():
+        path.unlink()
+    for path in (tmp_path / "export/keyframes/corrected_cameras").iterdir():
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps({key: value for key, value in content.items() if key.startswith("t_")}))
+    assert not write(tmp_path / "export", tmp_path)
+    check_imported(tmp_path / "out", FRAMES, tells_up=False)
+
+
+def test_frames_of_the_scanner_app_without_colour_are_none(tmp_path: Path) -> None:
+    write_scanner_app(tmp_path / "export", FRAMES)
+    (tmp_path / "export/frame_00001.jpg").unlink()
+    assert open_source(tmp_path / "export").count == 3
+    for path in (tmp_path / "export").glob("depth_*"):
+        path.unlink()
+    with pytest.raises(DataError, match=r"has no frame with a frame_00000\.jpg and a depth_00000\.png; in the app"):
+        open_source(tmp_path / "export")
+
+
+def test_older_scans_without_times_have_them_by_their_numbers(tmp_path: Path) -> None:
+    write_scanner_app(tmp_path / "export", FRAMES)
+    for path in (tmp_path / "export").glob("frame_*.json"):
+        change(path, lambda content: content.pop("time"))
+    assert not write(tmp_path / "export", tmp_path)
+    assert [frame.timestamp for frame in RgbdFolder(tmp_path / "out")] == pytest.approx([k / 30 for k in range(4)])
+
+
+def test_polycam_without_depth_is_refused(tmp_path: Path) -> None:
+    write_polycam(tmp_path / "export", FRAMES)
+    (tmp_path / "export/keyframes/depth").rename(tmp_path / "depth")
+    with pytest.raises(DataError, match="has no depth/ or no cameras: Polycam keeps them with a LiDAR"):
+        open_source(tmp_path / "export")
+
+
+def change(path: Path, how: Callable[[dict[str, Any]], Any]) -> None:
+    content = json.loads(path.read_text())
+    how(content)
+    path.write_text(json.dumps(content))
+
+
+def second(folder: Path, pattern: str) -> Path:
+    """The file of the second frame."""
+    return sorted(folder.rglob(pattern))[1]
+
+
+SPOILT_CAMERAS = {
+    "3D Scanner App": [
+        (lambda c: c.pop("intrinsics"), "intrinsics must be a list of 9 numbers"),
+        (lambda c: c.update(cameraPoseARFrame=[0] * 16), "the last row of the pose is not 0 0 0 1"),
+        (lambda c: c.update(cameraPoseARFrame=[1, 2]), "cameraPoseARFrame must be a list of 16 numbers"),
+        (lambda c: c.update(intrinsics=[0] * 9), "fx, fy must be positive"),
+        (lambda c: c.update(time="now"), "time must be a number, found now"),
+    ],
+    "Polycam": [
+        (lambda c: c.pop("fx"), "fx must be a number, found None"),
+        (lambda c: c.update(t_00=3), "the pose is not rigid"),
+        (lambda c: c.update(t_23=None), "t_23 must be a number, found None"),
+        (lambda c: c.update(fx=-1), "fx, fy must be positive"),
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("app", "how", "said"), [(app, *case) for app, cases in SPOILT_CAMERAS.items() for case in cases]
+)
+def test_a_damaged_camera_is_one_frame(tmp_path: Path, app: str, how, said: str) -> None:
+    WRITERS[app](tmp_path / "export", FRAMES)
+    change(second(tmp_path / "export", "frame_*.json" if app == "3D Scanner App" else "cameras/*.json"), how)
+    [fault] = write(tmp_path / "export", tmp_path)
+    assert re.search(said, fault), fault
+    assert len(RgbdFolder(tmp_path / "out")) == 3
+
+
+@pytest.mark.parametrize(
+    ("app", "pattern"),
+    [
+        *(("3D Scanner App", pattern) for pattern in ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")),
+        *(("Polycam", f"{kind}/*") for kind in ("cameras", "images", "depth", "confidence")),
+    ],
+)
+def test_a_torn_file_is_one_frame(tmp_path: Path, app: str, pattern: str) -> None:
+    WRITERS[app](tmp_path / "export", FRAMES)
+    path = second(tmp_path / "export", pattern)
+    path.write_bytes(path.read_bytes()[:-10])
+    [fault] = write(tmp_path / "export", tmp_path)
+    assert path.name in fault

@@ -1,0 +1,218 @@
+"""Record3D's export and .r3d files: as the app writes them, damaged, and a real export."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import ConfigError, DataError
+from framework.importing.folder_writer import Writing, write_folder
+from framework.importing.formats import open_source
+from framework.importing.phones.image_rotation import Turn, upright
+from tests.support.recordings.phone_exports import (
+    check_imported,
+    record3d_metadata,
+    room_frames,
+    write_r3d,
+    write_record3d_exr,
+)
+
+FRAMES = room_frames()
+REAL_FRAMES = 4  # whose images are there; the metadata is of all 345
+
+
+@pytest.fixture
+def export(tmp_path: Path) -> Path:
+    pytest.importorskip("OpenEXR")
+    write_record3d_exr(tmp_path / "export", FRAMES)
+    return tmp_path / "export"
+
+
+@pytest.fixture
+def r3d(tmp_path: Path) -> Path:
+    pytest.importorskip("lzfse")
+    write_r3d(tmp_path / "room.r3d", FRAMES)
+    return tmp_path / "room.r3d"
+
+
+def test_the_export_shows_the_room_where_it_is(export: Path, tmp_path: Path) -> None:
+    write_folder(open_source(export), tmp_path / "out", Writing())
+    check_imported(tmp_path / "out", FRAMES, least=0)  # the export has no confidence
+
+
+@pytest.mark.parametrize("least", [0, 1, 2])
+def test_the_file_shows_the_room_where_it_is(r3d: Path, tmp_path: Path, least: int) -> None:
+    write_folder(open_source(r3d), tmp_path / "out", Writing(width=160, confidence=least))
+    check_imported(tmp_path / "out", FRAMES, 0.5, least)
+
+
+def test_a_file_without_confidence_keeps_all_depth(tmp_path: Path) -> None:
+    pytest.importorskip("lzfse")
+    write_r3d(tmp_path / "room.r3d", FRAMES, confident=False)
+    write_folder(open_source(tmp_path / "room.r3d"), tmp_path / "out", Writing(confidence=2))
+    check_imported(tmp_path / "out", FRAMES, least=0)
+
+
+def test_older_exports_have_one_camera_and_a_frame_rate(export: Path, tmp_path: Path) -> None:
+    metadata = record3d_metadata(FRAMES, own_intrinsics=False)
+    del metadata["frameTimestamps"]
+    (export / "metadata.json").write_text(json.dumps(metadata))
+    write_folder(open_source(export), tmp_path / "out", Writing())
+    sequence = RgbdFolder(tmp_path / "out")
+    assert sequence.camera == FRAMES[0].camera
+    assert [frame.timestamp for frame in sequence] == pytest.approx([k / 30 for k in range(4)])
+
+
+def test_poses_that_begin_with_the_identity_do_not_tell_up(export: Path, tmp_path: Path) -> None:
+    """As the app wrote them in 2022: of the world of the first frame."""
+    changed(export, lambda m: m["poses"].__setitem__(0, [0, 0, 0, 1, 0, 0, 0]))
+    write_folder(open_source(export), tmp_path / "out", Writing())
+    assert len(RgbdFolder(tmp_path / "out")) == 4
+    assert not (tmp_path / "out/gravity.txt").exists()
+
+
+def changed(export: Path, change: Callable[[dict[str, Any]], Any]) -> None:
+    metadata = record3d_metadata(FRAMES)
+    change(metadata)
+    (export / "metadata.json").write_text(json.dumps(metadata))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: m["poses"].__setitem__(1, [0, 0, 0, 2, 0, 0, 0]), "pose 1: the quaternion .* has length 2"),
+        (lambda m: m["poses"].__setitem__(1, [0, 0, 0, 1]), "pose 1 must be a list of 7 numbers"),
+        (lambda m: m["poses"].__setitem__(1, [None] * 7), "pose 1 must be a list of 7 numbers"),
+        (lambda m: m["frameTimestamps"].__setitem__(1, 0.0), "not later than the frame before"),
+    ],
+)
+def test_a_damaged_pose_is_one_frame(export: Path, tmp_path: Path, change, said: str) -> None:
+    changed(export, change)
+    written = write_folder(open_source(export), tmp_path / "out", Writing())
+    [fault] = written.faults
+    assert re.search(said, fault)
+    assert len(RgbdFolder(tmp_path / "out")) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda m: m.pop("poses"), "poses must be a list of poses, found None"),
+        (lambda m: m.update(poses=[]), "poses must be a list of poses"),
+        (lambda m: (m.pop("perFrameIntrinsicCoeffs"), m.pop("K")), "K must be a list of 9 numbers"),
+        (lambda m: m.update(w="640"), "w must be a number, found 640"),
+        (lambda m: m.update(w=10**9), "an image has at most"),
+        (lambda m: m.update(dw=0.5), "an image has whole numbers of pixels"),
+        (lambda m: m.update(dw=10**9), "an image has at most"),
+        (lambda m: m.update(frameTimestamps=[1, 2]), "frameTimestamps must be a list of 4 numbers"),
+        (lambda m: (m.pop("frameTimestamps"), m.update(fps=0)), "fps must be positive"),
+    ],
+)
+def test_metadata_that_spoils_all_is_said(export: Path, change, said: str) -> None:
+    changed(export, change)
+    with pytest.raises(DataError, match=rf"metadata\.json: .*{said}|metadata\.json: {said}"):
+        open_source(export)
+
+
+@pytest.mark.parametrize("spoil", [lambda data: data[:1000], lambda data: b"", lambda data: data[:300] + data[400:]])
+def test_a_damaged_image_of_the_export_is_one_frame(export: Path, tmp_path: Path, spoil) -> None:
+    path = export / "depth/1.exr"
+    path.write_bytes(spoil(path.read_bytes()))
+    written = write_folder(open_source(export), tmp_path / "out", Writing())
+    [fault] = written.faults
+    assert "depth/1.exr" in fault
+
+
+def test_depth_of_another_size_than_it_says_is_not_asked_memory_for(export: Path, tmp_path: Path) -> None:
+    changed(export, lambda m: m.update(dw=1000))
+    with pytest.raises(DataError, match=r"depth/0\.exr has 80x60 px of R, expected 1000x60 of R"):
+        write_folder(open_source(export), tmp_path / "out", Writing())
+
+
+def rewritten(r3d: Path, name: str, content: bytes | None) -> Path:
+    path = r3d.with_name("damaged.r3d")
+    with zipfile.ZipFile(r3d) as old, zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as new:
+        for member in old.namelist():
+            if member != name:
+                new.writestr(member, old.read(member))
+            elif content is not None:
+                new.writestr(member, content)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("rgbd/1.depth", None, r"has no rgbd/1\.depth"),
+        ("rgbd/1.depth", b"bvx2" + bytes(100), r"rgbd/1\.depth could not be unpacked: it is damaged"),
+        ("rgbd/1.depth", bytes(10**6), r"rgbd/1\.depth has 1000000 bytes, more than"),
+        ("rgbd/1.depth", b"bvx2" * 100, r"rgbd/1\.depth has more blocks than 19200 bytes have"),
+        ("rgbd/1.jpg", b"\xff\xd8\xff", r"rgbd/1\.jpg is truncated"),
+        ("rgbd/1.conf", b"", r"rgbd/1\.conf could not be unpacked"),
+    ],
+)
+def test_a_damaged_member_of_the_file_is_one_frame(
+    r3d: Path, tmp_path: Path, name: str, content: bytes | None, said: str
+) -> None:
+    written = write_folder(open_source(rewritten(r3d, name, content)), tmp_path / "out", Writing())
+    [fault] = written.faults
+    assert re.search(said, fault), fault
+    assert len(RgbdFolder(tmp_path / "out")) == 3
+
+
+def test_what_unpacks_to_much_is_not_unpacked(r3d: Path, tmp_path: Path) -> None:
+    lzfse = pytest.importorskip("lzfse")
+    bomb = lzfse.compress(bytes(10**8))
+    written = write_folder(open_source(rewritten(r3d, "rgbd/1.depth", bomb)), tmp_path / "out", Writing())
+    assert re.search("more than the .* that it can have|more blocks", written.faults[0])
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04", b"no zip at all" * 100])
+def test_what_is_no_zip_is_said(tmp_path: Path, content: bytes) -> None:
+    pytest.importorskip("lzfse")
+    (tmp_path / "room.r3d").write_bytes(content)
+    with pytest.raises(DataError, match=r"room\.r3d could not be read: File is not a zip file"):
+        open_source(tmp_path / "room.r3d")
+
+
+@pytest.mark.parametrize(("module", "source"), [("OpenEXR", "export"), ("lzfse", "r3d")])
+def test_a_missing_package_names_the_extra(
+    module: str, source: str, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = request.getfixturevalue(source)
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(ConfigError, match=r"is not there: pip install instancemap\[phone\]"):
+        open_source(path)
+
+
+def test_a_real_export(shared_data: Path, tmp_path: Path) -> None:
+    pytest.importorskip("OpenEXR")
+    original = shared_data / "originals" / "record3d" / "EXR_RGBD"
+    if not original.is_dir():
+        pytest.skip(f"{original} is not there")
+    written = write_folder(open_source(original), tmp_path / "out", Writing())
+    assert (len(written.timestamps), len(written.faults)) == (REAL_FRAMES, 345 - REAL_FRAMES)
+    sequence = RgbdFolder(tmp_path / "out")
+    assert (sequence.camera.width, sequence.camera.height) == (480, 640)
+    assert sequence.camera.fx == pytest.approx(1404.302978515625 / 3)
+    assert sequence.camera.cx == pytest.approx((724.6458740234375 + 0.5) / 3 - 0.5)
+    frame = sequence[3]
+    assert frame.timestamp == pytest.approx(0.05000420800206484)
+    assert (frame.depth > 0).mean() > 0.99
+    assert np.median(frame.depth) == pytest.approx(0.247, abs=0.003)
+    # it looks down at a door handle: the view is 50 degrees below the horizon, and up is up
+    T_world_camera = frame.T_world_camera
+    assert T_world_camera is not None
+    assert T_world_camera[1, 2] == pytest.approx(-0.77, abs=0.02)
+    assert T_world_camera[1, 1] < -0.6
+    assert upright(written.ups) == Turn(0)
+    np.testing.assert_allclose(frame.up, T_world_camera[1, :3], atol=1e-6)

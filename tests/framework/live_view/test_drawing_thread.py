@@ -1,0 +1,154 @@
+"""The thread that draws: the loop does not wait for it, and what must be told is told."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from framework.data import Pose
+from framework.live_view.drawing_thread import Background
+from framework.live_view.updates import FrameNote, MapSnapshot, Picture
+from framework.pipeline import Pipeline
+from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
+
+EXACT = SphereDetector()
+
+
+@dataclass
+class Notebook:
+    """A drawing that keeps what it was given; may wait, or fail, at the first frames."""
+
+    waits_for: threading.Event | None = None
+    fails: bool = False
+    fails_to_close: bool = False
+    notes: list[FrameNote] = field(default_factory=list)
+    faults: list[str] = field(default_factory=list)
+    pictures: list[Picture] = field(default_factory=list)
+    maps: list[MapSnapshot] = field(default_factory=list)
+    threads: set[str] = field(default_factory=set)
+    closed: bool = False
+
+    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: Picture | None) -> None:
+        self.threads.add(threading.current_thread().name)
+        if self.fails:
+            raise OSError(28, "No space left on device")
+        if self.waits_for is not None:
+            assert self.waits_for.wait(30)
+        self.notes += notes
+        self.faults += faults
+        self.pictures += [picture] if picture else []
+
+    def draw_map(self, snapshot: MapSnapshot) -> None:
+        self.maps.append(snapshot)
+
+    def close(self) -> None:
+        self.closed = True
+        if self.fails_to_close:
+            raise RuntimeError("the writer's thread has ended")
+
+
+def mapped(room: CornerRoom) -> GridMap:
+    result = Pipeline(EXACT, GivenPose(), KeepAll(), GridFuser()).run(room)
+    assert isinstance(result.scene, GridMap)
+    return result.scene
+
+
+def test_all_is_told_and_the_last_map_is_whole(room: CornerRoom) -> None:
+    scene, book = mapped(room), Notebook()
+    background = Background(scene, book, every=1, map_every=3600)
+    for frame in room:
+        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera, frame.index == 3), {"fuse": 1.5})
+        background.skip(f"after {frame.index}")
+    background.end()
+    assert [note.index for note in book.notes] == list(range(6))
+    assert [note.pose.lost for note in book.notes] == [index == 3 for index in range(6)]
+    assert book.notes[2].stage_ms == {"fuse": 1.5}
+    assert book.faults == [f"after {index}" for index in range(6)]
+    assert book.pictures[-1].frame.index == 5
+    assert book.maps[-1].index == 5
+    np.testing.assert_array_equal(book.maps[-1].mesh.vertices, scene.mesh().vertices)
+    assert book.maps[-1].objects == {1: (0, pytest.approx(0.9)), 2: (1, pytest.approx(0.8))}
+    assert book.threads == {"viewer"}
+    assert book.closed
+
+
+def test_the_loop_does_not_wait_and_only_the_newest_picture_is_drawn(room: CornerRoom) -> None:
+    going_on, book = threading.Event(), Notebook()
+    book.waits_for = going_on
+    background = Background(mapped(room), book, every=1, map_every=3600)
+    background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
+    while not book.threads:  # it has begun to draw, and is stuck
+        time.sleep(0.001)
+    for frame in list(room)[1:]:
+        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
+    assert not book.notes, "all frames were taken, and none was drawn"
+    going_on.set()
+    background.end()
+    assert [picture.frame.index for picture in book.pictures] == [0, 5]
+    assert [note.index for note in book.notes] == list(range(6))
+
+
+@pytest.mark.parametrize("every", [2, 4])
+def test_pictures_are_of_every_so_many_frames(room: CornerRoom, every: int) -> None:
+    book = Notebook()
+    background = Background(mapped(room), book, every, map_every=3600)
+    for frame in room:
+        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
+    background.end()
+    assert {picture.frame.index % every for picture in book.pictures} == {0}
+
+
+def test_a_drawing_that_fails_is_told_once_and_ends_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    book = Notebook(fails=True)
+    background = Background(mapped(room), book, every=1, map_every=3600)
+    for frame in room:
+        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
+        background.skip("a fault")
+        time.sleep(0.02)
+    background.end()
+    told = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert told == ["viewer: it failed, and the run goes on without it: [Errno 28] No space left on device"]
+    assert book.closed
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_a_drawing_that_cannot_be_closed_is_told_once(
+    fails: bool, room: CornerRoom, caplog: pytest.LogCaptureFixture
+) -> None:
+    background = Background(mapped(room), Notebook(fails=fails, fails_to_close=True), every=1, map_every=3600)
+    background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
+    background.end()
+    [told] = [record.message for record in caplog.records if record.levelno >= logging.WARNING]
+    assert ("No space left" if fails else "the writer's thread has ended") in told
+
+
+def test_a_map_that_cannot_be_shown_ends_nothing(room: CornerRoom, caplog: pytest.LogCaptureFixture) -> None:
+    class Broken(GridMap):
+        def mesh(self) -> None:  # type: ignore[override]
+            raise MemoryError("Unable to allocate 40 GiB")
+
+    book = Notebook()
+    background = Background(Broken(vertices=[np.zeros((1, 3))]), book, every=1, map_every=3600)
+    background.show(room[0], EXACT.detect(room[0]), Pose(room[0].T_world_camera), {})
+    background.end()
+    assert "viewer: it failed, and the run goes on without it: Unable to allocate 40 GiB" in caplog.text
+    assert not book.maps
+
+
+def test_what_came_last_is_drawn_although_no_frame_follows(room: CornerRoom) -> None:
+    """A live video that stands still."""
+    book = Notebook()
+    background = Background(mapped(room), book, every=1, map_every=3600)
+    for frame in room:
+        background.show(frame, EXACT.detect(frame), Pose(frame.T_world_camera), {})
+    deadline = time.monotonic() + 20
+    while len(book.notes) < 6 and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert [note.index for note in book.notes] == list(range(6))
+    background.end()

@@ -1,0 +1,197 @@
+"""The evidence of a map's blocks against the same, voxel by voxel: updates, merging, and slots that grow."""
+
+import numpy as np
+import pytest
+
+from framework.data import Int32
+from framework.errors import DataError
+from framework.mapping.labels import evidence_rows
+from framework.mapping.labels.evidence_rows import SLOTS, EvidenceRows, Storage, _merge_voxel
+from framework.mapping.labels.label_evidence import MOST_UNITS, Combine, Evidence, best_class, update_voxel
+from framework.mapping.voxels.integration import GROUP, SeenBlocks
+from framework.mapping.voxels.voxel_grid import VoxelGrid
+from tests.support.one_pixel import COVERED, FLOOR, UNITS, blank, distribution, measured, voted
+from tests.support.thread_counts import by_one_thread_and_two
+
+
+def with_voxels(count: int) -> EvidenceRows:
+    """Labels of a map from before, of so many voxels, whose slots hold anything."""
+    labeled = np.full(-(-count // 512) * 512, -1, np.int32)
+    labeled[:count] = np.arange(count)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 100))
+    rows.fill(Evidence(labeled.reshape(-1, 512), *(np.zeros((count, slots)) for slots in (4, 4, 16, 16))))
+    return rows
+
+
+@pytest.mark.parametrize(
+    ("ids", "logs", "merged_ids", "merged_logs"),
+    [
+        ([1, 2, 3, 0], [5, 4, 3, 0], [3, 1, 0, 0], [7, 5, 0, 0]),  # both there: the sum becomes the best
+        ([2, 1, 4, 5], [5, 4, 3, 2], [3, 1, 4, 5], [5, 4, 3, 2]),  # only the dropped one there: it is renamed
+        ([1, 2, 3, 4], [5, 4, -6, 1], [1, 4, 3, 0], [5, 1, -2, 0]),  # evidence against either counts too
+        ([1, 3, 4, 0], [5, 4, 3, 0], [1, 3, 4, 0], [5, 4, 3, 0]),  # the dropped one not there: nothing changes
+    ],
+)
+def test_merging_adds_evidence_and_keeps_the_best_first(
+    ids: list[int], logs: list[float], merged_ids: list[int], merged_logs: list[float]
+) -> None:
+    rows = with_voxels(1)
+    rows.evidence.instance_ids[0], rows.evidence.instance_value[0] = ids, logs
+    rows.merge_instances(3, 2)
+    found = dict(zip(rows.evidence.instance_ids[0].tolist(), rows.evidence.instance_value[0].tolist(), strict=True))
+    assert found == dict(zip(merged_ids, merged_logs, strict=True))
+    assert rows.evidence.instance_ids[0, 0] == merged_ids[0]
+    assert ((rows.evidence.instance_ids[0] > 0) == (np.array(merged_ids) > 0)).all(), "filled from the front"
+
+
+@pytest.mark.parametrize("count", [1, 511, 512, 513, 2000])
+def test_merging_finds_every_voxel(count: int) -> None:
+    """Of thousands, a few know the instance: the first and the last in use, and some between; none beyond."""
+    rows = with_voxels(count)
+    evidence = rows.evidence
+    evidence.instance_ids[: count + 100], evidence.instance_value[: count + 100] = [4, 2, 0, 0], [7, 5, 0, 0]
+    known = np.unique([0, count // 3, count - 1])
+    evidence.instance_ids[known, 1] = 3
+    evidence.instance_ids[count : count + 100, 1] = 3
+    before = evidence.instance_ids[: count + 100].copy()
+    rows.merge_instances(4, 3)
+    expected = before.copy()
+    expected[known] = [4, 0, 0, 0]
+    np.testing.assert_array_equal(evidence.instance_ids[: count + 100], expected)
+    value = np.tile(np.float32([7, 5, 0, 0]), (count + 100, 1))
+    value[known] = [12, 0, 0, 0]
+    np.testing.assert_array_equal(evidence.instance_value[: count + 100], value)
+
+
+def test_too_many_classes_are_refused() -> None:
+    with pytest.raises(DataError, match="255 classes apart, and the detector has 256"):
+        EvidenceRows(VoxelGrid(0.01, 0.05, 10)).begin(256)
+
+
+def at_pixel(block: int, *voxels: int) -> SeenBlocks:
+    """A frame that sees these voxels of one block at the one pixel that there is."""
+    pixel = np.full((1, 512), -1, np.int32)
+    pixel[0, voxels] = 0
+    return seen_at(np.array([block], np.int32), pixel)
+
+
+def seen_at(blocks: Int32, pixels: Int32) -> SeenBlocks:
+    """A frame that sees the voxels of some blocks at pixels (A, 512), -1 = not near."""
+    block, voxel = np.nonzero(pixels >= 0)
+    count = np.bincount(block, minlength=len(blocks))
+    return SeenBlocks(
+        blocks,
+        np.cumsum(count) - count,
+        count.astype(np.int32),
+        voxel.astype(np.uint16),
+        pixels[block, voxel],
+    )
+
+
+def test_only_voxels_that_are_named_have_slots() -> None:
+    for storage in Storage:
+        rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=storage)
+        rows.begin(6)
+        rows.voxels.allocate(np.array([[0, 0, 0], [1, 0, 0]], np.int32))
+        rows.update(at_pixel(1, 7), voted([0, 7], [1.0, 1.0], [3, 2], Combine.SUM))
+        labeled = np.flatnonzero(rows.evidence.labeled[0] >= 0)
+        assert labeled.tolist() == [7]
+        assert rows.voxels.grid.label_row[:2].tolist() == [-1, 0]
+        assert best_class(rows.evidence, rows.evidence.labeled[0, 7]) == 2
+        rows.update(at_pixel(0, 3), voted([0], [1.0], [3], Combine.SUM))
+        assert (rows.row_count, rows.voxel_count) == (1, 1), "nothing was said"
+        assert len(rows.in_use().class_ids) == 1
+
+
+@pytest.mark.parametrize(("blocks", "frames", "max_blocks"), [(4, 40, 4), (4, 40, 400), (3 * GROUP + 5, 8, 400)])
+def test_many_blocks_are_updated_as_voxel_by_voxel(
+    blocks: int, frames: int, max_blocks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Pixels under no, one or several clusters, some without an instance; slots that have to grow, and some that need
+    not; whatever the order of the threads.
+    """
+    monkeypatch.setattr(evidence_rows, "RESERVED", 1 if max_blocks == 4 else 128)
+    first, other = by_one_thread_and_two(lambda: _updated(blocks, frames, max_blocks))
+    for one, two in zip(first, other, strict=True):
+        np.testing.assert_array_equal(one, two)
+
+
+def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
+    """The evidence of some blocks after a few frames, compared with each voxel's own."""
+    rng = np.random.default_rng(3)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, max_blocks))
+    rows.begin(6)
+    rows.voxels.allocate(np.array([[k, 0, 0] for k in range(block_count)], np.int32))
+    by_voxel: dict[tuple[int, int], Evidence] = {}
+    evicted = 0
+    for frame in range(frames):  # in the last of 40 of which no voxel is new
+        instances = [0, 1, 2, 3 + frame]
+        said = voted(instances, [1.0, 0.5, 2.0, 1.5], rng.integers(0, 6, 4).tolist(), Combine.SUM)
+        points = 12
+        cluster = rng.integers(0, 4, points).astype(np.int32)
+        pixel_of = rng.integers(0, 8, points)  # of 10 pixels, so that two are under none
+        lists = [[k for k in cluster[pixel_of == pixel] if instances[k]] for pixel in range(10)]
+        said = said._replace(
+            of_pixel=np.arange(1, 11, dtype=np.int32)[None],
+            first=np.cumsum([0, 0, *map(len, lists)], dtype=np.int32),
+            cluster=np.array([k for clusters in lists for k in clusters], np.int32),
+            absence=np.float32(-0.2),
+        )
+        said = said._replace(class_said=said.class_said.astype(np.int32), most_units=MOST_UNITS)  # as compact storage
+        blocks = rng.permutation(block_count)[1:].astype(np.int32)
+        pixels = rng.integers(-1, 10, (len(blocks), 512)).astype(np.int32)
+        pixels[rng.random(pixels.shape) > 4 / block_count] = -1
+        pixels[-1] = -1
+        rows.update(seen_at(blocks, pixels), said)
+        for a, n in np.argwhere(pixels >= 0).tolist():
+            key, pixel = (int(blocks[a]), n), pixels[a, n]
+            if lists[pixel] or key in by_voxel:
+                evicted += update_voxel(by_voxel.setdefault(key, blank()), 0, said, np.int32(pixel + 1))
+    evidence = rows.in_use()
+    assert len(by_voxel) == rows.voxel_count > 100
+    for (block, n), own in by_voxel.items():
+        voxel = evidence.labeled[rows.voxels.grid.label_row[block], n]
+        for name in SLOTS:
+            np.testing.assert_array_equal(getattr(evidence, name)[voxel], getattr(own, name)[0], err_msg=name)
+    assert rows.evicted == evicted
+    for kept, dropped in ((41, 42), *((2, k) for k in range(3, 42)), (1, 2)):
+        rows.merge_instances(kept, dropped)
+        for own in by_voxel.values():
+            _merge_voxel(own.instance_ids[0], own.instance_value[0], kept, dropped, int(Combine.SUM))
+    for (block, n), own in by_voxel.items():
+        voxel = evidence.labeled[rows.voxels.grid.label_row[block], n]
+        np.testing.assert_array_equal(evidence.instance_ids[voxel], own.instance_ids[0])
+        np.testing.assert_array_equal(evidence.instance_value[voxel], own.instance_value[0])
+    return evidence
+
+
+def test_slots_that_a_new_voxel_gives_away_count() -> None:
+    said = voted([1, 2, 3, 4, 5, 6], [1.0, 2.0, 3.0, 4.0, 5.0, 6.0], [0] * 6, Combine.SUM)
+    expected = update_voxel(blank(), 0, said, COVERED)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10))
+    rows.begin(6)
+    rows.voxels.allocate(np.zeros((1, 3), np.int32))
+    rows.update(at_pixel(0, 5), said)
+    assert rows.evicted == expected == 2
+
+
+def test_exact_storage_never_forgets() -> None:
+    """Many more instances and classes than the compact slots: every sum is there."""
+    rng = np.random.default_rng(0)
+    rows = EvidenceRows(VoxelGrid(0.01, 0.05, 10), storage=Storage.EXACT)
+    rows.begin(30)
+    rows.voxels.allocate(np.zeros((1, 3), np.int32))
+    class_log, instance_log = np.zeros(30), np.zeros(21)
+    for _ in range(100):
+        ids = rng.choice(np.arange(1, 21), 3, replace=False)
+        p = np.array([distribution(rng, 30) for _ in ids])
+        rows.update(at_pixel(0, 5), measured(ids.tolist(), [0.9] * 3, p, 1.0, 20))
+        assert rows.evicted == 0
+        class_log += np.log(p).sum(axis=0)
+        instance_log[ids] += np.log(0.9 / FLOOR)
+    labels, values = rows.evidence.class_ids[0], rows.evidence.class_value[0] / UNITS
+    assert sorted(labels.tolist()) == list(range(30))
+    assert np.allclose(values - values[0], class_log[labels] - class_log[labels[0]], atol=1e-2)
+    named = rows.evidence.instance_ids[0] > 0
+    assert np.allclose(rows.evidence.instance_value[0][named], instance_log[rows.evidence.instance_ids[0][named]])
+    assert named.sum() == 20

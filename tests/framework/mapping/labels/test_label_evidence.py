@@ -1,0 +1,208 @@
+"""The compact Bayesian update against the two recursions written out over all labels."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from framework.mapping.labels.class_slots import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
+from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
+from framework.mapping.labels.label_evidence import (
+    MOST_GAIN,
+    MOST_UNITS,
+    Combine,
+    add_evidence,
+    best_class,
+    best_counted_instance,
+    best_instance,
+    class_said,
+    named_classes,
+    update_voxel,
+)
+from tests.support.one_pixel import BARE, COVERED, FLOOR, UNITS, blank, distribution, measured, voted
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), labels=st.integers(1, INSTANCE_SLOTS))
+def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) -> None:
+    """With no more labels than slots, nothing is ever dropped, so posteriors are exact: eqs. [7] and [8]."""
+    rng = np.random.default_rng(seed)
+    classes = labels  # every class is named
+    evidence = blank()
+    instance_log = np.zeros(labels + 1)  # [0]: every other instance
+    class_log = np.zeros(classes)
+    for _ in range(20):
+        instance = int(rng.integers(1, labels + 1))
+        score = float(rng.uniform(0.2, 1))
+        p = distribution(rng, classes)
+        evicted = update_voxel(evidence, 0, measured([instance], [score], p[None], 1.0, labels), COVERED)
+        assert evicted == 0
+        # P(O = instance) = score, P(O = any other) = FLOOR
+        instance_log += np.log(FLOOR)
+        instance_log[instance] += np.log(score / FLOOR)
+        class_log += np.log(p)
+    found = {int(i): float(v) for i, v in zip(evidence.instance_ids[0], evidence.instance_value[0], strict=True) if i}
+    for i, log in found.items():
+        assert abs(log - (instance_log[i] - instance_log[0])) < 1e-3
+    assert best_instance(evidence, 0) == 1 + np.argmax(instance_log[1:])
+    order = evidence.class_ids[0][: min(classes, CLASS_SLOTS)]
+    ours = evidence.class_value[0][: len(order)] / UNITS
+    exact = class_log[order]
+    assert np.allclose(ours - ours[0], exact - exact[0], atol=2e-3)
+    assert best_class(evidence, 0) == np.argmax(class_log)
+
+
+def test_agrees_with_the_full_recursion_for_eighty_classes() -> None:
+    """More classes than slots: the argmax still agrees nearly always, and evictions are counted."""
+    rng = np.random.default_rng(0)
+    agree = 0
+    evictions = 0
+    voxels = 300
+    for _ in range(voxels):
+        evidence = blank()
+        log = np.zeros(80)
+        true = int(rng.integers(80))
+        for _ in range(12):
+            logits = rng.normal(0, 1, 80)
+            logits[true] += 2.5
+            p = np.exp(logits) / np.exp(logits).sum()
+            p = 0.9 * p + 0.1 / 80
+            log += np.log(p)
+            evictions += update_voxel(evidence, 0, measured([1], [0.9], p[None], 1.0, 1), COVERED)
+        agree += best_class(evidence, 0) == np.argmax(log)
+    assert agree >= 0.97 * voxels
+    assert evictions > 0
+
+
+def test_a_voxel_under_two_masks_hears_both() -> None:
+    evidence = blank()
+    p = np.full((2, 3), 1 / 3)
+    update_voxel(evidence, 0, measured([1, 2], [0.9, 0.5], p, 1.0, 2), COVERED)
+    found = dict(zip(evidence.instance_ids[0].tolist(), evidence.instance_value[0].tolist(), strict=True))
+    assert found[1] == np.float32(np.log(0.9 / FLOOR))
+    assert found[2] == np.float32(np.log(0.5 / FLOOR))
+
+
+def test_absence_counts_only_against_instances_found_in_the_frame() -> None:
+    evidence = blank()
+    one = np.full((1, 3), 1 / 3)
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), COVERED)
+    before = float(evidence.instance_value[0, 0])
+    update_voxel(evidence, 0, measured([2], [0.9], one, 0.5, 2), BARE)  # instance 2 found, not here
+    assert float(evidence.instance_value[0, 0]) == before
+    update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)  # instance 1 found, not here
+    assert float(evidence.instance_value[0, 0]) == np.float32(before + np.log(0.5))
+    for _ in range(10):
+        update_voxel(evidence, 0, measured([1], [0.9], one, 0.5, 2), BARE)
+    assert best_instance(evidence, 0) == 0, "the rest has become more likely"
+
+
+def test_a_cluster_without_instance_says_nothing() -> None:
+    evidence = blank()
+    update_voxel(evidence, 0, measured([0], [0.9], np.full((1, 3), 1 / 3), 0.5, 1), COVERED)
+    assert (evidence.instance_ids == 0).all()
+    assert (evidence.class_ids == NO_CLASS).all()
+
+
+def test_class_gains_are_relative_to_the_classes_not_named() -> None:
+    p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
+    gains, named, bits = named_classes(np.log(p), logarithmic=True)
+    assert named.tolist() == [list(range(NEW_CLASSES))]
+    assert bits[0, :NEW_CLASSES].tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
+    assert not bits[0, NEW_CLASSES:].any()
+    rest = p[0, NEW_CLASSES:].mean()
+    assert np.allclose(gains, np.log(p / rest), atol=1e-5)
+
+
+def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
+    labels, logs = np.arange(1, 5, dtype=np.int32), np.float32([4, 1, 2, 3])
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(0.5), Combine.SUM, np.float32(9)) == 1
+    assert labels.tolist() == [1, 2, 3, 4], "the newcomer itself is the least likely"
+    assert add_evidence(labels, logs, 0, np.int32(9), np.float32(1.5), Combine.SUM, np.float32(9)) == 1
+    assert dict(zip(labels.tolist(), logs.tolist(), strict=True)) == {1: 4, 9: 1.5, 3: 2, 4: 3}
+
+
+def test_the_likeliest_instance_that_counts_need_not_be_the_likeliest() -> None:
+    evidence = blank()
+    evidence.instance_ids[0], evidence.instance_value[0] = [1, 5, 3, 2], [9, 4, 7, -1]
+    counts = np.ones(6, np.bool_)
+    assert best_counted_instance(evidence, 0, counts) == 1
+    counts[1] = False
+    assert best_counted_instance(evidence, 0, counts) == 3
+    counts[[3, 5]] = False
+    assert best_counted_instance(evidence, 0, counts) == 0, "the rest is likelier than 2"
+
+
+SEEN = [([1], [0.9], [2]), ([2], [0.4], [3]), ([2], [0.5], [3]), ([3], [0.6], [2])]
+"""What four frames say of a voxel: instances, scores, classes."""
+
+
+@pytest.mark.parametrize(
+    ("combine", "weighed", "instance", "label"),
+    [
+        (Combine.SUM, False, 2, 2),  # counts: instance 2 twice; classes 2 and 3 twice each, and the smaller one wins
+        (Combine.LARGEST, True, 1, 2),
+        (Combine.LATEST, False, 3, 2),
+    ],
+)
+def test_the_other_rules(combine: Combine, weighed: bool, instance: int, label: int) -> None:
+    evidence = blank()
+    for ids, scores, classes in SEEN:
+        update_voxel(evidence, 0, voted(ids, scores if weighed else [1.0], classes, combine), COVERED)
+    assert best_instance(evidence, 0) == instance
+    assert best_class(evidence, 0) == label
+
+
+def test_the_later_of_two_clusters_over_one_pixel_is_what_was_written_last() -> None:
+    evidence = blank()
+    update_voxel(evidence, 0, voted([1, 2], [1.0, 1.0], [4, 5], Combine.LATEST), COVERED)
+    assert best_instance(evidence, 0) == 2
+    assert best_class(evidence, 0) == 5
+    assert (evidence.instance_ids[0, 1:] == 0).all()
+
+
+def test_counts_are_counts() -> None:
+    evidence = blank()
+    for _ in range(3):
+        assert update_voxel(evidence, 0, voted([7], [1.0], [2], Combine.SUM), COVERED) == 0
+    assert evidence.instance_value[0].tolist() == [3, 0, 0, 0]
+    assert evidence.class_value[0, 0] == 300, "units"
+    assert evidence.class_ids[0].tolist() == [2, *[NO_CLASS] * (CLASS_SLOTS - 1)]
+
+
+def test_small_numbers_saturate_and_do_not_wrap() -> None:
+    evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
+    said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(most_units=MOST_UNITS)
+    gains = np.zeros((2, 6))
+    gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
+    bits = (said.class_said & ALL_NAMED).astype(np.uint8)
+    for _ in range(40):
+        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits, np.int32)), COVERED)
+    assert evidence.class_value[0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
+    assert best_class(evidence, 0) == 2
+
+
+@pytest.mark.parametrize(("classes", "best"), [(2, 0.7), (3, 0.6), (9, 0.8), (80, 0.5)])
+def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classes: int, best: float) -> None:
+    """The same distribution 1000 times, its best class the last one and most of the rest on the first."""
+    p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
+    p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
+    gains, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
+    evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
+    said = measured([1], [0.9], p, 1.0, 1)._replace(
+        class_said=class_said(gains, 64, bits, np.int32), named_classes=named, most_units=MOST_UNITS
+    )
+    for _ in range(1000):
+        update_voxel(evidence, 0, said, COVERED)
+        assert best_class(evidence, 0) == classes - 1
+
+
+def test_both_kinds_of_integers_say_the_same() -> None:
+    """The largest gains that compact storage allows."""
+    gains = np.array([[MOST_GAIN, -MOST_GAIN, 0.4, -0.6]])
+    bits = np.zeros((1, NO_CLASS + 1), np.uint8)
+    bits[0, :4] = 1 << np.arange(4)
+    narrow, wide = (class_said(gains, 1, bits, kind) for kind in (np.int32, np.int64))
+    assert narrow.dtype == np.int32
+    np.testing.assert_array_equal(narrow, wide)
+    assert (wide[0, :4] >> NEW_CLASSES).tolist() == [MOST_GAIN, -MOST_GAIN, 0, -1]

@@ -1,0 +1,100 @@
+"""A map's file whose arrays are not those of a map is refused in one line, before a kernel reads them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.errors import DataError
+from framework.interfaces import MapFuser, SceneMap
+from tests.support import registered
+from tests.support.scenes.analytic_scene import room, walk
+from tests.support.true_masks import fuse_masks, masks_of
+
+FAR = 100_000_000
+
+
+@pytest.fixture(scope="module", params=registered.names("fuser"))
+def saved(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[type[SceneMap], Path]:
+    """A map and its file."""
+    fuser: MapFuser = registered.built("fuser", request.param, "fuser.voxel_size=0.04")
+    for k, T in enumerate(walk(2)):
+        frame = room().frame(T, k)
+        fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3)
+    path = tmp_path_factory.mktemp(request.param) / "map.npz"
+    fuser.scene.save(path)
+    return type(fuser.scene), path
+
+
+def content(path: Path) -> dict[str, np.ndarray]:
+    with np.load(path) as file:
+        return dict(file)
+
+
+def refused(kind: type[SceneMap], path: Path, changes: dict[str, np.ndarray]) -> str:
+    """What is said of the file with some arrays replaced."""
+    np.savez(path.with_name("changed.npz"), **(content(path) | changes))
+    with pytest.raises(DataError) as caught:
+        kind.load(path.with_name("changed.npz"))
+    message = str(caught.value)
+    assert "\n" not in message
+    assert "changed.npz" in message
+    return message
+
+
+def test_another_type_or_shape_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+    kind, path = saved
+    for name, array in content(path).items():
+        if name != "header":
+            other = np.float64 if array.dtype != np.float64 else np.float32
+            assert name in refused(kind, path, {name: array.astype(other)})
+            assert name in refused(kind, path, {name: array[..., None]})
+            assert array.ndim == 1 or name in refused(kind, path, {name: array[..., :-1]})
+            refused(kind, path, {name: array[:-1]})  # which of two arrays has the wrong length cannot be known
+
+
+def test_numbers_of_rows_instances_and_classes_that_there_are_not_are_refused(
+    saved: tuple[type[SceneMap], Path],
+) -> None:
+    kind, path = saved
+    arrays = content(path)
+    for name, wrong in [
+        ("label_row", FAR),
+        ("label_row", -2),
+        ("instance_ids", FAR),
+        ("instance_ids", -1),
+        ("instance", FAR),
+        ("class_ids", 200),
+        ("block_coords", FAR),
+    ]:
+        if name in arrays:
+            changed = arrays[name].copy()
+            changed.flat[len(changed) // 2] = wrong
+            assert name in refused(kind, path, {name: changed})
+    twice = arrays["block_coords"].copy()
+    twice[1] = twice[0]
+    assert "block_coords" in refused(kind, path, {"block_coords": twice})
+
+
+def test_a_header_with_something_else_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+    kind, path = saved
+    header: dict[str, Any] = json.loads(content(path)["header"].tobytes())
+    others: dict[str, Any] = {"sensor": [1], "settings": [1], "voxel_size": 0, "classes": 3}
+    if "table" in header:
+        table = header["table"]
+        others["table"] = table | {"instances": [one | {"class_evidence": [0.5]} for one in table["instances"]]}
+    for key in header.keys() & others.keys():
+        changed = json.dumps(header | {key: others[key]}).encode()
+        refused(kind, path, {"header": np.frombuffer(changed, np.uint8)})
+
+
+def test_a_header_that_lacks_something_is_refused(saved: tuple[type[SceneMap], Path]) -> None:
+    kind, path = saved
+    header: dict[str, Any] = json.loads(content(path)["header"].tobytes())
+    for key in header.keys() - {"format"}:
+        less = json.dumps({name: value for name, value in header.items() if name != key})
+        assert key in refused(kind, path, {"header": np.frombuffer(less.encode(), np.uint8)})

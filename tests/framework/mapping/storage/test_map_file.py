@@ -1,0 +1,71 @@
+"""A map's file: any array comes back, numpy reads it, and damage is found."""
+
+from __future__ import annotations
+
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.errors import DataError
+from framework.mapping.storage.map_file import read_map, write_map
+
+RNG = np.random.default_rng(0)
+HEADER = {"format": 7, "names": ["a", "b"], "none": None}
+ARRAYS = {
+    "noise": RNG.integers(-(2**15), 2**15, (300, 512), np.int16),
+    "few": RNG.integers(0, 3, (64, 512, 4), np.int32),
+    "zeros": np.zeros((1000, 512), np.float32),
+    "strided": RNG.normal(0, 1, (40, 60)).astype(np.float32)[::2, ::3],
+    "flags": np.array([True, False]),
+    "empty": np.zeros((0, 512), np.uint8),
+}
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    write_map(tmp_path / "map.npz", HEADER, ARRAYS)
+    return tmp_path / "map.npz"
+
+
+def test_header_and_arrays_come_back(saved: Path) -> None:
+    header, arrays = read_map(saved, 7, list(ARRAYS))
+    assert header.values == HEADER
+    with np.load(saved) as file:
+        assert file.files == ["header", *ARRAYS]
+        for name, array in ARRAYS.items():
+            for found in (arrays[name], file[name]):
+                assert found.dtype == array.dtype
+                np.testing.assert_array_equal(found, array)
+
+
+def test_the_same_arrays_give_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+    write_map(tmp_path / "again.npz", HEADER, {name: array.copy() for name, array in ARRAYS.items()})
+    assert (tmp_path / "again.npz").read_bytes() == saved.read_bytes()
+    with zipfile.ZipFile(saved) as archive:
+        assert {info.date_time for info in archive.infolist()} == {(1980, 1, 1, 0, 0, 0)}, "the same at another time"
+
+
+def test_it_is_lightly_compressed(saved: Path) -> None:
+    with zipfile.ZipFile(saved) as archive:
+        sizes = {info.filename: info.compress_size for info in archive.infolist()}
+        few = archive.read("few.npy")
+    assert sizes["few.npy"] < len(few) / 4
+    assert sizes["zeros.npy"] < 20000
+    by_zlib = zlib.compressobj(1, wbits=-15)
+    assert sizes["few.npy"] == len(by_zlib.compress(few) + by_zlib.flush())
+
+
+def test_a_changed_byte_is_found(saved: Path) -> None:
+    content = bytearray(saved.read_bytes())
+    content[len(content) // 3] ^= 0x10
+    saved.write_bytes(content)
+    with pytest.raises(DataError, match=r"map\.npz"):
+        read_map(saved, 7, list(ARRAYS))
+
+
+def test_another_format_is_refused(saved: Path) -> None:
+    with pytest.raises(DataError, match="it has map format 7, this version reads 8"):
+        read_map(saved, 8, list(ARRAYS))

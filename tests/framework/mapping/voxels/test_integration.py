@@ -1,0 +1,276 @@
+"""The TSDF against a slow reference and against exact surfaces."""
+
+import tracemalloc
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from framework.data import Frame
+from framework.errors import FrameError, MapFullError
+from framework.geometry import inverse
+from framework.mapping.voxels import integration
+from framework.mapping.voxels.integration import GOLDEN, LEAST_BEHIND, Integrator, SeenBlocks
+from framework.mapping.voxels.integration_parameters import Sensor
+from framework.mapping.voxels.tsdf import VoxelHashing
+from framework.mapping.voxels.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
+from framework.registry import assemble
+from tests.support.scenes.analytic_scene import CAMERA, pose, room, walk
+from tests.support.thread_counts import by_one_thread_and_two
+
+SENSOR = Sensor(*map(np.float32, (0.08, 0.01, 0.2, 4.0, 100.0, 1.5)))
+VOXEL = 0.02
+
+
+def new_integrator() -> Integrator:
+    return Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), SENSOR)
+
+
+def seen_by(integrator: Integrator, frame: Frame, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The blocks that a frame has updated, and the pixels that see their voxels near the surface, -1 for the others."""
+    seen = integrator.integrate(frame, T_world_camera, VOXEL)
+    pixels = np.full((len(seen.blocks), 512), -1)
+    for a, (first, count) in enumerate(zip(seen.near_first, seen.near_count, strict=True)):
+        voxels = seen.near_voxel[first : first + count]
+        assert (np.diff(voxels.astype(int)) > 0).all()
+        pixels[a, voxels] = seen.near_pixel[first : first + count]
+    return seen.blocks, pixels
+
+
+def test_one_frame_equals_the_definition_voxel_by_voxel() -> None:
+    """Every voxel of the active blocks, in double precision and plain numpy."""
+    frame = room().frame(pose(0.1, -0.05, 0.0, (0.1, -0.2, 0.05)))
+    integrator = new_integrator()
+    active, near_pixel = seen_by(integrator, frame, frame.T_world_camera)
+    grid = integrator.voxels.grid
+    i, j, k = np.meshgrid(*[np.arange(8)] * 3, indexing="ij")
+    offsets = np.stack([i, j, k], axis=-1).transpose(2, 1, 0, 3).reshape(-1, 3)
+    points = (grid.block_coords[active][:, None] * 8 + offsets) * VOXEL
+    T_camera_world = inverse(frame.T_world_camera)
+    p = points @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    u = CAMERA.fx * p[..., 0] / p[..., 2] + CAMERA.cx
+    v = CAMERA.fy * p[..., 1] / p[..., 2] + CAMERA.cy
+    column, row = np.floor(u + 0.5).astype(int), np.floor(v + 0.5).astype(int)
+    inside = (p[..., 2] > SENSOR.min_depth) & (column >= 0) & (row >= 0)
+    inside &= (column < CAMERA.width) & (row < CAMERA.height)
+    d = np.where(inside, frame.depth[row.clip(0, CAMERA.height - 1), column.clip(0, CAMERA.width - 1)], 0)
+    band = SENSOR.truncation + SENSOR.truncation_slope * d
+    seen = inside & (d > SENSOR.min_depth) & (d < SENSOR.max_depth) & (d - p[..., 2] >= -band)
+    distance = np.minimum(d - p[..., 2], band)
+    # a voxel on the border between two pixels or at the edge of the band may fall to either side in float32
+    clear = (np.abs(u + 0.5 - np.round(u + 0.5)) > 1e-3) & (np.abs(v + 0.5 - np.round(v + 0.5)) > 1e-3)
+    clear &= (np.abs(d - p[..., 2] + band) > 1e-4) & inside
+    stored = grid.tsdf[active]
+    assert ((stored != UNSEEN) == seen)[clear].all()
+    both = clear & seen
+    assert both.sum() > 20_000
+    unit = SENSOR.max_truncation / TSDF_MAX
+    assert np.abs(stored * unit - distance)[both].max() < 2e-5
+    near = np.where(seen & (np.abs(d - p[..., 2]) <= VOXEL), row * CAMERA.width + column, -1)
+    clear_band = clear & (np.abs(np.abs(d - p[..., 2]) - VOXEL) > 1e-4)
+    assert (near_pixel == near)[clear_band].all()
+    behind = np.clip((band + d - p[..., 2]) / (SENSOR.truncation - VOXEL), LEAST_BEHIND, 1)
+    expected_weight = behind * np.minimum(1, (SENSOR.full_weight_depth / np.maximum(d, 1e-9)) ** 2) * WEIGHT_ONE
+    assert np.abs(grid.weight[active] - np.maximum(expected_weight, 1))[both].max() < 1.001
+
+
+@pytest.mark.parametrize("promised", [100_000, 10], ids=["reserved", "memory is counted by what is asked for"])
+def test_a_frame_that_sees_more_blocks_takes_no_memory_that_was_reserved(
+    monkeypatch: pytest.MonkeyPatch, promised: int
+) -> None:
+    monkeypatch.setattr(integration, "reserved", lambda most, make: make(min(most, promised)))
+    integrator, T = new_integrator(), walk(1)[0]
+    frame = room().frame(T, 0)
+    left = replace(frame, depth=np.where(np.arange(CAMERA.width) < 20, frame.depth, np.float32(0.0)))
+    few = integrator.integrate(left, T, VOXEL)
+    more = integrator.integrate(frame, T, VOXEL)
+    assert len(more.blocks) > 2 * len(few.blocks) > 20
+    assert np.shares_memory(few.near_pixel, more.near_pixel) == (promised == 100_000)
+
+    alone = new_integrator().integrate(frame, T, VOXEL)
+    assert near_pixels(more) == near_pixels(alone)
+
+
+def near_pixels(seen: SeenBlocks) -> list[int]:
+    """The pixels that see voxels near the surface, as often as they see one."""
+    parts = zip(seen.near_first.tolist(), seen.near_count.tolist(), strict=True)
+    return sorted(p for first, count in parts for p in seen.near_pixel[first : first + count].tolist())
+
+
+def test_every_voxel_near_the_surface_is_seen() -> None:
+    """Blocks are allocated for the whole band, not only where a ray happens to pass."""
+    frame = room().frame(pose())
+    integrator = new_integrator()
+    integrator.integrate(frame, frame.T_world_camera, VOXEL)
+    v, u = np.nonzero(frame.depth)
+    d = frame.depth[v, u]
+    surface = np.stack([(u - CAMERA.cx) / CAMERA.fx * d, (v - CAMERA.cy) / CAMERA.fy * d, d], axis=-1)
+    blocks = {tuple(c) for c in integrator.voxels.grid.block_coords[: integrator.voxels.block_count]}
+    wanted = {tuple(c) for c in np.floor(surface / (8 * VOXEL)).astype(int)}
+    assert len(wanted - blocks) <= 0.02 * len(wanted), (
+        "only corners that less than a stride of pixels sees may be missed"
+    )
+
+
+def test_averages_have_no_rounding_bias() -> None:
+    """A constant that is no multiple of the stored unit is met on average, though values are stored as integers."""
+    rounding = [(k * GOLDEN) % 1.0 for k in range(1, 1001)]
+    assert abs(np.mean(np.floor(0.3 + np.array(rounding))) - 0.3) < 0.01
+
+
+@pytest.mark.parametrize("frame_number", [987, 2584, 121393])
+def test_rounding_does_not_wrap_round(frame_number: int) -> None:
+    """At these frames frac(k * GOLDEN) is all but 1; air at the widest truncation stays air and white stays white."""
+    assert (frame_number * GOLDEN) % 1.0 > 0.9995
+    scene = room()
+    frame = scene.frame(pose())
+    frame.color[:] = 255
+    integrator = Integrator(VoxelGrid(VOXEL, 0.08, 100_000), SENSOR._replace(truncation_slope=np.float32(0.0)))
+    for number in (1, frame_number):
+        integrator.frames = number - 1
+        active, near = seen_by(integrator, frame, np.eye(4))
+    grid = integrator.voxels.grid
+    seen = grid.weight[active] > 0
+    assert (grid.tsdf[active][seen] != UNSEEN).all()
+    assert (grid.tsdf[active][seen] == TSDF_MAX).sum() > 10_000
+    assert (channels(grid.color[active][near >= 0]) == 255).all()
+
+
+def channels(packed: np.ndarray) -> np.ndarray:
+    """(N, 3) red, green, blue in levels."""
+    return np.stack([packed & 1023, (packed >> 10) & 1023, (packed >> 20) & 1023], axis=-1) / 4
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.1, 7.0])
+def test_readings_outside_the_range_of_the_sensor_allocate_nothing(depth: float) -> None:
+    frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), np.full(CAMERA.shape, depth, np.float32), CAMERA)
+    integrator = new_integrator()
+    integrator.integrate(frame, np.eye(4), VOXEL)
+    assert integrator.voxels.block_count == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "T", "error", "said"),
+    [
+        (
+            {"voxel_size": 1e-4, "truncation_slope": 1.0, "max_depth": 1000.0},
+            0.0,
+            MapFullError,
+            "blocks deep, more than",
+        ),
+        ({"voxel_size": 1e-4, "truncation": 50.0}, 0.0, MapFullError, "one frame asks for [0-9]+ blocks or more"),
+        ({"voxel_size": 1e-3}, 9e3, FrameError, "sees 90[0-9.]+ m from the origin"),
+    ],
+)
+def test_what_one_frame_asks_for_is_limited_before_memory_is(
+    options: dict[str, float], T: float, error: type[Exception], said: str
+) -> None:
+    volume = assemble(VoxelHashing, max_blocks=1000, **options).new_volume()
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = T
+    depth = np.linspace(0.5, 4.5, CAMERA.width * CAMERA.height, dtype=np.float32).reshape(CAMERA.shape)
+    frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth, CAMERA)
+    tracemalloc.start()
+    try:
+        with pytest.raises(error, match=said):
+            volume.integrate(frame, T_world_camera, 0.01)
+        assert tracemalloc.get_traced_memory()[1] < 3e8
+    finally:
+        tracemalloc.stop()
+
+
+def test_color_belongs_to_the_surface_and_not_to_the_air_before_it() -> None:
+    frame = room().frame(pose())
+    frame.color[:] = (10, 200, 90)
+    sensor = SENSOR._replace(truncation_slope=np.float32(0.0))
+    integrator = Integrator(VoxelGrid(VOXEL, sensor.max_truncation, 100_000), sensor)
+    active, near = seen_by(integrator, frame, np.eye(4))
+    grid = integrator.voxels.grid
+    assert np.abs(channels(grid.color[active][near >= 0]) - (10, 200, 90)).max() <= 0.25
+    air = grid.tsdf[active] == TSDF_MAX
+    assert air.sum() > 1000
+    assert (grid.color[active][air] == 0).all()
+
+
+def test_air_has_no_colour_to_be_averaged_with() -> None:
+    """A wall comes nearer to where air was seen before: its colour is its own, not a mixture with black."""
+    integrator = new_integrator()
+    for depth, frames in ((1.5, 5), (1.4, 13)):
+        wall = np.full(CAMERA.shape, depth, np.float32)
+        frame = Frame(0, 0.0, np.full((*CAMERA.shape, 3), 200, np.uint8), wall, CAMERA)
+        for _ in range(frames):
+            integrator.integrate(frame, np.eye(4), VOXEL)
+    grid = integrator.voxels.grid
+    packed = grid.color[: integrator.voxels.block_count]
+    assert (packed == 0).any()
+    assert np.abs(channels(packed[packed > 0]) - 200).max() <= 0.25
+
+
+def test_old_surfaces_give_way_at_the_greatest_weight() -> None:
+    """The weight stops at max_weight, in the stored unit, at the highest that may be set too."""
+    frame = room().frame(pose())
+    for most in (3.0, 255.0):
+        sensor = SENSOR._replace(max_weight=np.float32(most), full_weight_depth=np.float32(100.0))
+        integrator = Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), sensor)
+        for _ in range(int(most) + 3):
+            integrator.integrate(frame, np.eye(4), VOXEL)
+        assert integrator.voxels.grid.weight[: integrator.voxels.block_count].max() == most * WEIGHT_ONE
+
+
+def test_noise_averages_out() -> None:
+    """40 frames with 10 mm noise leave about 10 / sqrt(40) mm in the voxels at the surface."""
+    frame = room().frame(pose())
+    integrator = new_integrator()
+    rng = np.random.default_rng(0)
+    for _ in range(40):
+        noisy = (frame.depth + rng.normal(0, 0.01, frame.depth.shape)).astype(np.float32)
+        integrator.integrate(Frame(0, 0.0, frame.color, noisy, CAMERA), np.eye(4), VOXEL)
+    clean = new_integrator()
+    clean.integrate(frame, np.eye(4), VOXEL)
+    n = min(integrator.voxels.block_count, clean.voxels.block_count)
+    ours = {tuple(c): b for b, c in enumerate(integrator.voxels.grid.block_coords[: integrator.voxels.block_count])}
+    unit = SENSOR.max_truncation / TSDF_MAX
+    errors = []
+    for block in range(n):
+        other = ours.get(tuple(clean.voxels.grid.block_coords[block]))
+        near = np.abs(clean.voxels.grid.tsdf[block] * unit) < 0.02
+        if other is not None:
+            difference = integrator.voxels.grid.tsdf[other].astype(float) - clean.voxels.grid.tsdf[block]
+            errors.append(difference[near] * unit)
+    assert np.std(np.concatenate(errors)) == pytest.approx(0.01 / np.sqrt(40), rel=0.15)
+
+
+def test_carving_removes_what_is_seen_through() -> None:
+    """A sphere that is taken away disappears from the map once the wall behind it has been seen often enough."""
+    scene, empty = room(), room()
+    empty.spheres = []
+    integrator = new_integrator()
+    integrator.integrate(scene.frame(pose()), np.eye(4), VOXEL)
+    grid = integrator.voxels.grid
+    before = int(
+        ((grid.tsdf[: integrator.voxels.block_count] < 0) & (grid.weight[: integrator.voxels.block_count] > 0)).sum()
+    )
+    for _ in range(10):
+        integrator.integrate(empty.frame(pose()), np.eye(4), VOXEL)
+    bare = new_integrator()
+    bare.integrate(empty.frame(pose()), np.eye(4), VOXEL)
+    center = np.array([-0.5, 0.6, 1.62])  # on the first sphere's front
+    block = {tuple(c): b for b, c in enumerate(grid.block_coords[: integrator.voxels.block_count])}
+    voxel = np.round(center / VOXEL).astype(int)
+    b = block[tuple(voxel >> 3)]
+    x, y, z = voxel & 7
+    assert integrator.voxels.grid.tsdf[b, (z * 8 + y) * 8 + x] > 0
+    assert before > 0
+
+
+def test_the_map_does_not_depend_on_the_number_of_threads() -> None:
+    def integrated() -> list[bytes]:
+        integrator = new_integrator()
+        for k, T in enumerate(walk(4)):
+            integrator.integrate(room().frame(T, k), T, VOXEL)
+        n = integrator.voxels.block_count
+        grid = integrator.voxels.grid
+        return [a[:n].tobytes() for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color)]
+
+    by_one, by_two = by_one_thread_and_two(integrated)
+    assert by_one == by_two

@@ -1,0 +1,169 @@
+"""Views of the map against closed-form depth, normals and colour."""
+
+import numpy as np
+import pytest
+
+from framework.data import Camera, Frame
+from framework.mapping.labels.evidence_rows import EvidenceRows
+from framework.mapping.voxels.integration import Integrator
+from framework.mapping.voxels.integration_parameters import Sensor, pinhole
+from framework.mapping.voxels.raycasting import TILE, cast_coarse, cast_view, render, render_near, tile_bounds
+from framework.mapping.voxels.voxel_grid import VoxelGrid
+from framework.mapping.voxels.voxel_walk import inverses, leave_cell
+from framework.sensors.noise_models import axial_sigma_single
+from tests.support.scenes.analytic_scene import Scene, pose, room, walk
+
+VOXEL = 0.02
+SENSOR = Sensor(*map(np.float32, (4 * VOXEL, 0.0, 0.2, 4.0, 100.0, 10.0)))
+CAMERA = Camera(320, 240, 262.0, 262.0, 159.5, 119.5)
+
+
+def mapped(scene: Scene, poses: list[np.ndarray]) -> VoxelGrid:
+    integrator = Integrator(VoxelGrid(VOXEL, SENSOR.max_truncation, 100_000), SENSOR)
+    for k, T in enumerate(poses):
+        integrator.integrate(scene.frame(T, k, CAMERA), T, VOXEL)
+    return integrator.voxels
+
+
+@pytest.mark.parametrize("slant", [0.0, 0.4, 0.8, 1.1])
+def test_depth_of_a_slanted_plane_is_unbiased(slant: float) -> None:
+    """Half-pixel and half-voxel faults show as a bias that changes sign with the slant."""
+    n = np.array([np.sin(slant), 0.3, -np.cos(slant)]) / np.linalg.norm([np.sin(slant), 0.3, -np.cos(slant)])
+    scene = Scene(planes=[(n, n @ np.array([0.0, 0.0, 1.8]))])
+    voxels = mapped(scene, walk(20))
+    T = pose(0.05, 0.02, 0.03, (0.02, 0.03, 0.0))
+    view = render(voxels, EvidenceRows(voxels).evidence, SENSOR, CAMERA, T)
+    exact, _, _ = scene.render(CAMERA, T)
+    both = (view.depth > 0) & (exact > 0)
+    assert both.mean() > 0.5 * (exact[exact < 3.5] > 0).mean() * (exact < 3.5).mean()
+    error = (view.depth - exact)[both]
+    assert np.median(np.abs(error)) < 0.1 * VOXEL
+    assert abs(np.median(error)) < 0.05 * VOXEL
+    assert np.median(view.normals_world[both] @ n) > 0.999
+
+
+def test_noise_does_not_push_a_far_wall_away() -> None:
+    """Readings too near and too far must weigh alike around a surface, where noise is wider than a voxel."""
+    voxel, depth = 0.01, 4.0
+    sensor = Sensor(*map(np.float32, (4 * voxel, 0.01, 0.2, 5.0, 200.0, 1.5)))
+    integrator = Integrator(VoxelGrid(voxel, sensor.max_truncation, 100_000), sensor)
+    rng = np.random.default_rng(0)
+    camera = Camera(80, 60, 65.5, 65.5, 39.5, 29.5)
+    for _ in range(60):
+        wall = rng.normal(depth, axial_sigma_single(np.float32(depth)), camera.shape).astype(np.float32)
+        frame = Frame(0, 0.0, np.zeros((*camera.shape, 3), np.uint8), wall, camera)
+        integrator.integrate(frame, np.eye(4), voxel)
+    seen, _ = cast_view(integrator.voxels, sensor, camera, np.eye(4))
+    assert abs(np.median(seen[seen > 0]) - depth) < 0.2 * voxel
+
+
+def test_depth_of_spheres_and_coverage() -> None:
+    scene = room()
+    voxels = mapped(scene, walk(30))
+    T = walk(30)[15]
+    view = render(voxels, EvidenceRows(voxels).evidence, SENSOR, CAMERA, T)
+    exact, color, surface = scene.render(CAMERA, T)
+    on_sphere = surface > len(scene.planes)
+    both = (view.depth > 0) & on_sphere
+    assert both.sum() > 0.9 * on_sphere.sum(), "the map has no holes where the camera has looked"
+    assert np.median(np.abs(view.depth - exact)[both]) < 0.1 * VOXEL
+    assert np.median(np.abs(view.color.astype(float) - color)[both]) < 6
+    assert (view.instance_ids == 0).all()
+    assert (view.class_ids == -1).all()
+
+
+def test_views_from_outside_and_of_an_empty_map() -> None:
+    voxels = mapped(room(), [pose()])
+    evidence = EvidenceRows(voxels).evidence
+    away = render(voxels, evidence, SENSOR, CAMERA, pose(rotvec=(0, np.pi, 0)))
+    assert (away.depth == 0).all()
+    behind = render(voxels, evidence, SENSOR, CAMERA, pose(z=5.0, rotvec=(0, np.pi, 0)))
+    assert (behind.depth == 0).mean() > 0.95, "the back of a surface is not a surface"
+    empty = VoxelGrid(VOXEL, SENSOR.max_truncation, 10)
+    nothing = render(empty, EvidenceRows(empty).evidence, SENSOR, CAMERA, pose())
+    assert (nothing.depth == 0).all()
+
+
+@pytest.mark.parametrize("d", [0.0, -0.0, 1e-20, -1e-20])
+def test_a_ray_along_a_slab_leaves_it_by_another_side(d: float) -> None:
+    """Else it would crawl through unmapped space a thousandth of a voxel at a time, as the middle column of a camera
+    with cx at a pixel's centre does.
+    """
+    direction = tuple(np.float32([d, d, 1.0]))
+    start = tuple(np.float32([0.03, -0.05, 0.01]))
+    side = np.float32(0.16)
+    assert leave_cell(np.float32(0.0), start, direction, inverses(direction), side, 1 / side) == pytest.approx(0.15)
+
+
+@pytest.mark.parametrize("d", [0.3, -0.3])
+def test_a_slanted_ray_leaves_its_cell_by_the_nearest_border(d: float) -> None:
+    direction = tuple(np.float32([d, 0.0, 1.0]))
+    start = tuple(np.float32([0.02 if d < 0 else 0.14, 0.0, 0.0]))
+    side = np.float32(0.16)
+    z = leave_cell(np.float32(0.0), start, direction, inverses(direction), side, 1 / side)
+    assert z == pytest.approx(0.02 / 0.3, rel=1e-4)
+
+
+@pytest.mark.parametrize("k", range(6))
+def test_bounds_and_interpolation_lose_nothing(k: int) -> None:
+    """Every pixel searched from the nearest to the farthest depth shows no surface that is missed otherwise."""
+    voxels = mapped(room(), [pose()])
+    camera = Camera(161, 119, 90.0, 95.0, 70.0, 61.0) if k % 2 else CAMERA
+    rng = np.random.default_rng(k)
+    T = pose(*rng.uniform(-0.8, 0.8, 3), tuple(rng.uniform(-0.7, 0.7, 3)))
+    depth, _ = cast_view(voxels, SENSOR, camera, T)
+    exhaustive = every_ray(voxels, T, camera)
+    assert (exhaustive > 0).mean() > 0.1
+    # at ragged borders of the map, where a step starts decides about a hair's breadth
+    assert ((depth == 0) & (exhaustive > 0)).mean() < 4e-3
+    assert ((depth > 0) & (exhaustive == 0)).mean() < 15e-3
+    both = (depth > 0) & (exhaustive > 0)
+    assert np.quantile(np.abs(depth - exhaustive)[both], 0.99) < 0.05 * VOXEL
+
+
+@pytest.mark.parametrize("sparse", ["every pixel", "every fourth column", "one in ten"])
+def test_what_has_a_reading_is_found_near_it(sparse: str) -> None:
+    """Also where the readings miss all the coarse rays."""
+    voxels = mapped(room(), [pose()])
+    T = pose(0.1, -0.05, 0.1, (0.05, 0.1, 0.0))
+    exhaustive = every_ray(voxels, T)
+    readings = np.where(exhaustive > 0, exhaustive + np.float32(0.3 * VOXEL), np.float32(0))
+    if sparse == "every fourth column":
+        readings[:, np.arange(readings.shape[1]) % 4 != 1] = 0
+    elif sparse == "one in ten":
+        readings[np.random.default_rng(0).uniform(size=readings.shape) > 0.1] = 0
+    depth = render_near(voxels, SENSOR, CAMERA, T, readings).depth
+    given = readings > 0
+    assert given.sum() > 500
+    assert (depth[~given] == 0).all()
+    assert (depth[given] > 0).mean() > 0.99
+    found = given & (depth > 0)
+    assert np.quantile(np.abs(depth - exhaustive)[found], 0.99) < 0.05 * VOXEL
+
+
+def test_nothing_is_seen_beyond_the_sensors_reach() -> None:
+    """Of a map that a farther-sighted sensor has made."""
+    voxels = mapped(room(), [pose()])
+    farthest = cast_view(voxels, SENSOR, CAMERA, pose())[0].max()
+    short = SENSOR._replace(max_depth=np.float32(0.8 * farthest))
+    for k in range(4):
+        depth, _ = cast_view(voxels, short, CAMERA, pose(rotvec=(0, 0.1 * k, 0)))
+        assert (depth > 0).any()
+        assert depth.max() <= short.max_depth
+
+
+def every_ray(voxels: VoxelGrid, T: np.ndarray, camera: Camera = CAMERA) -> np.ndarray:
+    """(H, W) m: every pixel searched from the nearest to the farthest depth."""
+    tiles = tuple((side + TILE - 1) // TILE for side in camera.shape)
+    near, far = (np.full(tiles, bound, np.float32) for bound in (SENSOR.min_depth, SENSOR.max_depth))
+    depth = np.empty((camera.height + 1, camera.width + 1), np.float32)
+    cast_coarse(voxels.grid, pinhole(camera, T), near, far, 1, camera.shape, depth)
+    return depth[:-1, :-1]
+
+
+def test_a_block_beside_the_camera_does_not_unbound_every_tile() -> None:
+    voxels = mapped(room(), walk(3))
+    voxels.allocate(np.int32([[0, 2, 0]]))  # 32 cm below the camera, out of view
+    voxels.grid.solid[voxels.block_count - 1] = True
+    tile_near, _ = tile_bounds(voxels, SENSOR, CAMERA, pose())
+    assert np.quantile(tile_near[:20], 0.1) > 0.5

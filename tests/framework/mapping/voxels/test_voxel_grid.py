@@ -1,0 +1,72 @@
+"""The hash table and the blocks."""
+
+import resource
+
+import numpy as np
+import pytest
+from numba import njit
+
+from framework.errors import MapFullError
+from framework.mapping.voxels import voxel_grid
+from framework.mapping.voxels.voxel_grid import FIRST_RESERVED, UNSEEN, VoxelGrid, find_block, reserved
+
+
+@njit
+def look_up(grid, coords):
+    found = np.empty(len(coords), np.int32)
+    key, region = np.int64(-2), np.int32(-1)
+    for i in range(len(coords)):
+        found[i], key, region = find_block(grid, coords[i, 0], coords[i, 1], coords[i, 2], key, region)
+    return found
+
+
+def test_every_block_is_found_by_its_coordinates_and_no_other() -> None:
+    rng = np.random.default_rng(0)
+    coords = rng.integers(-3000, 3000, (5000, 3)).astype(np.int32)
+    voxels = VoxelGrid(0.01, 0.05, 100_000)
+    voxels.allocate(coords)
+    unique, first = np.unique(coords, axis=0, return_index=True)
+    assert voxels.block_count == len(unique)
+    found = look_up(voxels.grid, coords)
+    assert (voxels.grid.block_coords[found] == coords).all()
+    in_order = coords[np.sort(first)]
+    assert (voxels.grid.block_coords[: voxels.block_count] == in_order).all(), "numbered in the order of first mention"
+    absent = coords + np.int32(10_000)
+    assert (look_up(voxels.grid, absent) == -1).all()
+
+
+@pytest.mark.parametrize("promised", [64, 100_000])
+def test_growing_keeps_what_is_stored(promised: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where the system promises memory for all blocks, nothing need be copied; some promise less."""
+    monkeypatch.setattr(voxel_grid, "reserved", lambda most, make: make(min(most, promised)))
+    voxels = VoxelGrid(0.01, 0.05, 100_000)
+    voxels.allocate(np.zeros((1, 3), np.int32))
+    voxels.grid.tsdf[0, 7] = 123
+    voxels.allocate(np.stack(np.meshgrid(*[np.arange(20)] * 3), axis=-1).reshape(-1, 3).astype(np.int32))
+    assert voxels.block_count == 8000
+    assert voxels.grid.tsdf[0, 7] == 123
+    assert (voxels.grid.tsdf[1:8000] == UNSEEN).all()
+
+
+def test_less_is_reserved_where_memory_is_counted_by_what_is_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    def make(length: int) -> int:
+        if length > 3000:
+            raise MemoryError
+        return length
+
+    assert reserved(2000, make) == 2000
+    assert reserved(10_000, make) == FIRST_RESERVED
+    assert reserved(10, make) == 10
+    with monkeypatch.context() as limited:
+        limited.setattr(resource, "getrlimit", lambda _: (2**33, 2**33))
+        assert reserved(2000, make) == FIRST_RESERVED
+    monkeypatch.setattr(voxel_grid, "resource", None)
+    assert reserved(2000, make) == FIRST_RESERVED
+
+
+def test_the_budget_is_an_error_that_names_the_setting() -> None:
+    voxels = VoxelGrid(0.01, 0.05, 10)
+    with pytest.raises(MapFullError, match=r"fuser\.max_blocks"):
+        voxels.allocate(np.arange(33, dtype=np.int32).reshape(11, 3))
+    assert voxels.block_count == 10
+    voxels.allocate(np.arange(3, dtype=np.int32).reshape(1, 3))  # what exists is still found

@@ -1,0 +1,184 @@
+"""What changed between two visits: what was taken, added or moved in a known room, and nothing where nothing was."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from copy import copy
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.api import Mapper
+from framework.commands.results import diff
+from framework.data import Bool
+from framework.datasets.rgbd_folder import RgbdFolder
+from framework.errors import DataError
+from framework.files.tum_trajectory import write_tum
+from framework.interfaces import RGBDSequence
+from framework.queries.changes import STAYS, Kind, Visit, changes, look_for, probability_gone
+from framework.synthetic.renderer import Renderer
+from framework.synthetic.room import RoomKind
+from framework.synthetic.sequence import Synthetic
+from framework.synthetic.surfaces import assemble
+
+GIVEN = ("tracker=ground_truth", "fuser.voxel_size=0.025")
+
+
+@cache
+def office() -> Synthetic:
+    return Synthetic(scene="room1", kind=RoomKind.OFFICE, width=320, height=240)
+
+
+def visit(sequence: RGBDSequence, *overrides: str) -> Visit:
+    mapper = Mapper(*GIVEN, *overrides)
+    poses = [mapper.add(frame).T_world_camera for frame in sequence]
+    return Visit(mapper.scene, np.array(poses))
+
+
+def changed_room(
+    start: int, without: tuple[int, ...] = (), moved: Mapping[int, tuple[float, float]] | None = None
+) -> Synthetic:
+    """Every ninth frame of the walk, the room without some things, or with some of them elsewhere by (x, y) m."""
+    room = copy(office())
+    shift = moved or {}
+    objects = [
+        (key, piece.placed(*shift[key]) if key in shift else piece)
+        for key, piece in office().room.objects
+        if key not in without
+    ]
+    room._renderer = Renderer(assemble(objects), list(office().room.lamps))
+    room._chosen = range(start, office().frames, 9)
+    return room
+
+
+@pytest.fixture(scope="module")
+def before() -> Visit:
+    return visit(changed_room(0), "detector=ground_truth")
+
+
+CHAIR, TABLE = 5, 6  # of this room, seen well; the ids of its truth
+
+
+def told(found: list, kind: Kind) -> list[str]:
+    return sorted(change.name for change in found if change.kind is kind)
+
+
+def test_the_room_has_what_the_tests_take_from_it() -> None:
+    names = office().class_names
+    assert (names[CHAIR], names[TABLE]) == ("chair", "dining table")
+
+
+def test_two_visits_of_one_room_differ_in_nothing(before: Visit) -> None:
+    found = changes(before, visit(changed_room(1), "detector=ground_truth"))
+    assert {change.kind for change in found} <= {Kind.STAYED, Kind.NOT_SEEN}
+    assert len(told(found, Kind.STAYED)) >= 7
+    assert all(change.before is not None and change.after is not None for change in found if change.kind is Kind.STAYED)
+    assert all(0 <= change.probability <= 1 for change in found)
+
+
+def test_what_was_taken_has_vanished_and_the_other_way_round_has_appeared(before: Visit) -> None:
+    after = visit(changed_room(1, without=(CHAIR, TABLE)), "detector=ground_truth")
+    found = changes(before, after)
+    assert told(found, Kind.VANISHED) == ["chair", "dining table"]
+    assert told(found, Kind.APPEARED) == told(found, Kind.MOVED) == []
+    assert all(change.probability > 0.5 for change in found if change.kind is Kind.VANISHED)
+    assert [change.kind for change in found[:2]] == [Kind.VANISHED] * 2, "changes come first"
+    back = changes(after, before)
+    assert told(back, Kind.APPEARED) == ["chair", "dining table"]
+    assert told(back, Kind.VANISHED) == told(back, Kind.MOVED) == []
+
+
+def test_what_stands_elsewhere_has_moved(before: Visit) -> None:
+    found = changes(before, visit(changed_room(1, moved={CHAIR: (-0.9, 0.6)}), "detector=ground_truth"))
+    [moved] = [change for change in found if change.kind is Kind.MOVED]
+    assert moved.name == "chair"
+    assert moved.distance == pytest.approx(np.hypot(0.9, 0.6), abs=0.4), "of its box: each visit saw other sides"
+    assert None not in (moved.before, moved.after)
+    assert told(found, Kind.VANISHED) == told(found, Kind.APPEARED) == []
+
+
+def test_a_noisy_detector_makes_up_no_changes() -> None:
+    one, other = (visit(changed_room(k), "detector=simulated", f"seed={k}") for k in (0, 1))
+    found = changes(one, other)
+    assert not [change for change in found if change.kind in (Kind.VANISHED, Kind.MOVED) and change.probability > 0.3]
+    assert len(told(found, Kind.STAYED)) >= 5
+
+
+def test_halves_of_a_real_recording_differ_in_nothing(shared_data: Path) -> None:
+    """A flat, by 2Go: every other frame each; what one half found and the other did not, stands where it stood."""
+    halves = [
+        visit(RgbdFolder(shared_data / "replica_floor2", start=k, stop=40, stride=2), "fuser.voxel_size=0.04")
+        for k in (0, 1)
+    ]
+    found = changes(*halves)
+    assert not [change for change in found if change.kind in (Kind.VANISHED, Kind.MOVED) and change.probability > 0.3]
+
+
+def bits(there: int, through: int, of: int = 10) -> tuple[Bool, Bool]:
+    return np.arange(of) < there, np.arange(of) >= of - through
+
+
+def test_probabilities_follow_the_evidence() -> None:
+    def gone(there: int, through: int, matched: bool, confidence: float = 0.8) -> float:
+        return probability_gone(confidence, *bits(there, through), matched)
+
+    assert gone(0, 2, False) == pytest.approx(1 - STAYS), "too little was seen to change one's mind"
+    assert gone(10, 0, True) < 0.01
+    assert gone(0, 10, False) > 0.8
+    assert gone(0, 10, False) > gone(5, 5, False) > gone(10, 0, False)
+    assert gone(8, 2, False) > gone(8, 2, True)
+    assert gone(0, 10, False, confidence=0.1) < gone(0, 10, False, confidence=0.9), "it was seldom found before, too"
+
+
+def test_a_point_is_there_where_a_surface_is_and_seen_through_before_it(before: Visit) -> None:
+    vertices = before.scene.mesh().vertices[::500]
+    there, through = look_for(before, vertices)
+    assert there.mean() > 0.8
+    camera = before.poses[:, :3, 3].mean(axis=0)
+    nearer = (camera + 0.5 * (vertices - camera)).astype(np.float32)  # in the air
+    there, through = look_for(before, nearer)
+    assert through.mean() > 0.6
+    assert there.mean() < 0.1
+    outside = (camera + 3 * (vertices - camera)).astype(np.float32)
+    assert not np.logical_or(*look_for(before, outside)).any(), "what is behind walls is not known"
+
+
+def test_a_visit_has_poses(before: Visit) -> None:
+    with pytest.raises(DataError, match="without any pose"):
+        Visit(before.scene, np.zeros((0, 4, 4)))
+
+
+def test_the_command_lists_changes(
+    tmp_path: Path, before: Visit, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    after = visit(changed_room(1, without=(CHAIR,)), "detector=ground_truth")
+    for name, seen in (("first", before), ("second", after)):
+        place = tmp_path / name
+        place.mkdir()
+        seen.scene.save(place / "map.npz")
+        write_tum(place / "trajectory.txt", np.arange(len(seen.poses)) / 30, seen.poses)
+        (place / "metrics.json").write_text('{"pose_source": "ground_truth"}')
+    out = tmp_path / "diff.json"
+    words = ["instancemap diff", str(tmp_path / "first"), str(tmp_path / "second"), "--out", str(out)]
+    monkeypatch.setattr("sys.argv", words)
+    diff.main()
+    printed = capsys.readouterr()
+    assert printed.err == ""
+    [first, last] = printed.out.splitlines()
+    assert first.startswith("vanished  chair            0.")
+    assert "stayed; of" in last
+    written = json.loads(out.read_text())
+    assert written[0]["kind"] == "vanished"
+    assert written[0]["after"] is None
+    assert len(written) > 5
+    (tmp_path / "second" / "metrics.json").unlink()
+    assert not diff.in_world(tmp_path / "second", tmp_path / "first")
+    (tmp_path / "second" / "config.yaml").write_text(f"world: {tmp_path / 'first'}\n")
+    assert diff.in_world(tmp_path / "second", tmp_path / "first")
+    monkeypatch.setattr("sys.argv", ["instancemap diff", str(tmp_path), str(tmp_path / "second")])
+    with pytest.raises(SystemExit):
+        diff.main()
+    assert "map.npz: expected the directory of a run" in capsys.readouterr().err

@@ -1,0 +1,180 @@
+"""What a map answers, while it grows and once it is stored."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.api import Map, Mapper, load_map
+from framework.data import Camera
+from framework.datasets.tum_rgbd import TumRgbd
+from framework.errors import ConfigError, DataError
+from tests.support.scenes.corner_room import CornerRoom
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
+
+
+@pytest.fixture(scope="module")
+def mapper() -> Mapper:
+    mapper = Mapper(*STAGES)
+    for frame in CornerRoom():
+        mapper.add(frame)
+    return mapper
+
+
+@pytest.fixture(scope="module")
+def stored(mapper: Mapper, tmp_path_factory: pytest.TempPathFactory) -> Map:
+    path = tmp_path_factory.mktemp("stored") / "map.npz"
+    mapper.save(path)
+    return load_map(path)
+
+
+@pytest.fixture(params=["growing", "stored"])
+def asked(request: pytest.FixtureRequest, mapper: Mapper, stored: Map) -> Map:
+    return mapper if request.param == "growing" else stored
+
+
+def test_objects_are_found_by_their_class(asked: Map) -> None:
+    names = {asked.name(instance) for instance in asked.instances().values()}
+    assert len(names) >= 1
+    for name in names:
+        of_class = asked.instances(name)
+        assert of_class
+        assert all(asked.name(instance) == name for instance in of_class.values())
+    absent = next(name for name in asked.classes if name not in names)
+    assert asked.instances(absent) == {}
+    with pytest.raises(DataError, match=f"there is no class '{absent}x' in this map; did you mean '{absent}'"):
+        asked.instances(f"{absent}x")
+
+
+def test_the_nearest_object_is_that_whose_surface_is_nearest(asked: Map) -> None:
+    vertices = asked.mesh().vertices
+    for instance in asked.instances().values():
+        on_it = vertices[instance.vertices[0]]
+        found = asked.nearest(on_it)
+        assert found is not None
+        assert found.id == instance.id
+        of_class = asked.nearest((50.0, 50.0, 50.0), asked.name(instance))
+        assert of_class is not None
+        assert asked.name(of_class) == asked.name(instance)
+    for wrong in ((1.0, 2.0), (np.nan, 0.0, 0.0)):
+        with pytest.raises(DataError, match="a point is three finite numbers"):
+            asked.nearest(wrong)
+
+
+def test_an_object_is_where_a_view_shows_it(asked: Map) -> None:
+    """And nothing is shown that nobody can ask for."""
+    frame = CornerRoom()[3]
+    assert frame.T_world_camera is not None
+    view = asked.view(frame.camera, frame.T_world_camera)
+    shown = set(np.unique(view.instance_ids).tolist()) - {0}
+    assert shown
+    assert shown <= set(asked.instances())
+    assert (view.class_ids[view.instance_ids == 0] == -1).all()
+    for key in shown:
+        v, u = np.argwhere(view.instance_ids == key)[0]
+        found = asked.at_pixel(int(u), int(v), frame.camera, frame.T_world_camera)
+        assert found is not None
+        assert found.id == key
+    v, u = np.argwhere(view.instance_ids == 0)[0]
+    assert asked.at_pixel(int(u), int(v), frame.camera, frame.T_world_camera) is None
+    with pytest.raises(DataError, match=r"the pixel \(-1, 0\) is not in the image of"):
+        asked.at_pixel(-1, 0, frame.camera, frame.T_world_camera)
+
+
+def test_a_view_does_not_show_what_does_not_count_yet() -> None:
+    """After one frame the map holds objects that a single detection has made."""
+    mapper = Mapper(*STAGES, "fuser.min_observations=3")
+    frame = CornerRoom()[0]
+    mapper.add(frame)
+    assert frame.T_world_camera is not None
+    assert mapper.scene.render(frame.camera, frame.T_world_camera).instance_ids.any()
+    assert mapper.instances() == {}
+    assert not mapper.view(frame.camera, frame.T_world_camera).instance_ids.any()
+
+
+def test_the_last_frame_is_what_a_pixel_is_asked_of(mapper: Mapper) -> None:
+    last = CornerRoom()[len(CornerRoom()) - 1]
+    assert last.T_world_camera is not None
+    for u, v in ((10, 10), (last.camera.width // 2, last.camera.height // 2)):
+        by_default = mapper.at_pixel(u, v)
+        by_hand = mapper.at_pixel(u, v, last.camera, last.T_world_camera)
+        assert (by_default and by_default.id) == (by_hand and by_hand.id)
+    with pytest.raises(DataError, match="no last frame"):
+        Mapper(*STAGES).at_pixel(0, 0)
+
+
+def test_an_object_has_a_mesh_of_its_own(asked: Map) -> None:
+    for instance in asked.instances().values():
+        own = asked.mesh(instance)
+        assert len(own.vertices) == len(instance.vertices)
+        assert (own.instance_ids == instance.id).all()
+        np.testing.assert_array_equal(own.vertices, asked.mesh(instance.id).vertices)
+    with pytest.raises(DataError, match="there is no instance 999"):
+        asked.mesh(999)
+
+
+def test_what_changed_is_told_with_each_frame() -> None:
+    mapper = Mapper(*STAGES)
+    known: set[int] = set()
+    for frame in CornerRoom():
+        added = mapper.add(frame)
+        assert not added.lost
+        assert known.isdisjoint(added.new)
+        assert known.issuperset(added.gone)
+        known = (known | set(added.new)) - set(added.gone)
+        assert known == mapper.scene.instance_ids()
+    assert known
+
+
+def test_frames_by_hand_are_frames() -> None:
+    """Colour, depth, pose and camera make the map that the frames of a sequence make."""
+    by_hand, by_frame = Mapper(*STAGES, "detector=none"), Mapper(*STAGES, "detector=none")
+    for k, frame in enumerate(CornerRoom()):
+        by_frame.add(frame)
+        camera = frame.camera if k == 0 else None
+        added = by_hand.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=camera)
+        np.testing.assert_array_equal(added.T_world_camera, frame.T_world_camera)
+    np.testing.assert_array_equal(by_hand.mesh().vertices, by_frame.mesh().vertices)
+
+
+def test_frames_that_are_none_are_told() -> None:
+    frame = CornerRoom()[0]
+    mapper = Mapper(*STAGES)
+    with pytest.raises(DataError, match="takes a Frame, or colour and depth, found ndarray alone"):
+        mapper.add(frame.color)
+    with pytest.raises(DataError, match="needs the camera once"):
+        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera)
+    small = Camera(10, 10, 5.0, 5.0, 4.5, 4.5)
+    with pytest.raises(DataError, match="color"):
+        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=small)
+
+
+@pytest.mark.parametrize("value", ["a b", "it's", r"C:\x\new", "x=1,2", "[1]", "{a: b}", "null", "é", "a\\"])
+def test_stages_and_parameters_go_by_name(value: str) -> None:
+    named = Mapper(detector="none", tracker="ground_truth", threads=1, detection_cache_dir=value, debug=False, map=None)
+    assert type(named.pipeline.detector).__name__ == "NoDetections"
+    assert Mapper("detector=none", **{"fuser.voxel_size": 0.05}).scene.voxel_count == 0  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="detector must be a name, a number"):
+        Mapper(detector=["none"])
+
+
+def test_by_hand_and_by_the_command_line_it_is_the_same_map_to_the_byte(tmp_path: Path) -> None:
+    """The beginning of the demo, tracked and labelled by the network."""
+    asked = ("fuser.voxel_size=0.02", "seed=3")
+    line = [sys.executable, "-m", "framework", "dataset=desk", "dataset.stop=6", *asked, "hydra.run.dir=run"]
+    done = subprocess.run(
+        line, cwd=tmp_path, env={"PYTHONPATH": str(CHECKOUT)}, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    mapper = Mapper(*asked)
+    for frame in TumRgbd(CHECKOUT / "data" / "desk", scene="rgbd_dataset_freiburg1_rpy", stop=6):
+        mapper.add(frame.color, frame.depth, pose=frame.T_world_camera, camera=frame.camera, timestamp=frame.timestamp)
+    mapper.save(tmp_path / "map.npz")
+    assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "run" / "map.npz").read_bytes()
+    assert mapper.instances()

@@ -1,0 +1,207 @@
+"""Objects by words: with embeddings, and by names and measured colours."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import instancemap
+from framework.api import query
+from framework.commands.results.query import main
+from framework.errors import ConfigError, DataError
+from framework.interfaces import MapFuser
+from framework.queries.map_queries import Map
+from framework.queries.text_search import by_embedding, by_names, color_fit
+from framework.vocabulary.color_names import COLOR_NAMES
+from tests.support import registered
+from tests.support.scenes.analytic_scene import room, walk
+from tests.support.true_masks import fuse_masks, masks_of
+
+EMBEDDINGS = np.float32([[1, 0], [0.6, 0.8], [0, 0]])
+PROBABILITIES = [(0.9, 0.1), (0.2, 0.8), (0.6, 0.4)]
+
+
+def mapped(embeddings: np.ndarray | None) -> Map:
+    """The analytic room's three objects: chair, bed and, less surely, chair."""
+    fuser: MapFuser = registered.built("fuser", "bayesian_tsdf", "fuser.voxel_size=0.08")
+    for k, T in enumerate(walk(4)):
+        frame = room().frame(T, k)
+        fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, PROBABILITIES, embeddings)
+    return Map(fuser.scene)
+
+
+@pytest.fixture(scope="module")
+def embedded() -> Map:
+    return mapped(EMBEDDINGS)
+
+
+@pytest.fixture(scope="module")
+def run(embedded: Map, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    embedded.save(folder / "map.npz")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run_without(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    mapped(None).save(folder / "map.npz")
+    return folder
+
+
+def test_the_object_with_the_nearest_embedding_is_first(embedded: Map) -> None:
+    found = by_embedding(embedded, np.float32([0, 1]))
+    assert [(one.instance.id, round(one.similarity, 4)) for one in found] == [(2, 0.8), (1, 0.0)]
+    assert found[0].name == "bed"
+    vertices = embedded.mesh(2).vertices
+    np.testing.assert_allclose(found[0].centroid, vertices.mean(axis=0), atol=1e-5)
+    with pytest.raises(DataError, match="other than the 3 numbers"):
+        by_embedding(embedded, np.float32([0, 1, 0]))
+
+
+def test_names_rank_by_the_probability_of_the_class(embedded: Map) -> None:
+    found = by_names(embedded, "the chairs")
+    assert [one.instance.id for one in found] == [1, 3]
+    assert found[0].similarity > found[1].similarity
+    assert by_names(embedded, "a bed")[0].instance.id == 2
+
+
+def test_a_color_fits_the_share_of_the_surface_that_has_it(embedded: Map) -> None:
+    whole, instance = embedded.mesh(), embedded.instances()[1]
+    half = len(instance.vertices) // 2
+    colors = np.full_like(whole.colors, 255)
+    colors[instance.vertices[:half]] = (220, 20, 30)
+    colors[instance.vertices[half:]] = (30, 60, 220)
+    painted = replace(whole, colors=colors)
+    share = half / len(instance.vertices)
+    assert color_fit(painted, instance, ["red"]) == pytest.approx(share, abs=1e-3)
+    assert color_fit(painted, instance, ["green", "blue"]) == pytest.approx(1 - share, abs=1e-3)
+    assert color_fit(painted, instance, ["yellow"]) == pytest.approx(0, abs=1e-3)
+
+
+def test_a_color_alone_is_a_query(embedded: Map) -> None:
+    for color in {one.color for one in by_names(embedded, "beds or chairs")}:
+        found = by_names(embedded, color)
+        assert [one.similarity for one in found] == sorted((one.similarity for one in found), reverse=True)
+        assert color in {one.color for one in found}
+
+
+@pytest.mark.parametrize("query", ["a blob", "a wooden chair", "the"])
+def test_words_that_nobody_knows_are_named(embedded: Map, query: str) -> None:
+    with pytest.raises(DataError, match="its objects are bed, chair; colours are black, gray") as refused:
+        by_names(embedded, query)
+    assert "'chair'" not in str(refused.value)
+
+
+def asked(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    monkeypatch.setattr(sys, "argv", ["instancemap query", *words])
+    status = 0
+    try:
+        main()
+    except SystemExit as ended:
+        status = int(ended.code or 0)
+    captured = capsys.readouterr()
+    return status, captured.out, captured.err
+
+
+def test_the_command_says_by_what_it_answers(
+    embedded: Map, run_without: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    absent = next(color for color in COLOR_NAMES if not by_names(embedded, f"a {color} bed"))
+    status, out, _ = asked(monkeypatch, capsys, str(run_without), "chair")
+    assert status == 0
+    lines = out.splitlines()
+    assert lines[0].startswith("by class names and colours, for this run has no embeddings: run with detector=")
+    assert lines[1].split() == ["id", "class", "match", "confidence", "colour", "position", "size"]
+    assert lines[2].split()[:2] == ["1", "chair"]
+    _, out, _ = asked(monkeypatch, capsys, str(run_without), "chair", "--by", "names", "--json", "--top", "1")
+    answer = json.loads(out)
+    assert (answer["by"], answer["space"], [one["id"] for one in answer["objects"]]) == ("names", None, [1])
+    assert len(answer["objects"][0]["size"]) == 3
+    _, out, _ = asked(monkeypatch, capsys, str(run_without), f"a {absent} bed")
+    assert f"nothing in this map is 'a {absent} bed'" in out
+
+
+@pytest.mark.parametrize(
+    ("words", "fault"),
+    [
+        (["chair", "--by", "embeddings"], "has no embeddings: run with"),
+        (["flying saucer"], "no class of this map and no colour is called 'flying', 'saucer'"),
+    ],
+)
+def test_what_cannot_be_answered_is_one_line(
+    words: list[str], fault: str, run_without: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = asked(monkeypatch, capsys, str(run_without), *words)
+    assert (status, out) == (1, "")
+    assert fault in err
+    assert len(err.splitlines()) == 1
+
+
+def test_embeddings_need_the_model_that_they_are_of(
+    run: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The fixture's are of no model that there is."""
+    status, _, err = asked(monkeypatch, capsys, str(run), "a red chair")
+    assert (status, len(err.splitlines())) == (1, 1)
+    assert "does not say of which model the embeddings are: name it by --model" in err
+    _, out, _ = asked(monkeypatch, capsys, str(run), "a bed", "--by", "names")
+    assert out.splitlines()[0] == "by class names and colours"
+    status, _, err = asked(monkeypatch, capsys, "nowhere", "a bed")
+    assert status == 1
+    assert "expected the directory of a run" in err
+    assert asked(monkeypatch, capsys, str(run), "a bed", "--top", "0")[0] == 2
+
+
+def test_a_map_is_asked_as_its_run_is(embedded: Map, run: Path, run_without: Path) -> None:
+    """A directory, its name, or a map; by names where there are no embeddings, and that is told."""
+    assert query is instancemap.query
+    answers = [query(run_without, "chairs"), query(str(run_without), "chairs"), query(embedded, "chairs", by="names")]
+    assert [answer.by for answer in answers] == ["names"] * 3
+    for answer in answers:
+        assert [(one.instance.id, one.name) for one in answer.objects] == [(1, "chair"), (3, "chair")]
+    assert (answers[0].space, answers[2].space) == ("", embedded.scene.embedding_space)
+    absent = next(color for color in COLOR_NAMES if not by_names(embedded, f"a {color} bed"))
+    assert query(run, f"a {absent} bed", by="names").objects == ()
+
+
+def test_a_run_that_does_not_say_its_model_is_told(embedded: Map, tmp_path: Path) -> None:
+    embedded.save(tmp_path / "map.npz")
+    for config in ("detector: null", "detector: 3", "detector: ${hydra:x}", "detector: {model: 4}", "seed: 0"):
+        (tmp_path / "config.yaml").write_text(f"{config}\n")
+        with pytest.raises(DataError, match=r"config.yaml does not say of which model the embeddings are: name it by"):
+            query(tmp_path, "bed")
+
+
+@pytest.mark.parametrize(
+    ("question", "fault"),
+    [
+        ({"words": " "}, r"the words to look for must be 1 to 1000 characters, found ' '"),
+        ({"words": "chair " * 200}, r"the words to look for must be 1 to 1000 characters, found 'chair chair"),
+        ({"words": 7}, r"must be 1 to 1000 characters, found 7$"),
+        ({"words": "bed", "by": "name"}, r"by must be one of embeddings, names, found 'name'"),
+        ({"words": "bed", "by": "names", "model": "clip"}, r"a model is of embeddings, and by names none is asked"),
+    ],
+)
+def test_what_is_no_question_is_said_before_anything_is_read(question: dict[str, Any], fault: str) -> None:
+    with pytest.raises(ConfigError, match=fault):
+        query("nowhere", **question)
+
+
+def test_a_question_that_cannot_be_answered_is_refused(embedded: Map, run_without: Path) -> None:
+    with pytest.raises(DataError, match=r"query: there is no nowhere/map.npz: expected the directory of a run"):
+        query("nowhere", "bed")
+    with pytest.raises(DataError, match="has no embeddings: run with detector=with_embeddings"):
+        query(run_without, "bed", model="clip")
+    with pytest.raises(DataError, match=r"this map has no embeddings: .* or ask by names"):
+        query(instancemap.load_map(run_without / "map.npz"), "bed", by="embeddings")
+    with pytest.raises(DataError, match=r"a map does not say of which model its embeddings are: name it by --model"):
+        query(embedded, "bed")
+    with pytest.raises(DataError, match="no class of this map and no colour is called 'saucer'"):
+        query(embedded, "saucer", by="names")

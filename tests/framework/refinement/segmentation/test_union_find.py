@@ -1,0 +1,14 @@
+"""Pieces of a forest."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from framework.refinement.segmentation.union_find import root, unite
+
+
+def test_pieces_are_named_after_their_first_cell():
+    parents = np.arange(8).astype(np.int32)
+    for a, b in ((6, 7), (7, 3), (5, 4), (3, 6), (2, 5)):
+        unite(parents, a, b)
+    assert [root(parents, cell) for cell in range(8)] == [0, 1, 2, 3, 2, 2, 3, 3]

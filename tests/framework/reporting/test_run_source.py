@@ -1,0 +1,119 @@
+"""The recording of a run found again."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from framework.geometry import inverse
+from framework.reporting.run_contents import RunContents
+from framework.reporting.run_source import Recording, TruePath
+from framework.reporting.source_frames import BLURRED, Footage
+from framework.runs.provenance import config_hash
+from tests.support.reported_run import write_run
+from tests.support.scenes.corner_room import pose_at
+
+pytestmark = pytest.mark.usefixtures("fakes_registered")
+
+
+@pytest.fixture(scope="module")
+def mapped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+@pytest.fixture
+def directory(mapped: Path, tmp_path: Path) -> Path:
+    """A copy of a run of six frames."""
+    return Path(shutil.copytree(mapped, tmp_path / "run"))
+
+
+def change_config(directory: Path, **dataset: Any) -> None:
+    """As if the run had been of another dataset."""
+    config = OmegaConf.load(directory / "config.yaml")
+    config.dataset = dataset
+    OmegaConf.save(config, directory / "config.yaml")
+    metrics = json.loads((directory / "metrics.json").read_text())
+    metrics["config_hash"] = config_hash(OmegaConf.to_container(config))
+    (directory / "metrics.json").write_text(json.dumps(metrics))
+
+
+def test_each_pose_gets_its_frame_also_after_one_that_was_skipped(tmp_path: Path) -> None:
+    contents = RunContents.read(write_run(tmp_path / "run", unreadable=2, frames=6))
+    assert contents.tracked_frames == (0, 1, 3, 4, 5)
+    recording = Recording.of(contents)
+    assert recording.why_not == ""
+    frames = [recording.frame(k) for k in range(5)]
+    assert [frame.index for frame in frames if frame is not None] == [0, 1, 3, 4, 5]
+
+
+def test_frames_without_a_pose_are_lost_ones(directory: Path) -> None:
+    lines = (directory / "timings.csv").read_text().splitlines()
+    stopped = [line for line in lines if not line.startswith(("2,lift", "2,refine", "2,fuse"))]
+    (directory / "timings.csv").write_text("\n".join(stopped) + "\n")
+    poses = (directory / "trajectory.txt").read_text().splitlines()
+    (directory / "trajectory.txt").write_text("\n".join(poses[:2] + poses[3:]) + "\n")
+    contents = RunContents.read(directory)
+    assert (contents.tracked_frames, contents.lost_frames) == ((0, 1, 3, 4, 5), (2,))
+    frame = Recording.of(contents).frame(2)
+    assert frame is not None
+    assert frame.index == 3
+
+
+@pytest.mark.parametrize(
+    ("dataset", "said"),
+    [
+        ({"_target_": "tests.support.scenes.corner_room.LiveRoom"}, "as it came from a camera"),
+        ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "start": 1}, "is not the one that was mapped"),
+        ({"_target_": "os.system"}, "no registered option"),
+        ({"_target_": "tests.support.scenes.corner_room.CornerRoom", "scene": "${oc.env:HOME}"}, "not resolved"),
+    ],
+)
+def test_what_is_not_the_recording_is_none_and_it_says_why(directory: Path, dataset: dict, said: str) -> None:
+    change_config(directory, **dataset)
+    recording = Recording.of(RunContents.read(directory))
+    assert said in recording.why_not
+    assert recording.frame(0) is None
+    assert recording.camera is None
+    truth, why = recording.scene_truth()
+    assert truth is None
+    assert said in why
+
+
+def test_another_truth_is_not_taken_for_the_one_of_the_run(directory: Path) -> None:
+    contents = RunContents.read(directory)
+    assert Recording.of(contents).scene_truth()[0] is not None
+    metrics = json.loads((directory / "metrics.json").read_text()) | {"truth_sha256": "0" * 64}
+    (directory / "metrics.json").write_text(json.dumps(metrics))
+    truth, why = Recording.of(RunContents.read(directory)).scene_truth()
+    assert truth is None
+    assert "no longer those" in why
+
+
+def test_footage_has_pictures_true_places_and_how_sharp_they_are(mapped: Path) -> None:
+    recording = Recording.of(RunContents.read(mapped))
+    assert recording.camera is not None
+    footage = Footage.of(recording, [0, 3], recording.camera)
+    assert footage.frames == {0: 0, 3: 3}
+    np.testing.assert_array_equal(footage.true_positions[3], pose_at(3)[:3, 3])
+    assert all(BLURRED <= value <= 1 for value in footage.clarity.values())
+    assert max(footage.clarity.values()) == 1
+    assert footage.images[0].shape == (*footage.camera.shape, 3)
+
+
+def test_the_true_path_is_moved_onto_the_trajectory() -> None:
+    true = np.array([pose_at(20 * k) for k in range(6)])
+    T_map_world = pose_at(77)
+    poses = np.array([T_map_world @ T for T in true])
+    path = TruePath.of(poses, {k: true[k][:3, 3] for k in (0, 1, 3, 5)})
+    assert path is not None
+    assert path.chosen == [0, 1, 3, 5]
+    np.testing.assert_allclose(path.errors, 0, atol=1e-9)
+    np.testing.assert_allclose(path.positions, poses[path.chosen, :3, 3], atol=1e-9)
+    assert np.abs(inverse(T_map_world)[:3, 3]).max() > 0.1, "the two worlds differ"
+    assert TruePath.of(poses, {0: true[0][:3, 3], 1: true[1][:3, 3]}) is None

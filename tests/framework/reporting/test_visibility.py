@@ -1,0 +1,79 @@
+"""What a trajectory's cameras saw of a map."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from framework.data import Camera, InstanceMesh
+from framework.exporting.submeshes import joined
+from framework.reporting.visibility import LOOKS, sightings, spread_out
+
+CAMERA = Camera(200, 150, 150.0, 150.0, 99.5, 74.5)
+
+
+def wall(n: int = 41) -> InstanceMesh:
+    """x from -2 to 2 m, y from -0.5 to 0.5, 2 m before the world's origin; two objects at its ends, one cut by both."""
+    x, y = np.meshgrid(np.linspace(-2, 2, n), np.linspace(-0.5, 0.5, n), indexing="ij")
+    vertices = np.stack([x, y, np.full_like(x, 2)], axis=-1).reshape(-1, 3).astype(np.float32)
+    a = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    triangles = np.concatenate([np.stack([a, a + n, a + 1], 1), np.stack([a + 1, a + n, a + n + 1], 1)])
+    ids = np.select([vertices[:, 0] < -1.2, vertices[:, 0] > 1.2], [3, 4]).astype(np.int32)
+    return InstanceMesh(vertices, triangles.astype(np.int32), np.zeros((n * n, 3), np.uint8), ids, ids - 1, ())
+
+
+def at(x: float) -> np.ndarray:
+    T_world_camera = np.eye(4)
+    T_world_camera[0, 3] = x
+    return T_world_camera
+
+
+def test_each_place_is_known_when_it_comes_into_sight() -> None:
+    mesh = wall()
+    found = sightings(mesh, mesh.instance_ids, np.array([at(-1.0), at(-0.2), at(0.2)]), CAMERA, {})
+    half = 2 * 100 / 150  # m, that the camera sees to either side
+    x = mesh.vertices[:, 0]
+    assert found.chosen == [0, 1, 2]
+    assert (found.first_seen[x < -1.0 + half - 0.05] == 0).all()
+    assert (found.first_seen[(x > -1.0 + half + 0.05) & (x < -0.2 + half - 0.05)] == 1).all()
+    assert (found.first_seen[x > 0.2 + half + 0.05] == 3).all(), "never in sight"
+    assert found.growth[-1] == 1
+    assert (np.diff(found.growth) > 0).all()
+
+
+def test_an_object_is_seen_best_where_none_of_it_is_cut_off() -> None:
+    mesh = wall()
+    near = at(-1.0)
+    near[2, 3] = 1.0  # it sees more of the object's pixels, but 0.59 of the object
+    poses = np.array([at(-3.2), near, at(-1.4), at(0.0), at(1.7)])
+    assert sightings(mesh, mesh.instance_ids, poses, CAMERA, {}).best == {3: 2, 4: 4}
+
+
+def test_a_blurred_picture_is_not_the_best_one() -> None:
+    mesh = wall()
+    poses = np.array([at(-1.4), at(-1.5), at(1.7)])
+    both = [sightings(mesh, mesh.instance_ids, poses, CAMERA, {k: 0.4}).best[3] for k in (0, 1)]
+    assert both == [1, 0]
+
+
+def test_what_stands_behind_something_is_not_seen() -> None:
+    mesh = wall()
+    nearer = replace(
+        mesh,
+        vertices=mesh.vertices - np.float32([0, 0, 1]),
+        instance_ids=np.where(mesh.instance_ids > 0, 9, 0).astype(np.int32),
+    )
+    before = joined([mesh, nearer])
+    found = sightings(before, before.instance_ids, np.array([at(0.0)]), CAMERA, {})
+    assert (found.first_seen[: len(mesh.vertices)] == 1).all()
+    assert 3 not in found.best
+
+
+def test_poses_are_spread_over_the_video() -> None:
+    assert spread_out(0) == []
+    assert spread_out(1) == [0]
+    assert spread_out(5) == [0, 1, 2, 3, 4]
+    chosen = spread_out(1000)
+    assert (len(chosen), chosen[0], chosen[-1]) == (LOOKS, 0, 999)
+    assert set(np.diff(chosen)) <= {12, 13}

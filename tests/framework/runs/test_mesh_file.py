@@ -1,0 +1,54 @@
+"""The mesh of a run, read back."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.data import InstanceMesh
+from framework.errors import DataError
+from framework.files.ply import write_ply
+from framework.runs.mesh_file import read_mesh, write_mesh
+from tests.support.scenes.corner_room import GridMap
+
+TETRAHEDRON = InstanceMesh(
+    vertices=np.array([[0, 0, 0], [1 / 3, 0, 1e-9], [0, -1e4, 0], [7, 0.1, 2.5]], np.float32),
+    triangles=np.array([[0, 1, 2], [0, 3, 1], [0, 2, 3], [1, 3, 2]], np.int32),
+    colors=np.arange(12, dtype=np.uint8).reshape(4, 3),
+    instance_ids=np.array([0, 5, 2**31 - 1, 5], np.int32),
+    class_ids=np.array([-1, 1, 0, 1], np.int32),
+    classes=("chair", "dining table"),
+)
+
+
+@pytest.mark.parametrize(
+    "mesh", [TETRAHEDRON, GridMap().mesh(), replace(TETRAHEDRON, classes=())], ids=["some", "empty", "no classes"]
+)
+def test_what_was_written_reads_back_exactly(tmp_path: Path, mesh: InstanceMesh) -> None:
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    read = read_mesh(tmp_path / "mesh.ply")
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(mesh, name))
+    assert read.classes == mesh.classes
+
+
+def test_a_mesh_of_something_else_is_refused_in_one_line(tmp_path: Path) -> None:
+    path = tmp_path / "mesh.ply"
+    mesh = TETRAHEDRON
+    shades = dict.fromkeys(("red", "green", "blue"), mesh.colors[:, 0])
+    labels = {"instance": mesh.instance_ids, "class": mesh.class_ids}
+    for properties, comments, said in [
+        (shades, ("classes chair",), "no property 'instance' of int32"),
+        (shades | labels | {"class": mesh.class_ids.astype(np.float32)}, ("classes chair",), "no property 'class'"),
+        (labels, ("classes chair",), "no property 'red' of uint8"),
+        (shades | labels, (), "one line 'comment classes ...', found 0"),
+        (shades | labels, ("classes chair", "classes bed"), "found 2"),
+    ]:
+        write_ply(path, mesh.vertices, mesh.triangles, properties, comments)
+        with pytest.raises(DataError, match=said) as caught:
+            read_mesh(path)
+        assert str(path) in str(caught.value)
+        assert "\n" not in str(caught.value)

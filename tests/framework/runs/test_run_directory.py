@@ -1,0 +1,376 @@
+"""The directory that a run leaves behind."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+
+from framework.data import InstanceMesh, Pose, SceneTruth
+from framework.errors import DataError, MapFullError
+from framework.evaluation.instances import PredictedInstances, Transfer, evaluate
+from framework.files.tum_trajectory import read_tum
+from framework.pipeline import Pipeline
+from framework.runs import provenance, run_directory
+from framework.runs.instances_file import write_instances
+from framework.runs.mesh_file import write_mesh
+from framework.runs.metrics import instance_metrics, run_metrics, trajectory_metrics
+from framework.runs.run_directory import RunRecord, headline
+from framework.runs.stored_runs import MAPPED, read_record
+from framework.runtime.run_log import RunResult, TrackedFrame
+from tests.support import registered
+from tests.support.scenes.corner_room import (
+    CLASSES,
+    CornerRoom,
+    GivenPose,
+    GridFuser,
+    GridMap,
+    KeepAll,
+    SphereDetector,
+    pose_at,
+)
+
+CONFIG = OmegaConf.create({"seed": 3, "debug": False, "fuser": {"voxel_size": 0.01, "seed": "${seed}"}})
+CHOICES = {"dataset": "fake", "detector": "simulated"}
+
+Run = Callable[..., RunResult]
+
+
+@pytest.fixture
+def record(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunRecord:
+    """A record without its picture, which has its own tests."""
+    monkeypatch.setattr(run_directory, "write_overview", lambda path, *_: path.write_bytes(b"picture"))
+    return RunRecord.begin(tmp_path / "run", CONFIG, CHOICES)
+
+
+def mapped(room: CornerRoom, capacity: int = 100, **tracking: int) -> RunResult:
+    return Pipeline(SphereDetector(), GivenPose(**tracking), KeepAll(), GridFuser(capacity)).run(room)
+
+
+def metrics_of(record: RunRecord, name: str = "metrics.json") -> dict[str, Any]:
+    metrics: dict[str, Any] = json.loads((record.directory / name).read_text())
+    return metrics
+
+
+def test_every_file_of_the_design_is_there(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room))
+    assert sorted(path.name for path in record.directory.iterdir()) == [
+        "config.yaml",
+        "instances.json",
+        "map.npz",
+        "mesh.ply",
+        "metrics.json",
+        "overview.png",
+        "timings.csv",
+        "trajectory.txt",
+    ]
+
+
+def test_metrics_have_the_keys_of_the_design(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room))
+    metrics = metrics_of(record)
+    stages = ("detect", "track", "lift", "refine", "fuse")
+    assert set(metrics) >= {
+        *("frames", "frames_lost", "frames_skipped", "fps", "fps_median", "map.voxels"),
+        *("map.bytes", "peak_rss_bytes", "pose_source"),
+        *(f"stage_ms.{stage}.{figure}" for stage in stages for figure in ("median", "p95")),
+        *("instances.count", "instances.ap50", "instances.ap25", "instances.ap50.chair", "instances.ap50.couch"),
+        *("instances.ap25.chair", "instances.ap.chair", "instances.true_count.chair", "annotation_release"),
+        *("instances.ap50_agnostic", "instances.mean_iou", "trajectory.ate_rmse_m", "trajectory.rpe_rmse_m"),
+        *(
+            "seed",
+            "config_hash",
+            "inputs_sha256",
+            "git_commit",
+            "environment.python",
+            "environment.torch",
+            "environment.cpus",
+        ),
+    }
+    assert (metrics["frames"], metrics["instances.count"], metrics["instances.ap50"]) == (6, 2, 1.0)
+    assert metrics["trajectory.ate_rmse_m"] == pytest.approx(0, abs=1e-9)
+    assert (metrics["seed"], metrics["choice.detector"], metrics["choice.fuser"]) == (3, "simulated", None)
+    assert metrics["peak_rss_bytes"] > 2**24
+
+
+@pytest.mark.parametrize(("annotation", "release"), [("second", "second"), ("", None)])
+def test_both_transfers_and_the_release_of_the_truth_are_told(room: CornerRoom, annotation: str, release: str) -> None:
+    scene = mapped(room).scene
+    room.annotation = annotation
+    metrics = instance_metrics(room, scene.mesh(), scene.instances(), CLASSES)
+    predictions = PredictedInstances.of_map(scene.mesh(), scene.instances(), CLASSES)
+    to_truth, to_map = (evaluate(predictions, room.scene_truth(), transfer=way).metrics() for way in Transfer)
+    assert to_map["instances.mean_iou"] != to_truth["instances.mean_iou"]
+    assert metrics.pop("annotation_release") == release
+    assert metrics.pop("instances.count") == 2
+    assert len(str(metrics.pop("truth_sha256"))) == 64
+    for name in ("ap50", "ap25", "ap", "ap50_agnostic", "mean_iou"):
+        assert metrics.pop(f"instances.to_map.{name}") == to_map[f"instances.{name}"]
+    assert metrics == to_truth
+
+
+def test_without_ground_truth_there_is_no_evaluation(record: RunRecord, room: CornerRoom) -> None:
+    result = mapped(room)
+    untrue = [type(frame)(frame.index, frame.position, frame.timestamp, frame.pose, None) for frame in result.tracked]
+    blind = RunResult(result.scene, 6, 0, tuple(untrue), result.timings, result.seconds)
+    record.write(CornerRoom(truth=False), blind)
+    metrics = metrics_of(record)
+    assert metrics["pose_source"] == "tracked"
+    assert not [key for key in metrics if key.startswith(("trajectory.", "instances.ap"))]
+
+
+def test_metrics_come_last(record: RunRecord, room: CornerRoom, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full_disk(path: Path, *_: object) -> None:
+        raise DataError(f"{path} could not be written: no space left on device")
+
+    monkeypatch.setattr(run_directory, "write_overview", full_disk)
+    assert "no space" in str(record.write(room, mapped(room)))
+    assert not (record.directory / "metrics.json").exists()
+    assert "no space" in metrics_of(record, "metrics.partial.json")["partial"]
+
+
+def test_what_was_mapped_stays_where_the_truth_is_unusable(record: RunRecord, room: CornerRoom) -> None:
+    def far_off() -> SceneTruth:
+        raise DataError("ground truth: a point lies far off")
+
+    result = mapped(room)
+    room.scene_truth = far_off  # type: ignore[method-assign]
+    assert str(record.write(room, result)) == "ground truth: a point lies far off"
+    left = {path.name for path in record.directory.iterdir()}
+    assert left == {"config.yaml", "metrics.partial.json", *MAPPED}
+    metrics = metrics_of(record, "metrics.partial.json")
+    assert metrics["partial"] == "ground truth: a point lies far off"
+    assert (metrics["frames"], metrics["instances.count"], "instances.ap50" in metrics) == (6, 2, False)
+
+
+@pytest.mark.parametrize("name", MAPPED)
+def test_a_folder_in_a_files_place_costs_that_file_alone(record: RunRecord, room: CornerRoom, name: str) -> None:
+    (record.directory / name).mkdir()
+    fault = record.write(room, mapped(room))
+    assert name in str(fault)
+    assert {path.name for path in record.directory.iterdir() if path.is_file()} >= {*MAPPED} - {name}
+    assert name in metrics_of(record, "metrics.partial.json")["partial"]
+
+
+def test_a_record_whose_directory_was_removed_meanwhile_is_whole(record: RunRecord, room: CornerRoom) -> None:
+    config = (record.directory / "config.yaml").read_bytes()
+    shutil.rmtree(record.directory)
+    assert record.write(room, mapped(room)) is None
+    assert (record.directory / "config.yaml").read_bytes() == config
+    assert read_record(record.directory).metrics["frames"] == 6
+
+
+def test_a_step_over_a_skipped_frame_is_no_step_of_one_frame(room: CornerRoom) -> None:
+    """1 cm of drift a frame, of which frame 2 was skipped: RPE is 1 cm, and not that of steps of 1, 2 and 1 cm."""
+    true = np.eye(4)
+    tracked = []
+    for position in (0, 1, 3, 4):
+        drifted = np.eye(4)
+        drifted[0, 3] = 0.01 * position
+        tracked.append(TrackedFrame(10 * position, position, 0.1 * position, Pose(drifted), true))
+    result = mapped(room)
+    metrics = trajectory_metrics(RunResult(result.scene, 5, 1, tuple(tracked), (), 1.0))
+    assert metrics["trajectory.rpe_rmse_m"] == pytest.approx(0.01)
+
+
+def test_a_partial_run_is_marked(record: RunRecord, room: CornerRoom) -> None:
+    result = mapped(room, capacity=2)
+    assert isinstance(result.stopped_by, MapFullError)
+    record.write(room, result)
+    assert not (record.directory / "metrics.json").exists()
+    metrics = metrics_of(record, "metrics.partial.json")
+    assert metrics["partial"] == "the map holds 2 frames: raise fuser.capacity"
+    assert metrics["frames"] == 3
+
+
+def test_a_new_run_takes_the_old_ones_metrics_away(record: RunRecord) -> None:
+    for name in ("metrics.json", "metrics.partial.json"):
+        (record.directory / name).write_text("{}")
+    RunRecord.begin(record.directory, CONFIG, CHOICES)
+    assert [path.name for path in record.directory.iterdir()] == ["config.yaml"]
+
+
+def test_the_config_is_resolved(record: RunRecord) -> None:
+    assert OmegaConf.load(record.directory / "config.yaml").fuser.seed == 3
+    assert "${" not in (record.directory / "config.yaml").read_text()
+
+
+def test_the_mesh_file_holds_the_mesh(record: RunRecord, room: CornerRoom) -> None:
+    result = mapped(room)
+    record.write(room, result)
+    assert_same(read_ply(record.directory / "mesh.ply"), result.scene.mesh())
+
+
+def test_an_empty_mesh_can_be_written(tmp_path: Path) -> None:
+    write_mesh(tmp_path / "mesh.ply", GridMap().mesh())
+    assert len(read_ply(tmp_path / "mesh.ply").vertices) == 0
+
+
+def test_others_can_read_the_mesh(tmp_path: Path) -> None:
+    import open3d as o3d
+
+    mesh = mapped(CornerRoom(frames=1)).scene.mesh()
+    write_mesh(tmp_path / "mesh.ply", mesh)
+    read = o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
+    np.testing.assert_array_equal(np.asarray(read.vertices).astype(np.float32), mesh.vertices)
+    np.testing.assert_array_equal(np.asarray(read.triangles), mesh.triangles)
+    np.testing.assert_allclose(np.asarray(read.vertex_colors) * 255, mesh.colors, atol=1e-3)
+
+
+def test_instances_say_what_and_where(record: RunRecord, room: CornerRoom) -> None:
+    result = mapped(room)
+    record.write(room, result)
+    first, second = json.loads((record.directory / "instances.json").read_text())
+    assert (first["id"], first["class"], second["id"], second["class"]) == (1, "chair", 2, "couch")
+    assert first["class_probabilities"] == {"chair": 0.9, "couch": 0.1}
+    assert first["observations"] == 6
+    mesh = result.scene.mesh()
+    points = mesh.vertices[mesh.instance_ids == 1]
+    assert first["vertices"] == len(points)
+    np.testing.assert_allclose(first["centroid"], points.mean(axis=0), atol=1e-5)
+    np.testing.assert_allclose(first["aabb"]["min"], points.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(first["aabb"]["max"], points.max(axis=0), atol=1e-6)
+    assert set(first["obb"]) == {"center", "extent", "rotation"}
+
+
+def test_no_instances_are_an_empty_list(tmp_path: Path) -> None:
+    write_instances(tmp_path / "instances.json", GridMap().mesh(), {}, CLASSES)
+    assert json.loads((tmp_path / "instances.json").read_text()) == []
+
+
+def test_lost_frames_are_not_in_the_trajectory(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room, lost_from=1, lost_to=3))
+    timestamps, poses = read_tum(record.directory / "trajectory.txt")
+    np.testing.assert_allclose(timestamps * 30, [0, 3, 4, 5], atol=1e-6)
+    np.testing.assert_allclose(poses[1], pose_at(3), atol=1e-8)
+    assert metrics_of(record)["frames_lost"] == 2
+
+
+def test_a_run_that_tracked_its_first_frame_alone_leaves_a_record(record: RunRecord, room: CornerRoom) -> None:
+    record.write(room, mapped(room, lost_from=1, lost_to=6))
+    assert (metrics_of(record)["frames_lost"], metrics_of(record)["trajectory.ate_rmse_m"]) == (5, 0.0)
+
+
+def test_timings_are_a_table(record: RunRecord, room: CornerRoom) -> None:
+    result = mapped(room)
+    record.write(room, result)
+    with (record.directory / "timings.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == len(result.timings) == 36
+    assert set(rows[0]) == {"frame", "stage", "milliseconds"}
+    fuse = [float(row["milliseconds"]) for row in rows if row["stage"] == "fuse"]
+    assert metrics_of(record)["stage_ms.fuse.median"] == pytest.approx(np.median(fuse), abs=1e-3)
+    assert metrics_of(record)["stage_ms.fuse.p95"] == pytest.approx(np.percentile(fuse, 95), abs=1e-3)
+
+
+def test_the_tracker_says_where_poses_come_from(room: CornerRoom) -> None:
+    """Whatever the poses are: a tracker's first one is the true one, and lost ones are no one's."""
+    one_frame = CornerRoom(frames=1)
+    given = [mapped(room), mapped(room, lost_from=1, lost_to=99), mapped(one_frame)]
+    assert [run_metrics(result)["pose_source"] for result in given] == ["ground_truth"] * 3
+
+    class Tracks(GivenPose):
+        pose_source = "tracked"
+
+    for sequence, lost_to in ((room, 0), (room, 99), (one_frame, 0)):
+        tracker = Tracks(lost_from=1, lost_to=lost_to)
+        result = Pipeline(SphereDetector(), tracker, KeepAll(), GridFuser()).run(sequence)
+        assert run_metrics(result)["pose_source"] == "tracked"
+
+
+@pytest.mark.parametrize("tracker", registered.names("tracker"))
+def test_only_the_true_poses_are_not_tracked(tracker: str, tmp_path: Path) -> None:
+    (tmp_path / "poses.txt").write_text("0 0 0 0 0 0 0 1\n")
+    needs = [f"tracker.path={tmp_path / 'poses.txt'}"] if tracker == "trajectory_file" else []
+    source = registered.built("tracker", tracker, *needs).pose_source
+    assert source == ("ground_truth" if tracker == "ground_truth" else "tracked")
+
+
+def test_the_headline_tells_what_matters() -> None:
+    metrics = {"sequence": "room0", "frames": 9, "fps": 3.21, "frames_lost": 2, "frames_skipped": 0}
+    metrics |= {"instances.count": 4, "trajectory.ate_rmse_m": 0.0123, "instances.ap50": 0.5, "instances.ap25": None}
+    told = headline(metrics | {"pose_source": "tracked"})
+    assert told == "room0 | 9 frames at 3.2/s | 2 lost | ATE 0.012 m | 4 instances | AP50 0.50"
+    told = headline(metrics | {"pose_source": "ground_truth"})
+    assert told == "room0 | 9 frames at 3.2/s | 2 lost | given poses | 4 instances | AP50 0.50"
+
+
+# Provenance
+
+
+def test_the_config_hash_is_of_what_changes_results() -> None:
+    config = {"seed": 0, "fuser": {"voxel_size": 0.01, "block_limit": 9}}
+    same = {"debug": True, "ahead": 0, "hydra": {"run": {"dir": "/x"}}, "fuser": {"block_limit": 9, "voxel_size": 0.01}}
+    assert provenance.config_hash(config) == provenance.config_hash(config | same)
+    assert provenance.config_hash(config) != provenance.config_hash(config | {"seed": 1})
+    assert len(provenance.config_hash(config)) == 64
+
+
+def test_the_commit_is_that_of_the_checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    package = tmp_path / "framework"
+    package.mkdir()
+    (package / "__init__.py").write_text("")
+    monkeypatch.setattr(provenance.framework, "__file__", str(package / "__init__.py"))
+    assert provenance.code_version() == {"git_commit": "unknown", "git_dirty": "unknown"}
+
+    who = {"GIT_AUTHOR_NAME": "a", "GIT_AUTHOR_EMAIL": "a@b", "GIT_COMMITTER_NAME": "a", "GIT_COMMITTER_EMAIL": "a@b"}
+    for command in ("init -q", "add .", "commit -q -m first"):
+        subprocess.run(["git", "-C", tmp_path, *command.split()], check=True, env=os.environ | who)
+    clean = provenance.code_version()
+    assert len(str(clean["git_commit"])) == 40
+    assert clean["git_dirty"] is False
+    (package / "__init__.py").write_text("changed = 1\n")
+    assert provenance.code_version() == {**clean, "git_dirty": True}
+
+
+def test_another_repository_around_an_installed_package_is_not_ours(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    subprocess.run(["git", "-C", tmp_path, "init", "-q"], check=True)
+    installed = tmp_path / "venv" / "site-packages" / "framework"
+    installed.mkdir(parents=True)
+    monkeypatch.setattr(provenance.framework, "__file__", str(installed / "__init__.py"))
+    assert provenance.code_version()["git_commit"] == "unknown"
+
+
+def read_ply(path: Path) -> InstanceMesh:
+    """A PLY reader that goes by the header alone."""
+    content = path.read_bytes()
+    header, _, body = content.partition(b"end_header\n")
+    lines = header.decode().splitlines()
+    assert lines[:2] == ["ply", "format binary_little_endian 1.0"]
+    types = {"float": "<f4", "uchar": "u1", "int": "<i4"}
+    counts = {words[1]: int(words[2]) for words in map(str.split, lines) if words[0] == "element"}
+    scalars = [words for words in map(str.split, lines) if words[0] == "property" and words[1] != "list"]
+    vertex = np.dtype([(words[2], types[words[1]]) for words in scalars])
+    assert vertex.names == ("x", "y", "z", "red", "green", "blue", "instance", "class")
+    face = np.dtype([("n", "u1"), ("corners", "<i4", (3,))])
+    assert "property list uchar int vertex_indices" in lines
+    assert len(body) == counts["vertex"] * vertex.itemsize + counts["face"] * face.itemsize
+    vertices = np.frombuffer(body, vertex, counts["vertex"])
+    faces = np.frombuffer(body, face, counts["face"], counts["vertex"] * vertex.itemsize)
+    assert (faces["n"] == 3).all()
+    [classes] = [line.removeprefix("comment classes ") for line in lines if line.startswith("comment classes ")]
+    return InstanceMesh(
+        vertices=np.stack([vertices[axis] for axis in "xyz"], axis=1),
+        triangles=faces["corners"].astype(np.int32),
+        colors=np.stack([vertices[channel] for channel in ("red", "green", "blue")], axis=1),
+        instance_ids=vertices["instance"].astype(np.int32),
+        class_ids=vertices["class"].astype(np.int32),
+        classes=tuple(classes.split(",")),
+    )
+
+
+def assert_same(a: InstanceMesh, b: InstanceMesh) -> None:
+    for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
+    assert a.classes == b.classes

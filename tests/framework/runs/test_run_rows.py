@@ -1,0 +1,201 @@
+"""Rows, means and paired differences, by hand."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from framework.runs.run_rows import Mean, Row, following, rows_of
+from framework.runs.stored_runs import Record
+
+AP = "instances.ap50"
+
+
+def record(config: dict[str, Any], ap: object = 0.5, written: float = 0.0, **choices: str) -> Record:
+    metrics = {AP: ap, "pose_source": "tracked", **{f"choice.{stage}": name for stage, name in choices.items()}}
+    return Record(Path("somewhere"), metrics, config, written)
+
+
+def row(name: str, **figures: object) -> Row:
+    return Row(name, {(run.removeprefix("seed"),): record({}, figure) for run, figure in figures.items()})
+
+
+def names(records: list[Record], *order: str, over: tuple[str, ...] = ("seed",)) -> dict[str, list[tuple[str, ...]]]:
+    return {row.name: list(row.records) for row in rows_of(records, over, dict.fromkeys(order, ()))}
+
+
+def test_mean_and_sample_standard_deviation() -> None:
+    mean = Mean.of([1.0, 2.0, 6.0])
+    assert (mean.value, mean.count) == (3.0, 3)
+    assert mean.deviation == pytest.approx(math.sqrt((4 + 1 + 9) / 2))
+    assert mean.error == pytest.approx(mean.deviation / math.sqrt(3))
+
+
+def test_what_one_run_or_none_cannot_say_is_nan() -> None:
+    one, none = Mean.of([4.0]), Mean.of([])
+    assert (one.value, one.count, none.count) == (4.0, 1, 0)
+    assert all(map(math.isnan, (one.deviation, one.error, none.value, none.deviation, none.error)))
+    assert not one.is_not_zero
+    assert not none.is_not_zero
+
+
+def test_differences_are_paired() -> None:
+    """Rooms differ by 0.5, rows by 0.1: only the pairs can tell."""
+    base, other = row("a", seed0=0.1, seed1=0.6, seed2=0.9), row("b", seed0=0.2, seed1=0.7, seed3=0.0)
+    difference = Mean.of(other.differences(base, AP).values())
+    assert difference.count == 2
+    assert difference.value == pytest.approx(0.1)
+    assert difference.error == pytest.approx(0, abs=1e-12)
+    assert other.mean(AP).value == pytest.approx(0.3)
+
+
+def test_figures_that_are_not_defined_are_left_out() -> None:
+    told = row("a", seed0=0.4, seed1=None, seed2="many", seed3=True, seed4=math.nan, seed5=1, seed6=10**400)
+    assert told.values(AP) == {("0",): 0.4, ("5",): 1.0}
+    assert told.mean("no.such.key").count == 0
+    assert told.differences(row("b", seed0=None), AP) == {}
+
+
+def test_the_star_is_the_paired_t_test() -> None:
+    rng = np.random.default_rng(0)
+    stars = []
+    for _ in range(40):
+        a = rng.normal(0, 1, 5)
+        b = a + rng.normal(0.6, 0.5, 5)
+        mean = Mean.of(b - a)
+        assert mean.is_not_zero == (stats.ttest_rel(b, a).pvalue < 0.05)
+        stars.append(mean.is_not_zero)
+    assert 5 < sum(stars) < 35
+
+
+def test_equal_differences_are_no_evidence() -> None:
+    """Two instances more in each of two rooms: a count, without a spread by which the next room could be told."""
+    assert not Mean.of([2.0, 2.0]).is_not_zero
+    assert not Mean.of([0.7 - 0.6, 0.2 - 0.1]).is_not_zero, "they differ in the last digit only"
+
+
+def test_rows_are_the_experiments_and_runs_are_seeds_in_order() -> None:
+    records = [record({"row": name, "seed": seed}) for name in ("b", "a") for seed in (10, 9, 1)]
+    runs = [("1",), ("9",), ("10",)]
+    assert names(records, "b", "none", "a") == {"b": runs, "a": runs}
+    assert list(names(records, "b", "none", "a")) == ["b", "a"]
+
+
+def test_what_follows_the_seed_makes_no_row() -> None:
+    records = [
+        record({"seed": seed, "dataset": {"seed": seed}, "detector": {"seed": seed, "shift": 1.5}}) for seed in range(3)
+    ]
+    assert names(records) == {"all runs": [("0",), ("1",), ("2",)]}
+
+
+def test_a_parameter_that_only_looks_like_the_seed_makes_rows() -> None:
+    records = [record({"seed": seed, "dataset": {"start": start}}) for seed in (0, 1) for start in (0, 1)]
+    runs = [("0",), ("1",)]
+    assert names(records) == {"dataset.start=0": runs, "dataset.start=1": runs}
+
+
+def test_without_an_experiment_rows_are_what_was_chosen() -> None:
+    """A refiner's own parameters differ from another's, and are no row of their own."""
+    parameters: dict[str, dict[str, Any]] = {"kmeans": {"centers": 5}, "gmm": {"steps": 8, "floor": 0.1}}
+    records = [
+        record({"seed": seed, "refiner": node}, refiner=name, fuser="bayes")
+        for name, node in parameters.items()
+        for seed in (0, 1)
+    ]
+    records.append(record({"seed": 0, "refiner": {"steps": 9, "floor": 0.1}}, refiner="gmm", fuser="bayes"))
+    assert names(records) == {
+        "refiner=gmm, refiner.steps=8": [("0",), ("1",)],
+        "refiner=gmm, refiner.steps=9": [("0",)],
+        "refiner=kmeans": [("0",), ("1",)],
+    }
+
+
+def test_an_experiments_row_is_split_where_the_command_line_changed_more() -> None:
+    records = [record({"row": name, "seed": 0, "fuser": {"voxel": voxel}}) for name in "ba" for voxel in (0.02, 0.05)]
+    split = [f"{name}, fuser.voxel={voxel}" for name in "ba" for voxel in (0.02, 0.05)]
+    assert list(names(records, "b", "a")) == split
+
+
+def test_rows_that_differ_in_what_no_row_changes_are_told_apart() -> None:
+    """One row was tracked and the other was not: that is no difference between the rows, and is in their names."""
+    records = [
+        record({"row": "a", "seed": 0}, tracker="icp", fuser="bayes"),
+        record({"row": "b", "seed": 0}, tracker="given", fuser="count"),
+    ]
+    changes = {"a": [], "b": ["+fuser=count", "fuser@fuser.inner=x", "fuser.voxel=1"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, tracker=icp", "b, tracker=given"]
+    changes["b"].append("tracker=given")
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
+
+
+def test_rows_with_other_parameters_are_told_apart_though_each_has_but_one() -> None:
+    """They differ in what no row's overrides say: that is no difference between the rows, and is in their names."""
+    frames = {"a": 8, "b": 16}
+    records = [
+        record({"row": row, "seed": 0, "dataset": {"frames": count}, "fuser": {"voxel": count, "inner": {"x": count}}})
+        for row, count in frames.items()
+    ]
+    changes = {"a": [], "b": ["fuser.voxel=16", "part@fuser.inner=y"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.frames=8", "b, dataset.frames=16"]
+    changes["b"].append("dataset=other")
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a", "b"]
+    assert [row.name for row in rows_of(records, ["seed"])] == ["a", "b"], "nobody knows what they change"
+
+
+def test_without_an_experiment_other_scenes_are_told_apart() -> None:
+    records = [
+        record({"seed": 0, "dataset": {"scene": scene}}, refiner=name)
+        for name, scene in (("chain", "011"), ("identity", "016"))
+    ]
+    assert list(names(records)) == ["refiner=chain, dataset.scene=011", "refiner=identity, dataset.scene=016"]
+
+
+def test_a_row_may_be_called_by_a_number() -> None:
+    records = [record({"row": row, "seed": 0}) for row in (0, 20)]
+    assert list(names(records, "0", "20")) == ["0", "20"]
+
+
+def test_what_may_follow_the_seed_by_chance_is_told() -> None:
+    records = [
+        record({"seed": seed, "dataset": {"seed": seed, "stride": seed, "start": 1}, "fuser": {"voxel": 1}})
+        for seed in (1, 2)
+    ]
+    assert following(records, ["seed"]) == ["dataset.stride"]
+    assert following(records[:1], ["seed"]) == []
+
+
+def test_rows_of_other_data_are_told_apart_though_each_has_but_one() -> None:
+    records = [record({"row": row, "seed": 0, "dataset": {"root": f"/{row}", "stride": 1}}) for row in "ab"]
+    changes = {"a": [], "b": ["dataset.stride=2"]}
+    assert [row.name for row in rows_of(records, ["seed"], changes)] == ["a, dataset.root=/a", "b, dataset.root=/b"]
+
+
+def test_a_row_tells_its_poses_in_words() -> None:
+    given = record({}, tracker="ground_truth")
+    given = Record(given.directory, {**given.metrics, "pose_source": "ground_truth"}, {}, 0.0)
+    assert Row("a", {("0",): given}).poses == "ground truth"
+    tracked = {(str(seed),): record({}, tracker=name) for seed, name in enumerate(("pnp", "icp", "icp"))}
+    assert Row("b", tracked).poses == "tracked (icp/pnp)"
+
+
+def test_rows_can_be_averaged_over_anything() -> None:
+    records = [record({"seed": seed, "dataset": {"scene": scene}}) for seed in (0, 1) for scene in "xy"]
+    assert names(records, over=("dataset.scene",)) == {"seed=0": [("x",), ("y",)], "seed=1": [("x",), ("y",)]}
+    assert len(names(records, over=("dataset.scene", "seed"))["all runs"]) == 4
+
+
+@pytest.mark.parametrize("backwards", [False, True])
+def test_of_two_records_of_one_run_the_later_counts(backwards: bool) -> None:
+    records = [record({"seed": 0}, ap, written) for ap, written in ((0.1, 1.0), (0.9, 2.0))]
+    [one] = rows_of(records[::-1] if backwards else records, ["seed"])
+    assert one.mean(AP).value == 0.9
+
+
+def test_what_an_experiment_says_about_itself_makes_no_row() -> None:
+    records = [record({"seed": seed, "debug": bool(seed), "table": {"base": str(seed)}}) for seed in (0, 1)]
+    assert list(names(records)) == ["all runs"]

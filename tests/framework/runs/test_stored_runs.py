@@ -1,0 +1,239 @@
+"""Records read back: whole, broken, missing."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+from pathlib import Path
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.errors import DataError
+from framework.runs import stored_runs
+from framework.runs.inputs import inputs_sha256
+from framework.runs.provenance import config_hash
+from framework.runs.stored_runs import MAPPED, find_records, is_recorded, read_record
+
+CONFIG = {"seed": 3, "fuser": {"voxel_size": 0.02, "far": 1e-9, "storage": "EXACT", "none": None}, "on": [1, "2", True]}
+
+
+@pytest.fixture
+def directory(tmp_path: Path) -> Path:
+    """A complete record."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(CONFIG)))
+    write(directory, config_hash=config_hash(CONFIG))
+    for name in MAPPED:
+        (directory / name).touch()
+    return directory
+
+
+@pytest.fixture(autouse=True)
+def code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_runs, "code_version", lambda: {"git_commit": "abcdef0123", "git_dirty": False})
+
+
+def write(directory: Path, **metrics: object) -> None:
+    told = {"instances.ap50": 0.5, "git_commit": "abcdef0123", "git_dirty": False}
+    (directory / "metrics.json").write_text(json.dumps(told | metrics))
+
+
+def test_the_config_comes_back_with_the_hash_that_it_was_written_with(directory: Path) -> None:
+    record = read_record(directory)
+    assert record.config == CONFIG
+    assert record.metrics["instances.ap50"] == 0.5
+    assert record.commit == "abcdef0"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("metrics.json", "", "metrics.json cannot be read"),
+        ("metrics.json", '{"seed": 0', "metrics.json cannot be read"),
+        ("metrics.json", "[" * 100_000, "metrics.json cannot be read"),
+        ("metrics.json", "\xff", "metrics.json cannot be read"),
+        ("metrics.json", "[1, 2]", "metrics.json must hold an object, found list"),
+        ("metrics.json", '{"fps": [1]}', "metrics.json must be flat, found more below 'fps'"),
+        ("metrics.json", '{"instances.ap50": "best"}', "instances.ap50 must be a number or null, found 'best'"),
+        ("metrics.json", '{"trajectory.ate_rmse_m": NaN}', "trajectory.ate_rmse_m must be a number or null, found nan"),
+        ("metrics.json", '{"fps": 1e999}', "fps must be a number or null, found inf"),
+        ("metrics.json", '{"frames": true}', "frames must be a number or null, found True"),
+        ("metrics.json", "{}", "is not of the config beside it"),
+        ("config.yaml", "seed: 4", "is not of the config beside it"),
+        ("config.yaml", "", "is not of the config beside it"),
+        ("config.yaml", "seed: [", "config.yaml cannot be read"),
+        ("config.yaml", "word", "is not of the config beside it"),
+        ("config.yaml", "- 1", "config.yaml must hold keys and values"),
+        ("config.yaml", "fuser: {true: 1, voxel_size: 2}", "is not of the config beside it"),
+    ],
+)
+def test_a_broken_record_is_one_line(directory: Path, name: str, content: str, said: str) -> None:
+    (directory / name).write_text(content, encoding="latin-1")
+    with pytest.raises(DataError, match=said) as caught:
+        read_record(directory)
+    assert "\n" not in str(caught.value)
+    found, others = find_records(directory.parent)
+    assert found == []
+    assert [(one.directory, one.reason) for one in others] == [(directory, str(caught.value))]
+    assert not is_recorded(directory, OmegaConf.create(CONFIG))
+
+
+def test_a_record_without_config_is_told(directory: Path) -> None:
+    (directory / "config.yaml").unlink()
+    with pytest.raises(DataError, match=r"config.yaml is missing"):
+        read_record(directory)
+
+
+@pytest.mark.parametrize(
+    ("files", "reason"),
+    [
+        ({}, "not complete: running, or killed"),
+        ({"instancemap.log": "12:00:00 INFO    mapping\n"}, "not complete: running, or killed"),
+        (
+            {"instancemap.log": "12:00:00 INFO    mapping\n12:00:01 ERROR   fuser: bad\nTraceback\n  x\n"},
+            "failed: fuser: bad",
+        ),
+        (
+            {"instancemap.log": "12:00:01 ERROR   fuser: bad\n12:00:02 INFO    mapping again\n"},
+            "not complete: running, or killed",
+        ),
+        ({"metrics.partial.json": '{"partial": "interrupted by Ctrl-C"}'}, "partial: interrupted by Ctrl-C"),
+        ({"metrics.partial.json": "{"}, r"cannot be read"),
+    ],
+)
+def test_why_a_run_is_not_complete(directory: Path, files: dict[str, str], reason: str) -> None:
+    (directory / "metrics.json").unlink()
+    (directory / "instancemap.log").write_text("")
+    for name, content in files.items():
+        (directory / name).write_text(content)
+    found, [other] = find_records(directory.parent)
+    assert found == []
+    assert reason in other.reason
+
+
+def test_what_is_no_run_is_not_looked_at(directory: Path) -> None:
+    (directory.parent / "table.md").write_text("")
+    (directory.parent / ".hydra").mkdir()
+    (directory.parent / ".hydra" / "metrics.json").write_text("{}")
+    found, others = find_records(directory.parent)
+    assert [record.directory for record in found] == [directory]
+    assert others == []
+
+
+def test_a_record_of_the_same_config_is_kept(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    assert is_recorded(directory, OmegaConf.create(CONFIG | {"debug": True}))
+    assert caplog.messages == [f"kept: the complete record in {directory}"]
+
+
+def test_what_a_record_has_lost_is_named(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Who needs the disk may have removed it, and the figures are still those of the run."""
+    (directory / "map.npz").unlink()
+    (directory / "mesh.ply").unlink()
+    assert is_recorded(directory, OmegaConf.create(CONFIG))
+    assert f"{directory} has lost mesh.ply, map.npz; resume=false would make it again" in caplog.messages
+
+
+def test_a_record_of_another_config_is_not(directory: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    assert not is_recorded(directory, OmegaConf.create(CONFIG | {"seed": 4}))
+    assert caplog.messages == [f"run again: the record in {directory} is of another config"]
+
+
+@pytest.mark.parametrize("theirs", [{"git_commit": "1234567890"}, {"git_dirty": True}])
+def test_a_record_of_other_code_is_kept_with_a_warning(
+    directory: Path, caplog: pytest.LogCaptureFixture, theirs: dict[str, object]
+) -> None:
+    write(directory, config_hash=config_hash(CONFIG), **theirs)
+    assert is_recorded(directory, OmegaConf.create(CONFIG))
+    [told] = caplog.records
+    assert told.levelno == logging.WARNING
+    assert "this is abcdef0" in told.getMessage()
+
+
+SETTINGS = {"threads": 4, "ahead": 2, "detection_cache": "off"}
+MACHINE = {"environment.processor": "a", "environment.cpus": 4}
+
+
+def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A complete record of this config, on a machine like this."""
+    monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE)
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    write(directory, config_hash=config_hash(config), inputs_sha256=inputs_sha256(config), **MACHINE)
+
+
+@pytest.mark.parametrize("changed", [{"threads": 1}, {"ahead": 0}, {"detection_cache": "read_write"}])
+def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
+    directory: Path, changed: dict[str, object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    config = CONFIG | SETTINGS
+    record_of(directory, config, monkeypatch)
+    about_results = {"table": {"columns": ["instances.ap50", "stage_ms.fuse.median"]}}
+    about_speed = {"table": {"columns": ["fps"]}}
+    assert is_recorded(directory, OmegaConf.create(config | about_speed))
+    assert is_recorded(directory, OmegaConf.create(config | changed | about_results))
+    assert is_recorded(directory, OmegaConf.create(config | changed))
+    caplog.clear()
+    assert not is_recorded(directory, OmegaConf.create(config | changed | about_speed))
+    assert caplog.messages == [
+        f"run again: the times in {directory} are of other settings or another machine: "
+        "threads=4, ahead=2, detection_cache=off, processor=a, cpus=4"
+    ]
+
+
+def test_times_of_another_machine_are_no_record_of_an_experiment_about_speed(
+    directory: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    config = CONFIG | SETTINGS | {"table": {"columns": ["fps"]}}
+    record_of(directory, config, monkeypatch)
+    assert is_recorded(directory, OmegaConf.create(config))
+    monkeypatch.setattr(stored_runs, "environment", lambda: MACHINE | {"environment.cpus": 8})
+    assert not is_recorded(directory, OmegaConf.create(config))
+
+
+def test_other_weights_or_data_in_the_same_place_are_another_run(
+    directory: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    weights, data = tmp_path / "net.onnx", tmp_path / "data" / "room" / "depth"
+    data.mkdir(parents=True)
+    weights.write_bytes(b"one")
+    (data / "0.png").write_bytes(b"depth")
+    dataset = {"root": str(tmp_path / "data"), "scene": "room"}
+    config = CONFIG | {"dataset": dataset, "detector": {"weights": str(weights), "labels": "auto"}}
+    for change in (
+        lambda: weights.write_bytes(b"two"),
+        lambda: (data / "1.png").write_bytes(b"depth"),
+        lambda: (data / "0.png").write_bytes(b"other depth"),
+        lambda: os.utime(data / "0.png", ns=(1, 1)),
+        lambda: (tmp_path / "data" / "camera.json").write_text("{}"),
+    ):
+        record_of(directory, config, monkeypatch)
+        assert is_recorded(directory, OmegaConf.create(config))
+        change()
+        caplog.clear()
+        assert not is_recorded(directory, OmegaConf.create(config))
+        assert caplog.messages == [f"run again: weights or data have changed since the record in {directory}"]
+    record_of(directory, config, monkeypatch)
+    (tmp_path / "data" / "another room").mkdir()
+    (tmp_path / "data" / "another room" / "0.png").write_bytes(b"depth")
+    (data / "outputs").mkdir()
+    (data / "outputs" / "table.md").write_text("of runs that were begun here")
+    os.utime(weights, ns=(1, 1))
+    assert is_recorded(directory, OmegaConf.create(config)), "neither concerns this run"
+
+
+def test_a_record_from_before_inputs_were_told_is_kept(directory: Path, tmp_path: Path) -> None:
+    config = CONFIG | {"dataset": {"root": str(tmp_path), "scene": ""}}
+    (directory / "config.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create(config)))
+    write(directory, config_hash=config_hash(config))
+    assert is_recorded(directory, OmegaConf.create(config))
+
+
+def test_no_record_is_none(tmp_path: Path) -> None:
+    assert not is_recorded(tmp_path, OmegaConf.create(CONFIG))
+    assert find_records(tmp_path) == ([], [])

@@ -1,0 +1,62 @@
+"""timings.csv: what a run wrote, read back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from framework.errors import DataError
+from framework.runs.run_directory import write_timings
+from framework.runs.timings_file import read_timings
+from framework.runtime.run_log import RunResult, StageTime
+from tests.support.scenes.corner_room import GridMap
+
+
+def test_what_a_run_wrote_is_read_back_with_gaps_where_a_stage_did_not_run(tmp_path: Path) -> None:
+    times = (
+        *(StageTime(4, "track", 2.5), StageTime(4, "fuse", 20.0)),
+        StageTime(6, "track", 3.0),  # lost: not fused
+        *(StageTime(8, "track", 3.5), StageTime(8, "fuse", 0.0)),
+    )
+    result = RunResult(GridMap(10), frames=3, frames_skipped=0, tracked=(), timings=times, seconds=1.0)
+    write_timings(tmp_path / "timings.csv", result)
+    found = read_timings(tmp_path / "timings.csv")
+    np.testing.assert_array_equal(found.frames, [4, 6, 8])
+    assert list(found.milliseconds) == ["track", "fuse"]
+    np.testing.assert_array_equal(found.milliseconds["track"], [2.5, 3, 3.5])
+    np.testing.assert_array_equal(found.milliseconds["fuse"], [20, np.nan, 0])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("", "line 1: expected frame,stage,milliseconds, found ''"),
+        ("a,b\n", "line 1: expected frame,stage,milliseconds, found 'a,b'"),
+        ("frame,stage,milliseconds\n", "has no times"),
+        ("frame,stage,milliseconds\n0,fuse,1\n0,fuse\n", "line 3: .* found '0,fuse'"),
+        ("frame,stage,milliseconds\n0,fuse,nan\n", "line 2: .* found '0,fuse,nan'"),
+        ("frame,stage,milliseconds\n0,fuse,-1\n", "line 2: "),
+        ("frame,stage,milliseconds\n1e3,fuse,1\n", "line 2: "),
+        (f"frame,stage,milliseconds\n{10**18},fuse,1\n", "line 2: "),
+        (f"frame,stage,milliseconds\n{'9' * 5000},fuse,1\n", "line 2: "),
+        ('frame,stage,milliseconds\n0,"' + "x" * 200000, "cannot be read: field larger"),
+        ("frame,stage,milliseconds\n0,\x00,1\n0,fuse\n", "line 3: "),
+    ],
+)
+def test_a_fault_is_one_line_that_names_the_place(tmp_path: Path, content: str, said: str) -> None:
+    path = tmp_path / "timings.csv"
+    path.write_text(content)
+    with pytest.raises(DataError, match=said) as caught:
+        read_timings(path)
+    assert str(caught.value).startswith(str(path))
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200 + len(str(path))
+
+
+def test_a_file_that_is_not_there_or_not_text_is_told(tmp_path: Path) -> None:
+    (tmp_path / "timings.csv").write_bytes(b"\xff\xfe")
+    for name in ("timings.csv", "none.csv"):
+        with pytest.raises(DataError, match=f"{name} could not be read"):
+            read_timings(tmp_path / name)

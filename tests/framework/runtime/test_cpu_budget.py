@@ -1,0 +1,99 @@
+"""Cores for the thread ahead and for the mapping: what the latest frames cost decides."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import numba
+import pytest
+
+from framework.runtime.cpu_budget import RECENT, CoreSharing
+
+
+@pytest.fixture
+def thread_time(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[float], None]]:
+    """A clock of CPU time that passes when it is told to."""
+    now = [0.0]
+    monkeypatch.setattr(time, "thread_time", lambda: now[0])
+
+    def passes(seconds: float) -> None:
+        now[0] += seconds
+
+    return passes
+
+
+@pytest.fixture(params=[1, 2, 4])
+def sharing(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> CoreSharing:
+    """Among so many cores; numba may have fewer here, and gets as many as it is told to in a variable of its own."""
+    threads = [request.param]
+    monkeypatch.setattr(numba, "get_num_threads", lambda: threads[0])
+    monkeypatch.setattr(numba, "set_num_threads", lambda number: threads.__setitem__(0, number))
+    return CoreSharing()
+
+
+def pass_frames(sharing: CoreSharing, passes: Callable[[float], None], ahead: float, mapping: float) -> None:
+    """Some frames that take so much work; the mapping's loops are spread perfectly."""
+    for _ in range(RECENT):
+        with sharing.ahead():
+            passes(ahead)
+        with sharing.mapping():
+            passes(mapping / numba.get_num_threads())
+
+
+def test_each_side_gets_its_share(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+    assert sharing.cores_ahead() == sharing.cores // 2  # nothing is known yet
+    pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
+    assert sharing.cores_ahead() == sharing.cores // 2
+
+
+def test_a_side_with_little_to_do_leaves_all_cores_to_the_other(
+    sharing: CoreSharing, thread_time: Callable[[float], None]
+) -> None:
+    pass_frames(sharing, thread_time, ahead=0.1, mapping=1.0)  # as without a network: a frame is read
+    assert sharing.cores_ahead() == 0
+    with sharing.mapping():
+        assert numba.get_num_threads() == sharing.cores
+    with sharing.ahead():
+        assert numba.get_num_threads() == 1
+    assert numba.get_num_threads() == sharing.cores
+    pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
+    assert sharing.cores_ahead() == sharing.cores
+    with sharing.mapping():
+        assert numba.get_num_threads() == 1
+
+
+def test_workers_ahead_divide_their_share(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+    pass_frames(sharing, thread_time, ahead=20.0, mapping=1.0)
+    with sharing.ahead(workers=2):
+        assert numba.get_num_threads() == max(sharing.cores // 2, 1)
+
+
+def test_a_slow_frame_changes_nothing(sharing: CoreSharing, thread_time: Callable[[float], None]) -> None:
+    pass_frames(sharing, thread_time, ahead=1.0, mapping=1.1)
+    with sharing.mapping():
+        thread_time(100.0)  # kernels are compiled
+    assert sharing.cores_ahead() == sharing.cores // 2
+
+
+def test_threads_are_as_before_after_a_fault(sharing: CoreSharing) -> None:
+    with pytest.raises(RuntimeError, match="lost"), sharing.mapping():
+        raise RuntimeError("lost")
+    assert numba.get_num_threads() == sharing.cores
+
+
+def test_both_sides_may_ask_at_once() -> None:
+    sharing = CoreSharing()
+
+    def side(around: Callable[[], object]) -> None:
+        for _ in range(2000):
+            with around():  # type: ignore[attr-defined]
+                sharing.cores_ahead()
+
+    threads = [threading.Thread(target=side, args=(around,)) for around in (sharing.ahead, sharing.mapping)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert 0 <= sharing.cores_ahead() <= sharing.cores

@@ -1,0 +1,255 @@
+"""Live videos in the loop: the newest frame counts, the rest is dropped and counted, and being stopped is their end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from collections.abc import Generator
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import pytest
+
+from framework.data import Frame, PointClusters, Pose
+from framework.errors import DataError
+from framework.interfaces import FrameReader, LiveVideo, RGBDVideo
+from framework.runs.metrics import run_metrics
+from framework.runs.run_directory import headline
+from framework.runtime.frame_stream import LiveFrames, stream_of
+from tests.framework.test_pipeline import AHEAD, PressesCtrlC, mapped, pipeline, working_threads
+from tests.support.scenes.corner_room import (
+    CornerRoom,
+    FaultyDetector,
+    GivenPose,
+    GridFuser,
+    LiveRoom,
+    SphereDetector,
+    pose_at,
+)
+
+PATIENCE_S = 10.0
+SLOW_S = 0.03  # as long as a stage takes that is too slow for the video
+
+
+@dataclass
+class Handed(LiveVideo):
+    """Frames that a test hands over, as numbers: `come` waits until the listener has them."""
+
+    def __post_init__(self) -> None:
+        self.name = "handed"
+        self.coming: list[int] = []
+        self.asked = threading.Semaphore(0)
+        self.over = False
+
+    def frames(self) -> Generator[FrameReader | None]:
+        while not self.over:
+            while self.coming:
+                yield partial(int, self.coming.pop(0))  # type: ignore[misc]
+            self.asked.release()
+            time.sleep(0.001)
+            yield None
+
+    def come(self, *numbers: int) -> None:
+        self.coming.extend(numbers)
+        for _ in range(3):  # rounds of the listener, the last of them whole
+            while self.asked.acquire(blocking=False):
+                pass
+            assert self.asked.acquire(timeout=PATIENCE_S)
+        assert not self.coming
+
+
+def taken(stream: LiveFrames) -> object:
+    reader = stream.take()
+    return reader and reader()
+
+
+def test_the_newest_is_taken_once_and_the_others_are_counted() -> None:
+    video = Handed()
+    with LiveFrames(video, lambda: False) as stream:
+        video.come(0)
+        assert (taken(stream), stream.dropped) == (0, 0)
+        video.come(1, 2, 3)
+        assert (taken(stream), stream.dropped) == (3, 2)
+        video.come(4)
+        video.come(5)
+        video.over = True
+        assert (taken(stream), stream.dropped) == (5, 3), "the last one is not lost where the video ends"
+        assert taken(stream) is None
+        assert taken(stream) is None
+
+
+def test_who_waits_gets_what_comes_and_is_let_go_when_it_shall_end() -> None:
+    video, ended = Handed(), threading.Event()
+    found: list[object] = []
+    with LiveFrames(video, ended.is_set) as stream:
+        waiting = threading.Thread(target=lambda: found.extend([taken(stream), taken(stream)]))
+        waiting.start()
+        video.come(7)
+        ended.set()
+        waiting.join(PATIENCE_S)
+        assert found == [7, None]
+        video.come(8)
+        assert taken(stream) is None, "what comes after the end is not mapped"
+
+
+def test_what_the_video_raises_is_raised_after_its_last_frame() -> None:
+    video = LiveRoom(fails_after=1)
+    with LiveFrames(video, lambda: False) as stream:
+        assert isinstance(taken(stream), Frame)
+        for _ in range(2):
+            with pytest.raises(DataError, match="the cable is out"):
+                stream.take()
+    assert video.closed
+
+
+def test_whoever_leaves_gives_the_device_back() -> None:
+    video, before = LiveRoom(frames_sent=1000), threading.active_count()
+    with LiveFrames(video, lambda: False) as stream:
+        taken(stream)
+    assert video.closed
+    assert threading.active_count() == before
+
+
+def test_what_is_neither_recorded_nor_live_is_refused() -> None:
+    class Neither(RGBDVideo):
+        name = "neither"
+
+    with pytest.raises(DataError, match="Neither must be an RGBDSequence or a LiveVideo"):
+        stream_of(Neither(), lambda: False)
+
+
+@AHEAD
+def test_a_live_video_that_is_slow_enough_is_mapped_whole(ahead: int) -> None:
+    threads, video = working_threads(), LiveRoom(unreadable=2)
+    result = pipeline(ahead).run(video)
+    assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
+    assert result.live is not None
+    assert result.live.frames_dropped == 0
+    assert [frame.index for frame in result.tracked] == [0, 1, 3, 4, 5]
+    np.testing.assert_array_equal(result.tracked[4].pose.T_world_camera, pose_at(5))
+    assert len(result.live.latencies) == 5
+    assert all(0 < latency < PATIENCE_S for latency in result.live.latencies)
+    assert working_threads() == threads
+
+
+@AHEAD
+def test_when_mapping_is_behind_frames_are_dropped_and_counted(ahead: int, caplog: pytest.LogCaptureFixture) -> None:
+    video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
+    result = pipeline(ahead, fuser=GridFuser(slow_s=SLOW_S)).run(video)
+    assert result.live is not None
+    assert result.frames + result.live.frames_dropped == video.sent == 60
+    assert result.frames < 40
+    indices = [frame.index for frame in result.tracked]
+    assert indices == sorted(set(indices))
+    assert indices[-1] == 59, "the last frame is the newest for good"
+    assert caplog.messages == [f"{result.live.frames_dropped} frames dropped: they came while others were mapped"]
+
+
+def test_no_frame_waits_behind_another() -> None:
+    """However far the loop may look ahead in a recording: a queue would add its length to each latency."""
+    video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
+
+    @dataclass
+    class Slow(GridFuser):
+        def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+            super().fuse(frame, pose, clusters)
+            waiting.append(video.read - len(waiting) - 1)
+
+    pipeline(ahead=5, fuser=Slow(slow_s=SLOW_S)).run(video)
+    assert max(waiting) == 1
+
+
+def test_the_figures_of_a_live_run() -> None:
+    result = pipeline(fuser=GridFuser(slow_s=SLOW_S)).run(LiveRoom(frames_sent=30, period_s=0.005))
+    assert result.live is not None
+    metrics = run_metrics(result)
+    assert metrics["frames_dropped"] == result.live.frames_dropped > 0
+    assert metrics["latency_ms"] == pytest.approx(1e3 * float(np.median(result.live.latencies)))
+    title = headline({"sequence": "live_room", **metrics})
+    assert f"{result.live.frames_dropped} dropped" in title
+    assert f"latency {metrics['latency_ms']:.0f} ms" in title
+
+
+def test_a_recording_has_none_of_these_figures_and_drops_nothing(room: CornerRoom) -> None:
+    result = pipeline(fuser=GridFuser(slow_s=SLOW_S)).run(room)
+    assert (result.frames, result.live) == (6, None)
+    assert not {"frames_dropped", "latency_ms"} & run_metrics(result).keys()
+
+
+@AHEAD
+def test_ctrl_c_is_the_end_of_a_live_video(ahead: int) -> None:
+    video, threads = LiveRoom(frames_sent=1000), working_threads()
+    result = pipeline(ahead, tracker=PressesCtrlC(at=0)).run(video)
+    assert result.stopped_by is None
+    assert len(mapped(result).vertices) == result.frames == 1
+    assert video.closed
+    assert working_threads() == threads
+
+
+def test_a_second_ctrl_c_ends_it_at_once() -> None:
+    """In the middle of a frame: what is left is not whole."""
+    video = LiveRoom(frames_sent=1000)
+    result = pipeline(tracker=PressesCtrlC(at=2, times=2)).run(video)
+    assert isinstance(result.stopped_by, KeyboardInterrupt)
+    assert len(mapped(result).vertices) == 2
+    assert video.closed
+
+
+def test_ctrl_c_before_anything_came_is_what_it_is_elsewhere() -> None:
+    """The worker waits for a first frame that never comes."""
+
+    @dataclass
+    class Silent(LiveRoom):
+        def frames(self) -> Generator[FrameReader | None]:
+            os.kill(os.getpid(), signal.SIGINT)
+            while True:
+                time.sleep(0.01)
+                yield None
+
+    with pytest.raises(KeyboardInterrupt):
+        pipeline().run(Silent())
+
+
+def test_a_video_that_breaks_down_leaves_what_was_mapped() -> None:
+    result = pipeline().run_to_any_end(LiveRoom(fails_after=3))
+    assert isinstance(result.stopped_by, DataError)
+    assert result.frames == 3
+    with pytest.raises(DataError, match="the cable is out"):
+        pipeline().run_to_any_end(LiveRoom(fails_after=0))
+
+
+def test_a_live_video_without_a_usable_frame_is_an_error() -> None:
+    with pytest.raises(DataError, match="live_room: no frame came"):
+        pipeline().run(LiveRoom(frames_sent=0))
+    with pytest.raises(DataError, match="none of the 1 frames can be used"):
+        pipeline().run(LiveRoom(frames_sent=1, unreadable=0))
+    with pytest.raises(DataError, match="none of its frames has a true pose"):
+        pipeline(tracker=GivenPose()).run(Handed())
+
+
+@AHEAD
+def test_a_fault_of_a_stage_leaves_no_thread(ahead: int) -> None:
+    """The worker may be waiting for a frame, and the listener for the video."""
+    video, threads = LiveRoom(frames_sent=1000), working_threads()
+    with pytest.raises(OSError, match="Input/output error"):
+        pipeline(ahead, detector=FaultyDetector(at=0)).run(video)
+    with pytest.raises(OSError, match="Input/output error"):
+        pipeline(ahead, detector=FaultyDetector(at=2)).run(LiveRoom(frames_sent=1000))
+    assert video.closed
+    assert working_threads() == threads
+
+
+def test_detections_come_from_frames_that_were_taken_only() -> None:
+    seen: list[int] = []
+
+    @dataclass
+    class Noting(SphereDetector):
+        def detect(self, frame: Frame):  # type: ignore[no-untyped-def]
+            seen.append(frame.index)
+            return super().detect(frame)
+
+    result = pipeline(detector=Noting(), fuser=GridFuser(slow_s=SLOW_S)).run(LiveRoom(frames_sent=40, period_s=0.005))
+    assert len(seen) == result.frames < 40

@@ -1,0 +1,52 @@
+"""The program runs where Python lacks what only Linux, or no Windows, has."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
+
+ELSEWHERE = """
+import fcntl, os, signal, sys
+
+flags, synced = fcntl.fcntl, os.fsync
+
+def fsync(descriptor):
+    assert flags(descriptor, 3) & os.O_ACCMODE, "Windows syncs only what can be written to"  # 3: F_GETFL
+    synced(descriptor)
+
+os.fsync = fsync
+sys.modules["fcntl"] = sys.modules["resource"] = None
+del os.sched_getaffinity, signal.SIGPIPE
+from framework.__main__ import main
+main()
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system lacks some of it anyway")
+def test_a_run_and_its_table_without_what_other_systems_lack(tmp_path: Path) -> None:
+    def start(*arguments: str) -> str:
+        done = subprocess.run(
+            [sys.executable, "-c", ELSEWHERE, *arguments],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": str(CHECKOUT)},
+            capture_output=True,
+            text=True,
+            timeout=120,
+        )
+        assert done.returncode == 0, done.stderr
+        return done.stdout + done.stderr
+
+    options = ["--config-dir", str(CHECKOUT / "tests" / "support" / "fake_conf"), f"hydra.run.dir={tmp_path}"]
+    start(*options, *FAKES, "dataset.frames=2")
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["peak_rss_bytes"]) == (2, None)
+    assert "AP50" in start("tables", str(tmp_path))
+    assert "bayesian_tsdf" in start("plugins", "fuser")

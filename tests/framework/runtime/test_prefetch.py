@@ -1,0 +1,91 @@
+"""Work ahead: in order, bounded, beside the consumer, and its turns."""
+
+from __future__ import annotations
+
+import random
+import threading
+import time
+from contextlib import nullcontext
+
+import pytest
+
+from framework.runtime.prefetch import Turns, map_ahead
+
+
+def test_map_ahead_is_bounded_and_ordered() -> None:
+    begun: list[int] = []
+
+    def square(k: int) -> int:
+        begun.append(k)
+        return k * k
+
+    outcomes = map_ahead(square, range(10), ahead=2)
+    assert next(outcomes) == 0
+    assert max(begun, default=0) <= 2
+    assert list(outcomes) == [k * k for k in range(1, 10)]
+    assert begun == list(range(10))
+
+
+def test_detection_of_the_next_frame_overlaps_with_this_one() -> None:
+    """Each side waits for the other: without a worker thread this would never end."""
+    fusing, detected = threading.Event(), threading.Event()
+
+    def detect(k: int) -> int:
+        if k == 1:
+            assert fusing.wait(10)
+            detected.set()
+        return k
+
+    for k in map_ahead(detect, range(2), ahead=1):
+        if k == 0:
+            fusing.set()
+            assert detected.wait(10)
+
+
+@pytest.mark.parametrize("workers", [1, 2, 3])
+def test_outcomes_come_in_order_whoever_is_done_first(workers: int) -> None:
+    def sleep(k: int) -> int:
+        time.sleep(0.002 * (k % 3))
+        return k
+
+    assert list(map_ahead(sleep, range(20), ahead=3, workers=workers)) == list(range(20))
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_what_a_worker_raises_comes_in_its_place_and_ends_all(workers: int) -> None:
+    def fail(k: int) -> int:
+        if k == 3:
+            raise OSError("the disk is gone")
+        return k
+
+    outcomes = map_ahead(fail, range(100), ahead=2, workers=workers)
+    assert [next(outcomes) for _ in range(3)] == [0, 1, 2]
+    with pytest.raises(OSError, match="the disk is gone"):
+        next(outcomes)
+    assert not [thread for thread in threading.enumerate() if thread.name.startswith("detect-ahead")]
+
+
+def test_turns_are_taken_in_order_and_a_fault_ends_one() -> None:
+    turns, taken, inside = Turns(), [], threading.Lock()
+
+    def work(number: int) -> None:
+        with turns.turn(number):
+            assert inside.acquire(blocking=False), "two at once"
+            taken.append(number)
+            time.sleep(0.001)
+            inside.release()
+            if number % 3 == 0:
+                raise OSError("expected")
+
+    def quietly(number: int) -> None:
+        with pytest.raises(OSError, match="expected") if number % 3 == 0 else nullcontext():
+            work(number)
+
+    numbers = list(range(12))
+    random.Random(0).shuffle(numbers)
+    threads = [threading.Thread(target=quietly, args=(number,), daemon=True) for number in numbers]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(10)
+    assert taken == list(range(12))

@@ -1,0 +1,158 @@
+"""What the top of the config says to the libraries."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+from omegaconf import OmegaConf
+from scipy.spatial import cKDTree
+
+from framework.errors import ConfigError
+from framework.evaluation import instances
+from framework.runtime.process_settings import Settings, available_cores
+from framework.synthetic.ray_caster import RayCaster
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+
+
+def test_threads_limit_what_is_loaded_and_what_is_loaded_later() -> None:
+    """torch is not loaded for it, and obeys when it is."""
+    code = """
+import sys
+from framework.runtime.process_settings import Settings
+Settings(seed=0, device="cpu", threads=1).apply()
+import cv2, numba
+assert "torch" not in sys.modules
+import torch
+print(numba.get_num_threads(), cv2.getNumThreads(), torch.get_num_threads())
+Settings(seed=0, device="cpu", threads=3).apply()
+print(torch.get_num_threads())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == ["1", "1", "1", "3"]
+
+
+def test_libraries_that_are_told_their_threads_at_each_call_obey(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+
+    class Tree(cKDTree):
+        def query(self, *of: Any, workers: int = 1, **kept: Any) -> Any:
+            asked.append(workers)
+            return super().query(*of, workers=workers, **kept)
+
+    class Scene:
+        def cast_rays(self, rays: Any, nthreads: int) -> Any:
+            asked.append(nthreads)
+            return scene.cast_rays(rays, nthreads)
+
+    triangle = np.eye(3, dtype=np.float32)
+    monkeypatch.setattr(instances, "cKDTree", Tree)
+    caster = RayCaster(triangle, np.arange(3, dtype=np.int32)[None])
+    scene = caster._scene
+    monkeypatch.setattr(caster, "_scene", Scene())
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        instances.transfer_labels(triangle, np.arange(3, dtype=np.int32), triangle, 0.1)
+        caster.cast(np.ones((1, 6), np.float32))
+    finally:
+        numba.set_num_threads(before)
+    assert asked == [1, 1]
+
+
+def test_torch_is_seeded_whenever_it_is_imported() -> None:
+    code = """
+from framework.runtime.process_settings import Settings
+Settings(seed=4, device="cpu", threads=1).apply()
+Settings(seed=5, device="cpu", threads=1).apply()
+import importlib.util
+assert importlib.util.find_spec("torch")  # as libraries look whether it is there
+import torch.nn, torch
+print(torch.initial_seed())
+Settings(seed=6, device="cpu", threads=1).apply()
+print(torch.initial_seed())
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert done.stdout.split() == ["5", "6"]
+
+
+WITHOUT_A_PLACE = """
+import os
+os.access = lambda *_: False
+import framework
+print(os.environ["NUMBA_CACHE_DIR"], os.path.isdir(os.environ["NUMBA_CACHE_DIR"]))
+from framework import geometry
+"""
+
+
+def test_kernels_are_kept_for_a_process_where_nothing_else_can_be_written(tmp_path: Path) -> None:
+    environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
+    environment["PYTHONPATH"] = str(CHECKOUT)
+    line = [sys.executable, "-c", WITHOUT_A_PLACE]
+    done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    folder, was_there = done.stdout.split()
+    assert was_there == "True"
+    assert not Path(folder).exists(), "it is removed in the end"
+    given = subprocess.run(
+        line, cwd=tmp_path, env=environment | {"NUMBA_CACHE_DIR": "given"}, capture_output=True, text=True, check=False
+    )
+    assert given.stdout.split()[0] == "given"
+
+
+def test_where_the_system_tells_no_affinity_all_cores_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert available_cores() == os.cpu_count()
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "most"),
+    [
+        *[("ahead", wrong, 1000) for wrong in ("x", -1, 1.5, 10**6, None, True)],
+        *[("threads", wrong, 4096) for wrong in (10**6, "all", None)],
+        *[("seed", wrong, 2**63 - 1) for wrong in (2**63, 10**400, "x" * 100_000)],
+    ],
+)
+def test_settings_are_within_bounds_that_the_message_says(name: str, value: object, most: int) -> None:
+    config = OmegaConf.create({"seed": 0, "device": "cpu", "threads": 0, "ahead": 2})
+    config[name] = value
+    with pytest.raises(
+        ConfigError, match=f"^{name} must be a whole number, 0 or more and at most {most}, found"
+    ) as told:
+        Settings.of(config)
+    assert len(str(told.value)) < 400
+
+
+@pytest.mark.parametrize("threads", [-1, 1.0, True])
+def test_threads_are_a_number_of_threads(threads: object) -> None:
+    with pytest.raises(ConfigError, match="threads must be a whole number, 0 or more and at most 4096, found"):
+        Settings(seed=0, device="cpu", threads=threads)  # type: ignore[arg-type]
+
+
+IDLE_AFTER_A_PRODUCT = """
+import framework
+import time
+import cv2, numpy as np
+
+for _ in range(2):
+    cv2.gemm(np.ones((800, 128), np.float32), np.ones((128, 12), np.float32), 1, None, 0)
+    np.ones((500, 500)) @ np.ones((500, 500))
+done = time.process_time()
+time.sleep(0.2)
+print(time.process_time() - done)
+"""
+
+
+def test_threads_of_products_do_not_spin_when_they_are_done() -> None:
+    """They would take 0.02 s and more of the CPU time of a process that sleeps."""
+    environment = {name: value for name, value in os.environ.items() if name != "OPENBLAS_THREAD_TIMEOUT"}
+    line = [sys.executable, "-c", IDLE_AFTER_A_PRODUCT]
+    done = subprocess.run(line, cwd=CHECKOUT, env=environment, capture_output=True, text=True, check=True)
+    assert float(done.stdout) < 0.01

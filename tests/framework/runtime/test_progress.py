@@ -1,0 +1,86 @@
+"""Signs of life: where there is a terminal, where there is none, and where nobody wants them."""
+
+from __future__ import annotations
+
+import fcntl
+import io
+import logging
+import os
+import pty
+import struct
+import sys
+import termios
+
+import numpy as np
+import pytest
+
+from framework.runtime import progress
+from framework.runtime.progress import LONGEST, SIGN_OF_LIFE, Progress
+from framework.runtime.run_log import Journal
+from tests.support.scenes.corner_room import GridFuser
+
+
+class Clock:
+    """Stands still until it is set."""
+
+    now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(progress, "time", clock)
+    return clock
+
+
+def test_lines_come_every_few_seconds_and_more_rarely_the_longer_it_takes(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    lines = []
+    with Progress(None, " frames") as bar:
+        for second in np.arange(0, 3600, 0.5):
+            clock.now = 100 + float(second)
+            if bar.line_is_due():
+                lines.append(second)
+    assert lines[:4] == [SIGN_OF_LIFE * k for k in (1, 2, 3, 4)]
+    assert np.diff([line for line in lines if line < 30]).max() == SIGN_OF_LIFE
+    assert np.diff(lines)[-1] == LONGEST
+    assert len(lines) == pytest.approx(10 + 10 * np.log(600 / 30) + 3000 / LONGEST, abs=5)
+
+
+@pytest.mark.parametrize("columns", [80, 0])
+def test_a_terminal_sees_a_bar_also_one_that_does_not_say_how_wide_it_is(
+    columns: int, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+    with os.fdopen(theirs, "w") as terminal:
+        monkeypatch.setattr(sys, "stderr", terminal)
+        with Progress(7, " frames") as bar:
+            clock.now += 100
+            assert not bar.line_is_due()
+    shown = os.read(ours, 1000).decode()
+    os.close(ours)
+    assert "0/7" in shown
+
+
+def test_who_wants_no_bars_gets_no_lines(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TQDM_DISABLE", "1")
+    with Progress(7, " frames") as bar:
+        clock.now += 100
+        assert not bar.line_is_due()
+
+
+def test_without_a_terminal_mapping_says_how_far_it_is(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(sys, "stderr", io.StringIO())
+    with caplog.at_level(logging.INFO), Journal(GridFuser().scene, 3, "tracked") as journal:
+        for _ in range(3):
+            clock.now += 2
+            journal.frame_begins()
+    assert [record.message for record in caplog.records] == ["frame 2 of 3, 0 instances"]

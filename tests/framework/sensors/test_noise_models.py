@@ -1,0 +1,32 @@
+"""The noise of depth is that of Nguyen et al., whoever asks."""
+
+import numpy as np
+import pytest
+from numba import njit
+
+from framework.sensors.noise_models import axial_sigma, axial_sigma_at_angle, axial_sigma_single
+
+
+def test_rounding_does_not_depend_on_who_calls() -> None:
+    """numba would let it have the fast math of the kernel that calls it first."""
+
+    @njit(fastmath=True)
+    def fill(z, out):  # type: ignore[no-untyped-def]
+        for i in range(len(z)):
+            out[i] = axial_sigma_single(z[i])
+
+    z = np.linspace(0.3, 9, 10_000, dtype=np.float32)
+    found = np.empty_like(z)
+    fill(z, found)
+    beyond = z - np.float32(0.4)
+    np.testing.assert_array_equal(found, np.float32(0.0012) + np.float32(0.0019) * beyond * beyond)
+
+
+@pytest.mark.parametrize("z", [0.4, 1.4, 3.4])
+def test_depth_noise_is_nguyens(z: float) -> None:
+    right = 0.0012 + 0.0019 * (z - 0.4) ** 2
+    assert axial_sigma(z) == pytest.approx(right, rel=1e-12)
+    assert axial_sigma_single(np.float32(z)) == pytest.approx(right, rel=1e-6)
+    assert axial_sigma_at_angle(np.float32(z), np.float32(0)) == pytest.approx(right, rel=1e-6)
+    slant = 0.0001 / np.sqrt(z) / (np.pi / 2 - 1) ** 2
+    assert axial_sigma_at_angle(np.float32(z), np.float32(1)) == pytest.approx(right + slant, rel=1e-5)

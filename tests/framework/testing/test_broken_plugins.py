@@ -1,0 +1,194 @@
+"""Plugins that break a contract in one way each, and the test of the contract that says so."""
+
+from __future__ import annotations
+
+import inspect
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import FrozenInstanceError, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from framework.config import composition
+from framework.data import Detections, Frame, PointClusters, Pose
+from framework.interfaces import ClusterRefiner, PoseTracker, SceneMap, Viewer
+from framework.testing.dataset import SequenceContract
+from framework.testing.detector import DetectorContract
+from framework.testing.fuser import FuserContract
+from framework.testing.option import OptionContract
+from framework.testing.refiner import RefinerContract
+from framework.testing.tracker import TrackerContract
+from framework.testing.viewer import ViewerContract
+from tests.support.scenes.corner_room import CornerRoom, GridFuser, SphereDetector
+
+
+class Forgetful(SphereDetector):
+    """Finds less every time."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.left = 2
+
+    def detect(self, frame: Frame) -> Detections:
+        found = super().detect(frame)
+        self.left -= 1
+        kept = slice(max(self.left, 0))
+        parts = {name: getattr(found, name)[kept] for name in ("masks", "boxes", "scores", "class_probabilities")}
+        return replace(found, **parts)
+
+
+class Sharing(SphereDetector):
+    """Says that it takes several frames at once, and keeps the frame in work for all of them."""
+
+    concurrent = True
+
+    def detect(self, frame: Frame) -> Detections:
+        self.frame = frame
+        time.sleep(0.01)
+        return super().detect(self.frame)
+
+
+@dataclass
+class Shifting(ClusterRefiner):
+    """Moves points."""
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        return replace(clusters, points_world=clusters.points_world + np.float32(0.01))
+
+
+@dataclass
+class Dropping(ClusterRefiner):
+    """Leaves nothing."""
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        return replace(clusters, cluster=np.full_like(clusters.cluster, -1))
+
+
+@dataclass
+class Writing(PoseTracker):
+    """Writes the map, and begins where it likes."""
+
+    writes: bool = False
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        if self.writes:
+            scene.classes = ("mine",)
+        return Pose(np.diag([1.0, -1.0, -1.0, 1.0]))
+
+
+class Careless(GridFuser):
+    """Renders its map from whatever it is given for a pose."""
+
+
+class Backwards(CornerRoom):
+    """Gives its frames from the last to the first."""
+
+    def __getitem__(self, k: int) -> Frame:
+        return super().__getitem__(len(self) - 1 - k)
+
+
+@pytest.mark.parametrize(
+    ("contract", "plugin", "test"),
+    [
+        (DetectorContract, Forgetful(), "test_detector_gives_the_same_for_the_same_frame_in_any_order"),
+        (DetectorContract, Sharing(), "test_detector_gives_the_same_in_another_thread_and_in_several_where_it_says_so"),
+        (RefinerContract, Shifting(), "test_refiner_invents_no_points"),
+        (RefinerContract, Dropping(), "test_refiner_invents_no_points"),
+        (TrackerContract, Writing(writes=True), "test_tracker_returns_a_pose_and_leaves_the_map_alone"),
+        (TrackerContract, Writing(), "test_trackers_world_is_the_first_frames_true_pose"),
+        (FuserContract, Careless(), "test_fusers_map_is_seen_by_cameras_from_poses_only"),
+        (SequenceContract, Backwards(), "test_dataset_is_in_order"),
+    ],
+)
+def test_a_broken_plugin_is_found(contract: type[Any], plugin: object, test: str) -> None:
+    tests = contract()
+    tests.plugin = lambda: plugin
+    with pytest.raises((AssertionError, FrozenInstanceError)):
+        getattr(tests, test)()
+
+
+class Late(Viewer):
+    """Looks at the map when the call is over, and notes it in the working folder."""
+
+    def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
+        self.scene = scene
+
+    def show(self, *_: object) -> None:
+        looking = threading.Timer(0.0, self.scene.mesh)
+        self.scene.within_a_call.clear()  # type: ignore[attr-defined]
+        looking.start()
+        looking.join()
+        Path("note").touch()
+
+
+class Painting(Viewer):
+    """Paints into the frame."""
+
+    def show(self, frame: Frame, *_: object) -> None:
+        frame.color[0, 0] = 255 - frame.color[0, 0]
+
+
+@pytest.mark.parametrize(
+    ("viewer", "test"),
+    [
+        (Painting(), ViewerContract.test_viewer_takes_all_that_happens_to_frames_and_changes_nothing),
+        (Late(), ViewerContract.test_viewer_reads_the_map_within_a_call_only),
+        (Late(), ViewerContract.test_viewer_leaves_its_files_in_the_runs_directory),
+    ],
+)
+def test_a_broken_viewer_is_found(
+    viewer: Viewer,
+    test: Callable[..., None],
+    request: pytest.FixtureRequest,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    tests = ViewerContract()
+    tests.plugin = lambda: viewer  # type: ignore[method-assign]
+    fixtures = [name for name in inspect.signature(test).parameters if name != "self"]
+    with pytest.raises(AssertionError):
+        test(tests, *map(request.getfixturevalue, fixtures))
+
+
+def option(folder: Path, text: str) -> OptionContract:
+    """The contract of a refiner's option with this YAML."""
+    (folder / "refiner").mkdir()
+    (folder / "refiner" / "own.yaml").write_text(text)
+
+    class Own(OptionContract, RefinerContract):
+        option = "own"
+
+    return Own()
+
+
+OWN = "_target_: plugins.refiners.largest_component.LargestComponent\ngap: {} # m\ngap_per_depth: 0.02 # m per m\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "listed", "defaults"),
+    [
+        (OWN.format(0.03) + "reach: 2 # px\n", True, True),
+        (OWN.format(0.04) + "reach: 2 # px\n", True, False),
+        (OWN.format(0.03) + "reach: 2\n", False, True),
+        (OWN.format(0.03), False, True),
+    ],
+)
+def test_a_yaml_that_differs_from_its_class_is_found(
+    text: str, listed: bool, defaults: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(composition, "_added", [tmp_path])
+    tests = option(tmp_path, text)
+    for test, holds in (
+        (tests.test_option_is_listed_with_every_parameter_and_a_comment, listed),
+        (tests.test_values_in_the_yaml_are_the_defaults_of_the_class, defaults),
+    ):
+        if holds:
+            test()
+        else:
+            with pytest.raises(AssertionError):
+                test()

@@ -1,0 +1,134 @@
+"""Label spaces: complete, of one mind, and exact arithmetic when one is turned into another."""
+
+import numpy as np
+import pytest
+
+from framework.errors import ConfigError
+from framework.vocabulary.label_spaces import _SECTIONS, COCO, MEANINGS, SCENENN_TO_COCO, SPACES, read_labels, to_coco
+
+
+@pytest.mark.parametrize(
+    ("space", "size", "first", "last"),
+    [
+        ("coco", 80, "person", "toothbrush"),
+        ("nyu40", 40, "wall", "otherprop"),
+        ("scenenn", 9, "bed", "bag"),
+        ("ade20k", 150, "wall", "flag"),
+        ("coco_panoptic", 133, "person", "rug-merged"),
+        ("scannet20", 20, "wall", "otherfurniture"),
+        ("scannet200", 200, "wall", "mattress"),
+    ],
+)
+def test_every_space_is_complete(space, size, first, last):
+    names = read_labels(space)
+    assert len(set(names)) == len(names) == size
+    assert (names[0], names[-1]) == (first, last)
+    assert set(SPACES) == {"coco", "nyu40", "scenenn", "ade20k", "coco_panoptic", "scannet20", "scannet200"}
+
+
+def test_orders_are_those_of_the_published_lists():
+    assert [COCO.index(name) for name in ("chair", "couch", "bed", "tv", "book")] == [56, 57, 59, 62, 73]
+    ade = read_labels("ade20k")
+    assert [ade.index(name) for name in ("bed", "chair", "sofa", "toilet", "crt screen")] == [7, 19, 23, 65, 141]
+    assert read_labels("coco_panoptic")[:81] == (*COCO, "banner")
+    assert read_labels("nyu40").index("bag") == 36
+    assert set(read_labels("scannet20")) < set(read_labels("nyu40"))
+    scannet = read_labels("scannet200")
+    assert [scannet.index(name) for name in ("floor", "couch", "paper towel dispenser", "object")] == [2, 5, 71, 172]
+
+
+def test_a_name_means_the_same_in_every_section_and_only_what_coco_has():
+    for section, names in _SECTIONS.items():
+        for name, coco in names.items():
+            assert MEANINGS[name] == coco, f"{section}: {name}"
+            assert name == name.strip().lower()
+            assert "," not in name
+            assert coco is None or coco in COCO
+            assert name not in COCO or coco == name
+
+
+def test_the_nine_of_scenenn():
+    assert SCENENN_TO_COCO["sofa"] == "couch"
+    assert len(SCENENN_TO_COCO) == len(set(SCENENN_TO_COCO.values())) == 9
+    assert set(to_coco(read_labels("scenenn")).classes) == set(SCENENN_TO_COCO.values())
+
+
+def test_coco_is_left_as_it_is():
+    mapping = to_coco(COCO)
+    assert mapping.classes == COCO
+    np.testing.assert_array_equal(mapping.meaning, np.arange(80))
+    assert to_coco(read_labels("coco_panoptic")).classes == COCO
+
+
+def test_columns_of_one_meaning_add_up_and_the_rest_is_renormalised():
+    mapping = to_coco(["wall", "swivel chair", "sofa", "armchair", "person"])
+    assert mapping.classes == ("person", "chair", "couch")
+    rows = np.array([[0.5, 0.125, 0.125, 0.125, 0.125], [0, 0.3, 0.4, 0.3, 0], [0.2, 0.1, 0.5, 0.1, 0.1]], np.float32)
+    found, known = mapping.apply(rows)
+    np.testing.assert_allclose(
+        found, [[0.25, 0.5, 0.25], [0, 0.6, 0.4], [1 / 8, 1 / 4, 5 / 8]], rtol=1e-6, err_msg="sums of columns"
+    )
+    assert found.dtype == np.float32
+    np.testing.assert_array_equal(known, [False, True, True])
+
+
+def test_a_row_without_any_class_is_uniform_and_not_known():
+    mapping = to_coco(["chair", "wall", "bed"])
+    rows, known = mapping.apply(np.array([[0, 1, 0], [0, 0, 0]], np.float32))
+    np.testing.assert_array_equal(rows, np.full((2, 2), 0.5))
+    assert not known.any()
+
+
+def test_no_rows():
+    rows, known = to_coco(COCO).apply(np.zeros((0, 80), np.float32))
+    assert (rows.shape, known.shape) == ((0, 80), (0,))
+
+
+def test_agrees_with_a_loop_over_labels():
+    labels = read_labels("ade20k")
+    mapping = to_coco(labels)
+    rows = np.random.default_rng(0).dirichlet(np.full(150, 0.1), 20).astype(np.float32)
+    found, known = mapping.apply(rows)
+    for row, new, is_known in zip(rows, found, known, strict=True):
+        sums = dict.fromkeys(mapping.classes, 0.0)
+        for label, p in zip(labels, row, strict=True):
+            if (coco := _SECTIONS["ade20k"][label]) is not None:
+                sums[coco] += float(p)
+        np.testing.assert_allclose(new, np.array(list(sums.values())) / sum(sums.values()), rtol=1e-5, atol=1e-9)
+        assert is_known == (_SECTIONS["ade20k"][labels[row.argmax()]] is not None)
+    assert 0 < known.sum() < 20
+
+
+def test_spellings_of_published_lists():
+    assert to_coco(["Sofa, couch, lounge", "bed ", "N/A", "windowpane, window"]).classes == ("couch", "bed")
+    assert to_coco(["tvmonitor", "plane"]).classes == ("airplane", "tv")
+
+
+def test_unknown_names_are_all_listed():
+    with pytest.raises(ConfigError, match=r"2 of 3 labels .*'chiar', 'Flux, capacitor'") as caught:
+        to_coco(["chiar", "bed", "Flux, capacitor"])
+    assert "\n" not in str(caught.value)
+
+
+def test_labels_without_an_object_class_are_refused():
+    with pytest.raises(ConfigError, match="none of the 2 labels"):
+        to_coco(["wall", "floor"])
+    with pytest.raises(ConfigError, match="none of the 0 labels"):
+        to_coco([])
+
+
+def test_labels_from_a_text_file(tmp_path):
+    path = tmp_path / "names.txt"
+    path.write_text("chair\ndining table \n\n")
+    assert read_labels(str(path)) == ("chair", "dining table")
+    path.write_text("chair\n\nbed\n")
+    with pytest.raises(ConfigError, match="line 2"):
+        read_labels(str(path))
+    path.write_text("\n")
+    with pytest.raises(ConfigError, match="is empty"):
+        read_labels(str(path))
+    path.write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="coco, coco_panoptic, nyu40, scenenn, ade20k"):
+        read_labels(str(path))
+    with pytest.raises(ConfigError, match="found cocoo"):
+        read_labels("cocoo")

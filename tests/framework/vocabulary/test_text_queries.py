@@ -1,0 +1,57 @@
+"""Queries taken apart, and the names of colours."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.vocabulary.color_names import COLOR_NAMES, fits, nearest_names
+from framework.vocabulary.label_spaces import COCO
+from framework.vocabulary.text_queries import ObjectWords, object_words
+
+
+@pytest.mark.parametrize(
+    ("query", "classes", "colors", "unknown"),
+    [
+        ("a red chair", ("chair",), ("red",), ()),
+        ("The two RED Chairs!", ("chair",), ("red",), ()),
+        ("sofa", ("couch",), (), ()),
+        ("grey dining tables", ("dining table",), ("gray",), ()),
+        ("knives, mice and people", ("knife", "mouse", "person"), (), ()),
+        ("an orange orange", ("orange",), ("orange",), ()),
+        ("orange", ("orange",), (), ()),
+        ("an orange chair", ("chair",), ("orange",), ()),
+        ("teddy bears", ("teddy bear",), (), ()),
+        ("the fridge", ("refrigerator",), (), ()),
+        ("light blue couch", ("couch",), ("blue",), ()),
+        ("dark grey, pale chairs", ("chair",), ("gray",), ("pale",)),
+        ("a red light", (), ("red",), ("light",)),
+        ("traffic light", ("traffic light",), (), ()),
+        ("a blob", (), (), ("blob",)),
+        ("purple", (), ("purple",), ()),
+        ("", (), (), ()),
+        ("buses", ("bus",), (), ()),
+        ("wine glasses", ("wine glass",), (), ()),
+    ],
+)
+def test_a_query_is_classes_colors_and_what_is_neither(
+    query: str, classes: tuple[str, ...], colors: tuple[str, ...], unknown: tuple[str, ...]
+) -> None:
+    assert object_words(query, COCO) == ObjectWords(classes, colors, unknown)
+
+
+def test_only_classes_that_are_offered_are_found_with_whatever_case_they_have() -> None:
+    assert object_words("a Red Mug", ("Red mug", "Mug")).classes == ("Red mug",)
+    assert object_words("a chair", ("couch",)) == ObjectWords((), (), ("chair",))
+
+
+@pytest.mark.parametrize("name", COLOR_NAMES)
+def test_what_stands_for_a_color_has_its_name_and_fits_it_best(name: str) -> None:
+    plain = {"black": (0, 0, 0), "gray": (128, 128, 128), "white": (255, 255, 255), "red": (220, 20, 30),
+             "orange": (250, 130, 20), "yellow": (250, 220, 40), "green": (30, 150, 50), "blue": (30, 60, 220),
+             "purple": (120, 30, 160), "pink": (250, 140, 190), "brown": (100, 60, 30),
+             "beige": (220, 200, 165)}[name]  # fmt: skip
+    color = np.float32([plain]) / 255
+    assert COLOR_NAMES[nearest_names(color)[0]] == name
+    assert fits(color, name)[0] == 1
+    assert max(fits(color, other)[0] for other in COLOR_NAMES if other != name) < 1

@@ -1,0 +1,29 @@
+"""The demo: what comes with the project for it, and that the first frames are mapped with the defaults."""
+
+from __future__ import annotations
+
+from framework.config.composition import composed
+from framework.files.search_paths import PROJECT_ROOT
+from framework.interfaces import RGBDSequence
+from framework.registry import build
+from instancemap import Mapper
+
+DESK = PROJECT_ROOT / "data" / "desk"
+
+
+def test_it_is_small_and_says_whose_it_is() -> None:
+    assert sum(path.stat().st_size for path in DESK.rglob("*") if path.is_file()) < 12e6
+    card = (DESK / "README.md").read_text()
+    assert all(word in card for word in ("Sturm", "Attribution 4.0", "JPEG", "undone"))
+
+
+def test_a_real_desk_is_tracked_and_its_things_are_found() -> None:
+    """Its first two dozen frames, by the network that comes with the project."""
+    config = composed("dataset=desk")
+    assert config.detector._target_ == "plugins.detectors.maskrcnn2go.MaskRCNN2Go"
+    sequence = build(RGBDSequence, composed("dataset=desk", "dataset.stop=24").dataset)
+    mapper = Mapper("fuser.voxel_size=0.02")
+    assert not any(mapper.add(sequence[k]).lost for k in range(len(sequence)))
+    classes = mapper.scene.classes
+    found = {classes[int(one.class_probabilities.argmax())] for one in mapper.instances().values()}
+    assert {"tv", "keyboard"} <= found

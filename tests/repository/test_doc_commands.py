@@ -1,0 +1,86 @@
+"""No command and no script is shown, in the README or below docs/, that no test runs or looks at."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import re
+import shlex
+import sys
+import tomllib
+from typing import Any
+
+import pytest
+from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
+
+from framework import __main__ as main
+from tests.repository.test_readme import BENCHMARKS, COMMANDS, OWN_DATA, OWN_PLUGIN, RUNNABLE
+from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
+
+EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # in test_readme.py
+ACME = block("python", "class AcmeSearchPath")
+CONTRACT = block("python", "class TestMyRefiner")
+PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
+
+
+OURS = ("python", "instancemap", "make", "pip", "docker")
+
+
+class ParsedError(Exception):
+    """Raised in place of what a command does."""
+
+
+@pytest.mark.parametrize("command", [line for line in PARSED if line not in COMMANDS and line not in RUNNABLE])
+def test_every_other_command_takes_its_arguments(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    parse = argparse.ArgumentParser.parse_intermixed_args
+
+    def parse_and_stop(parser: argparse.ArgumentParser, words: list[str]) -> None:
+        parse(parser, words)
+        raise ParsedError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_intermixed_args", parse_and_stop)
+    monkeypatch.setattr(sys, "argv", ["instancemap", *shlex.split(command)[4:]])
+    with pytest.raises(ParsedError):
+        importlib.import_module(main.module_of(command.split()[3])).main()
+
+
+def test_nothing_is_shown_that_no_test_runs() -> None:
+    """Every line of a console but those of other programs, such as viewers, and every script."""
+    make = re.findall(r"^([a-z-]+):", (CHECKOUT / "Makefile").read_text(), re.MULTILINE)
+    looked_at = {*COMMANDS, *RUNNABLE, *PARSED, *BENCHMARKS, *(f"make {target}" for target in make), OWN_PLUGIN}
+    shown_in = (CHECKOUT / "docker" / "Dockerfile").read_text()
+    looked_at |= {
+        "pip install .",
+        *(line for line in LINES if line.startswith("docker ") and f"#   {line}\n" in shown_in),
+    }
+    assert not [line for line in LINES if line.split()[0] in OURS and line not in looked_at]
+    scripts = {
+        ACME,
+        CONTRACT,
+        *OWN_DATA,
+        *blocks("python", "docs/python.md"),
+        *(block("python", words) for words in EXECUTED),
+    }
+    assert not set(blocks("python")) - scripts
+
+
+def test_what_is_installed_by_name_is_there() -> None:
+    extras = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+    named = {extra for text in PAGES.values() for extra in re.findall(r"instancemap\[([\w,-]+)\]", text)}
+    assert len(named) > 8
+    assert not named - set(extras)
+
+
+def test_a_package_registers_its_options() -> None:
+    names: dict[str, Any] = {}
+    exec(ACME, names)
+    path = ConfigSearchPathImpl()
+    names["AcmeSearchPath"]().manipulate_search_path(path)
+    assert [(element.provider, element.path) for element in path.get_path()] == [("acme", "pkg://acme.conf")]
+
+
+def test_a_contract_is_inherited() -> None:
+    names: dict[str, Any] = {"__name__": "my_package"}
+    exec(CONTRACT, names)
+    inherited = {name for name in dir(names["TestMyRefiner"]) if name.startswith("test_")}
+    assert {"test_option_is_listed_with_every_parameter_and_a_comment", "test_refiner_is_repeatable"} <= inherited

@@ -1,0 +1,151 @@
+"""The pages of docs/ are built without a warning, what they link to and name is there, and CITATION.cff fits."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import yaml
+
+import instancemap
+from framework import __version__
+from framework.commands.installation.plugins import registered
+from framework.files.search_paths import CONF
+from framework.registry import GROUPS
+from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
+
+LINKING = {
+    **PAGES,
+    **{
+        str(path.relative_to(CHECKOUT)): path.read_text()
+        for folder in ("*.md", "data/**/*.md", "plugins/**/*.md")
+        for path in sorted(CHECKOUT.glob(folder))
+    },
+}
+CODE = re.compile(r"^(```|~~~).*?^\1|`[^`\n]+`", re.DOTALL | re.MULTILINE)
+LINK = re.compile(r"\]\((?!\w+:)([^)#\s]*)#?([^)\s]*)\)")
+
+
+def anchors(page: str) -> set[str]:
+    """Those of a page's headings, as code hosts and myst-parser make them."""
+    titles = re.findall(r"^#+ (.*)", re.sub(r"^```.*?^```", "", page, flags=re.DOTALL | re.MULTILINE), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
+
+
+@pytest.mark.parametrize("name", LINKING)
+def test_what_a_page_links_to_is_there(name: str) -> None:
+    here = CHECKOUT / name
+    for path, anchor in LINK.findall(CODE.sub("", LINKING[name])):
+        target = (here.parent / path).resolve() if path else here
+        assert target.is_relative_to(CHECKOUT), f"{path} leads out of the project"
+        assert target.exists(), f"there is no {path}"
+        if anchor:
+            assert anchor in anchors(target.read_text()), f"{path} has no heading #{anchor}"
+
+
+def option_names(stage: str) -> list[str]:
+    return [path.stem for path in (CONF / stage).glob("*.yaml")]
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The pages as HTML."""
+    missing = [name for name in ("sphinx", "furo", "myst_parser") if find_spec(name) is None]
+    if missing:
+        pytest.skip(f"{', '.join(missing)}: not installed, pip install instancemap[docs]")
+    place = tmp_path_factory.mktemp("docs")
+    command = ["-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-d", str(place / "doctrees"), str(DOCS)]
+    done = subprocess.run(
+        [sys.executable, *command, str(place / "html")], capture_output=True, text=True, check=False, timeout=600
+    )
+    assert done.returncode == 0, done.stderr
+    return place / "html"
+
+
+def test_the_api_reference_has_every_public_name(built: Path) -> None:
+    page = (built / "api.html").read_text()
+    assert not [name for name in instancemap.__all__ if f'id="instancemap.{name}"' not in page]
+    assert "(H, W) m along z, 0 = no reading" in page  # a comment beside a field
+
+
+def test_the_configuration_reference_has_every_parameter(built: Path) -> None:
+    for stage in GROUPS:
+        page = (built / "configuration" / f"{stage}.html").read_text()
+        assert not [name for name in option_names(stage) if f'id="{stage}-{name.replace("_", "-")}"' not in page]
+    page = html.unescape((built / "configuration" / "refiner.html").read_text())
+    for option in registered("refiner"):
+        assert option.parameters or option.name == "identity"
+        for parameter in option.parameters:
+            assert f"refiner.{parameter.name}</span>" in page
+            assert parameter.comment in page
+    assert "every random number of a run derives from it" in (built / "configuration.html").read_text()
+
+
+def test_plugins_and_parameters_that_pages_name_are_there(built: Path) -> None:
+    """`fuser=NAME` and `fuser.parameter`, in prose and commands: the configuration reference has them."""
+    text = "\n".join(PAGES.values())
+    for stage in GROUPS:
+        reference = (built / "configuration" / f"{stage}.html").read_text()
+        chosen = set(re.findall(rf"(?<![\w.@]){stage}=([a-z]\w*)", text)) - {"color_blobs", "nearby", "my_refiner"}
+        assert len(chosen) > (0 if stage == "viewer" else 2)
+        assert not [name for name in chosen if f'id="{stage}-{name.replace("_", "-")}"' not in reference]
+        given = set(re.findall(rf"(?<![\w./:(]){stage}\.([a-z]\w*)\b(?![.(])", text)) - {"hue", "scene"}
+        assert not [name for name in given if f"{stage}.{name}</span>" not in reference]
+
+
+def test_pages_need_no_network(built: Path) -> None:
+    for page in built.rglob("*.html"):
+        asked = re.findall(r'<(?:script|link|img|iframe)\b[^>]*?(?:src|href)="(?:https?:)?//[^"]*"', page.read_text())
+        assert not asked, page.name
+    assert "<math" in (built / "method.html").read_text()
+
+
+def test_files_of_the_project_are_pages_with_links_that_lead_somewhere(built: Path) -> None:
+    for name in ("changelog", "contributing", "security", "desk", "guides/maskrcnn2go"):
+        page = (built / f"{name}.html").read_text()
+        assert len(page) > 10_000
+        for target in re.findall(r'<a class="reference (?:internal|download internal)"[^>]*? href="([^"#]+)', page):
+            assert (built / name).parent.joinpath(target).resolve().exists(), f"{name}: {target}"
+
+
+def test_the_citation_has_what_its_schema_requires() -> None:
+    """Citation File Format 1.2.0: the keys that it asks for, and of each reference."""
+    citation = yaml.safe_load((CHECKOUT / "CITATION.cff").read_text())
+    assert citation["cff-version"] == "1.2.0"
+    assert str(citation["version"]) == __version__
+    assert {"message", "title", "authors"} <= set(citation)
+    for work in [citation, *citation["references"]]:
+        assert {"title", "type", "authors"} <= set(work)
+        assert all("name" in author or "family-names" in author for author in work["authors"])
+    page = PAGES["docs/citing.md"]
+    [paper] = citation["references"]
+    for said in (__version__, str(paper["year"]), paper["journal"], str(paper["number"]), paper["url"]):
+        assert said in page
+
+
+def test_the_image_is_made_of_what_is_there() -> None:
+    """Nobody here can build it: what it copies is there and reaches docker, and it installs what the Makefile does."""
+    dockerfile = (CHECKOUT / "docker" / "Dockerfile").read_text().replace("\\\n", " ")
+    steps = re.findall(r"^([A-Z]+) (.*)", dockerfile, re.MULTILINE)
+    copied = {source for step, words in steps if step == "COPY" for source in words.split()[:-1]}
+    assert copied >= {"framework", "plugins", "conf", "pyproject.toml"}
+    assert not [source for source in copied if not (CHECKOUT / source).exists()]
+    sent = set(re.findall(r"^!(.*)", (CHECKOUT / ".dockerignore").read_text(), re.MULTILINE))
+    assert copied == sent
+    project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
+    assert {project["readme"], project["license-files"][0]} <= copied  # pip reads them
+    [(_, entrypoint)] = [step for step in steps if step[0] == "ENTRYPOINT"]
+    assert set(json.loads(entrypoint)) <= set(project["scripts"])
+    makefile = (CHECKOUT / "Makefile").read_text()
+    libraries = set(re.findall(r"missing (lib[\w.-]+)", makefile))
+    assert len(libraries) > 3
+    assert libraries <= set(dockerfile.split())
+    assert re.findall(r"torch==[\d.]+", makefile) == re.findall(r"torch==[\d.]+", dockerfile)
+    assert [step for step, _ in steps].index("USER") < [step for step, _ in steps].index("ENTRYPOINT")  # not as root

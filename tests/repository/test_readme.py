@@ -1,0 +1,248 @@
+"""What the README and the pages of docs/ show works."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hydra import compose, initialize_config_dir
+from omegaconf import OmegaConf
+
+from framework.api import Map, load_map
+from framework.config import composition
+from framework.data import Camera, Frame
+from framework.files.search_paths import CONF
+from framework.interfaces import Detector
+from framework.pipeline import Pipeline
+from framework.refinement.lifting import lift
+from framework.registry import STAGES, build
+from framework.runs.mesh_file import read_mesh
+from tests.support import option_files
+from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
+from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
+
+COMMANDS = {  # by the main config that they compose
+    line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
+    for line in LINES
+    if (words := line.split())[:3] == ["python", "-m", "framework"]
+    and ("=" in words[3] or words[3] == "-m" or (CONF / f"{words[3].replace('-', '_')}.yaml").exists())
+}
+BENCHMARKS = [line for line in LINES if line.startswith("python -m pytest ")]
+
+
+def test_the_loop_maps_a_sequence() -> None:
+    fuser = GridFuser()
+    stages = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": fuser}
+    exec(block("python", "for frame in sequence"), {"sequence": CornerRoom(), "lift": lift, **stages})
+    assert len(fuser.scene.vertices) == 6
+    assert set(fuser.scene.instances()) == {1, 2}
+
+
+def test_frames_are_mapped_from_python(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    names: dict[str, object] = {"frames": CornerRoom()}
+    exec(block("python", "for frame in frames:"), names)
+    scene = names["scene"]
+    assert isinstance(scene, Map)
+    assert len(scene.mesh().vertices) > 1000
+
+
+def test_what_the_tour_names_is_there() -> None:
+    tour = (CHECKOUT / "CONTRIBUTING.md").read_text()
+    named = re.findall(r"`((?:framework|plugins|tests|conf)/[\w/]+\.py)`", tour)
+    assert len(named) > 15
+    assert not [path for path in named if not (CHECKOUT / path).exists()]
+    assert all(hasattr(Pipeline, step) for step in ("read_and_detect", "map_frame"))
+
+
+@pytest.fixture
+def my_plugins(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The detector of the tutorial, saved where it says."""
+    (tmp_path / "my_plugins").mkdir()
+    (tmp_path / "my_plugins" / "color_blobs.py").write_text(block("python", "class ColorBlobs"))
+    (tmp_path / "my_conf" / "detector").mkdir(parents=True)
+    (tmp_path / "my_conf" / "detector" / "color_blobs.yaml").write_text(block("yaml", "color_blobs.ColorBlobs"))
+    monkeypatch.syspath_prepend(tmp_path)
+    importlib.invalidate_caches()
+    return tmp_path
+
+
+def test_the_detector_finds_what_it_says(my_plugins: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    node = OmegaConf.load(my_plugins / "my_conf" / "detector" / "color_blobs.yaml")
+    monkeypatch.setattr(composition, "_added", [my_plugins / "my_conf"])
+    detector = build(Detector, OmegaConf.create({"detector": node}).detector)
+    camera = Camera(64, 48, 50.0, 50.0, 31.5, 23.5)
+    color = np.full((48, 64, 3), 200, np.uint8)
+    color[10:30, 5:25] = (220, 20, 30)  # a red square
+    color[35:40, 40:45] = (220, 20, 30)  # red too, but too small
+    color[10:30, 40:60] = (20, 220, 30)  # green
+    found = detector.detect(Frame(0, 0.0, color, np.ones((48, 64), np.float32), camera))
+    assert len(found) == 1
+    np.testing.assert_array_equal(found.boxes, [[5, 10, 25, 30]])
+    assert found.masks[0].sum() == 400
+    assert found.masks[0, 10:30, 5:25].all()
+    assert found.classes[0] == "cup"
+    blank = Frame(0, 0.0, np.zeros_like(color), np.ones((48, 64), np.float32), camera)
+    assert len(detector.detect(blank)) == 0
+
+
+def test_the_detector_runs_by_its_name(my_plugins: Path) -> None:
+    """The tutorial's command, with the other stages faked for speed."""
+    chosen = [f"{stage}=fake" for stage in FAKES]
+    (my_plugins / "my_conf").joinpath("dataset").mkdir()
+    for stage, name in FAKES.items():
+        group = my_plugins / "my_conf" / stage
+        group.mkdir(exist_ok=True)
+        (group / "fake.yaml").write_text(f"_target_: tests.support.scenes.corner_room.{name}\n")
+    assert OWN_PLUGIN in LINES
+    done = subprocess.run(
+        [sys.executable, *OWN_PLUGIN.split()[1:], *chosen, "hydra.run.dir=run"],
+        cwd=my_plugins,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": f"{CHECKOUT}:{my_plugins}", "HOME": str(my_plugins)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert (my_plugins / "run" / "metrics.json").exists()
+
+
+OWN_PLUGIN = "python -m framework --config-dir my_conf detector=color_blobs detector.hue=120"
+FAKES = {"dataset": "CornerRoom", "tracker": "GivenPose", "refiner": "KeepAll", "fuser": "GridFuser"}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_composes(command: str) -> None:
+    overrides = [word for word in shlex.split(command)[3:] if "=" in word]
+    choices = [override.split("=")[1].split(",") for override in overrides if override.split("=")[0] in STAGES]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        for k in range(max(map(len, choices), default=1)):
+            compose(
+                COMMANDS[command],
+                overrides=[re.sub(r"=.*", f"={_kth(override, k)}", override) for override in overrides],
+            )
+
+
+OWN_DATA = blocks("python", "docs/tutorials/own_data.md")  # writes a recording, and reads what a run made of it
+SMALL = ["dataset.frames=4", "dataset.width=160", "dataset.height=120"]
+OWN = [
+    "dataset=rgbd_folder",
+    "dataset.root=DIR",
+]  # smaller still, and no room has to be furnished
+DEFAULTS = "python -m framework"
+RUNNABLE = {  # what to append, by a command that then takes seconds
+    # twice as large: of what is left of a noisy room in a quarter of 160x120, tracking is not to be had
+    DEFAULTS: [*SMALL, "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
+    "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=outputs/demo"],
+    "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
+    "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
+    "python -m framework check dataset=rgbd_folder dataset.root=my_room": [],
+    "python -m framework dataset=rgbd_folder dataset.root=my_room hydra.run.dir=outputs/my_room": [
+        "dataset.stop=6",
+        "fuser.voxel_size=0.04",
+    ],
+    "python -m framework detection_cache=read_write refiner=kmeans": [*OWN, "hydra.run.dir=cached"],
+    "python -m framework detect dataset=synthetic detector=simulated out=detections.json": SMALL,
+    "python -m framework show-refinement dataset=synthetic detector=simulated frame=24 out=refinement.png": [
+        *SMALL,
+        "frame=1",
+    ],
+    "python -m framework dataset=rgbd_folder dataset.root=DIR tracker=trajectory_file tracker.path=FILE": [
+        "hydra.run.dir=own"
+    ],
+    "python -m framework tables outputs/table3_map": [],  # of the sweep above
+    "python -m framework evaluate outputs/table3_map": [],
+    "python -m framework export outputs/demo --to glb usd ply obj": [],
+    "python -m framework export outputs/demo --to floorplan graph --robot-height 0.5": [],
+    "python -m framework plugins": [],
+    "python -m framework plugins detector": [],
+    "python -m framework doctor": [],
+    "python -m framework new-plugin refiner my_refiner": [],
+}
+LEFT_BEHIND = [
+    "detections.json",
+    "refinement.png",
+    "instancemap-my-refiner/pyproject.toml",
+    *(f"{run}/metrics.json" for run in ("outputs/demo", "coarse", "own")),
+    *(f"outputs/demo/export/{name}" for name in ("scene.glb", "scene.usdc", "map.yaml", "scene_graph.json")),
+]
+RUN = """
+import json, sys
+from framework.__main__ import main
+for line in json.load(open("commands.json")):
+    print(">>>", line, flush=True)
+    if isinstance(line, str):
+        exec(line, {})
+    else:
+        sys.argv = ["instancemap", *line]
+        main()
+"""
+
+
+@pytest.fixture(scope="module")
+def ran(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder in which all of these ran, one after the other in one process: to load the libraries takes longest."""
+    folder = tmp_path_factory.mktemp("readme")
+    (folder / "DIR").mkdir()
+    option_files.overrides("dataset", "rgbd_folder", folder / "DIR")
+    (folder / "FILE").write_text((folder / "DIR" / "poses.txt").read_text())
+    recording, result = OWN_DATA
+    lines = [recording, *(shlex.split(command)[3:] + small for command, small in RUNNABLE.items()), result]
+    (folder / "commands.json").write_text(json.dumps(lines))
+    done = subprocess.run(
+        [sys.executable, "-c", RUN],
+        cwd=folder,
+        env=os.environ | {"PYTHONPATH": str(CHECKOUT), "XDG_CACHE_HOME": str(folder), "MPLBACKEND": "agg"},
+        capture_output=True,
+        text=True,
+        timeout=600,
+    )
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-4000:]
+    return folder
+
+
+def test_commands_that_take_seconds_run(ran: Path) -> None:
+    assert set(RUNNABLE) - {DEFAULTS} <= set(LINES)
+    assert not [name for name in LEFT_BEHIND if not (ran / name).exists()]
+    assert len(list((ran / "outputs" / "table3_map").glob("*/metrics.json"))) == 3
+    assert list(ran.glob("instancemap/detections/*/*.detections"))
+    assert (ran / "check.png").exists()
+
+
+def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
+    """The network that comes with the project, tracked, refined by both links and fused: on four small frames."""
+    metrics = json.loads((ran / "defaults" / "metrics.json").read_text())
+    assert (metrics["frames"], metrics["frames_lost"], metrics["frames_skipped"]) == (4, 0, 0)
+    assert metrics["pose_source"] == "tracked"
+    assert metrics["trajectory.ate_rmse_m"] < 0.02
+    mesh = read_mesh(ran / "defaults" / "mesh.ply")
+    assert len(mesh.vertices) > 1000
+    assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
+
+
+@pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))
+def test_every_row_of_an_experiment_is_named(name: str) -> None:
+    rows = composition.composed(f"experiment={name}", "row=any").rows
+    assert rows
+    assert not [row for row in rows if not any(f"`{row}`" in page for page in PAGES.values())]
+
+
+@pytest.mark.parametrize("command", BENCHMARKS)
+def test_every_benchmark_is_there(command: str) -> None:
+    """Running them takes minutes: pytest's status is 5 where nothing would be run."""
+    line = [sys.executable, *shlex.split(command)[1:], "--collect-only", "--quiet"]
+    done = subprocess.run(line, cwd=CHECKOUT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stdout
+
+
+def _kth(override: str, k: int) -> str:
+    values = override.split("=")[1].split(",")
+    return values[k % len(values)]

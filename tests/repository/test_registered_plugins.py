@@ -1,0 +1,106 @@
+"""The contracts of `framework.interfaces`, on every plugin that a config registers. A new plugin needs no line here.
+
+They are in framework/testing, where packages that bring plugins find them, too.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from itertools import islice
+from typing import Any
+
+import pytest
+
+from framework.data import Frame
+from framework.interfaces import LiveVideo, RGBDSequence
+from framework.testing.dataset import SequenceContract
+from framework.testing.detector import DetectorContract
+from framework.testing.fuser import FuserContract
+from framework.testing.refiner import RefinerContract
+from framework.testing.tracker import TrackerContract
+from framework.testing.viewer import ViewerContract
+from tests.support import option_files, registered
+from tests.support.cores import all_cores
+
+Ready = Callable[[str, str], Any]
+
+
+class TestDatasets(SequenceContract):
+    @pytest.fixture(autouse=True, params=registered.names("dataset", RGBDSequence))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        self.plugin = lambda: ready("dataset", request.param)
+
+
+class TestDetectors(DetectorContract):
+    @pytest.fixture(autouse=True, params=registered.names("detector"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        self.plugin = lambda: ready("detector", request.param)
+
+
+class TestTrackers(TrackerContract):
+    @pytest.fixture(autouse=True, params=registered.names("tracker"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        self.plugin = lambda: ready("tracker", request.param)
+
+
+class TestRefiners(RefinerContract):
+    @pytest.fixture(autouse=True, params=registered.names("refiner"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> Iterator[None]:
+        self.plugin = lambda: ready("refiner", request.param)
+        with all_cores():
+            yield
+
+
+class TestFusers(FuserContract):
+    @pytest.fixture(autouse=True, params=registered.names("fuser"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        self.plugin = lambda: ready("fuser", request.param)
+
+
+class TestViewers(ViewerContract):
+    @pytest.fixture(autouse=True, params=registered.names("viewer"))
+    def option(self, request: pytest.FixtureRequest, ready: Ready) -> None:
+        if request.param == "rerun":
+            pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not installed")
+        self.plugin = lambda: ready("viewer", request.param)
+
+
+# Live videos
+
+
+@pytest.fixture(params=registered.names("dataset", LiveVideo))
+def video(request: pytest.FixtureRequest, ready: Ready, monkeypatch: pytest.MonkeyPatch) -> LiveVideo:
+    for name, module in option_files.modules("dataset", request.param).items():
+        monkeypatch.setitem(sys.modules, name, module)
+    video: LiveVideo = ready("dataset", request.param)
+    return video
+
+
+def come(video: LiveVideo) -> Iterator[Frame]:
+    """The frames, which can be read; something is said while none comes."""
+    with closing(video.frames()) as readers:
+        said = time.monotonic()
+        for reader in readers:
+            assert time.monotonic() - said < 1, "ten times a second, but for a busy machine"
+            if reader is not None:
+                yield reader()
+            said = time.monotonic()
+
+
+def test_live_video_gives_frames_of_this_moment_in_order(video: LiveVideo) -> None:
+    began = time.time()
+    frames = list(islice(come(video), 2))
+    assert video.name
+    assert len(frames) == 2
+    assert all((frame.depth > 0).any() for frame in frames)
+    assert frames[0].camera == frames[1].camera
+    assert frames[0].index < frames[1].index
+    assert began <= frames[0].timestamp < frames[1].timestamp <= time.time()
+
+
+def test_live_video_is_given_back_and_can_be_opened_again(video: LiveVideo) -> None:
+    for _ in range(2):
+        assert len(list(islice(come(video), 1))) == 1

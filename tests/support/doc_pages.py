@@ -1,0 +1,30 @@
+"""What README.md and the pages of docs/ show: commands, and code by its language. What stands twice is there once."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+DOCS = CHECKOUT / "docs"
+PAGES = {
+    str(path.relative_to(CHECKOUT)): path.read_text() for path in [CHECKOUT / "README.md", *sorted(DOCS.rglob("*.md"))]
+}
+"""Text by path, from the checkout."""
+
+
+def blocks(language: str, page: str | None = None) -> list[str]:
+    """The distinct code blocks of a language on one page, or on all, in their order."""
+    texts = PAGES.values() if page is None else [PAGES[page]]
+    return list(
+        dict.fromkeys(code for text in texts for code in re.findall(rf"```{language}\n(.*?)```", text, re.DOTALL))
+    )
+
+
+def block(language: str, containing: str) -> str:
+    """The one code block with these words in it."""
+    [found] = [code for code in blocks(language) if containing in code]
+    return found
+
+
+LINES = list(dict.fromkeys(line for code in blocks("console") for line in code.splitlines()))

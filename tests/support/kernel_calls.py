@@ -1,0 +1,155 @@
+"""Which kernels the pipelines call, and with what types: framework/compilation/kernels.txt.
+
+    python -m tests.support.kernel_calls
+
+writes it anew, in a minute. Runs every registered refiner, fuser and tracker over the demo's video, and one over a
+made-up room, and notes each kernel that Python calls for the first time with some types. A test compares the list with
+what the same runs call.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from numba.core import event
+from numba.core.dispatcher import Dispatcher
+from numba.core.typing.typeof import Purpose, typeof
+
+from framework.commands.running.run import run
+from framework.compilation.catalog import DEFAULT, LIST, OTHERS, line_of
+from framework.config.composition import composed
+from framework.data import Detections, Frame
+from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDSequence
+from framework.pipeline import Pipeline
+from framework.registry import build
+from framework.runtime.process_settings import Settings
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+FEW = ("dataset=desk", "dataset.stride=3", "dataset.stop=12")
+
+
+class Compiled(event.Listener):
+    """Names the kernels that are compiled while it listens."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def on_start(self, event: Any) -> None:
+        function = event.data["dispatcher"].py_func
+        self.names.append(f"{function.__module__}.{function.__qualname__}")
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+class Remembered(Detector):
+    """What the default detector has found in each of the frames."""
+
+    def __init__(self, detector: Detector) -> None:
+        self.detector = detector
+        self.found: dict[int, Detections] = {}
+        self.classes = detector.classes
+
+    def detect(self, frame: Frame) -> Detections:
+        if frame.index not in self.found:
+            self.found[frame.index] = self.detector.detect(frame)
+        return self.found[frame.index]
+
+
+def calls() -> list[str]:
+    """The lines of the list from here on; numba asks for types that it has not had, and then never again."""
+    noted: list[str] = []
+    compile_for = Dispatcher._compile_for_args
+
+    def note(self: Any, *arguments: Any, **named: Any) -> Any:
+        if self.py_func.__module__.startswith(("framework.", "plugins.")):
+            noted.append(line_of(self, [typeof(argument, Purpose.argument) for argument in arguments]))
+        return compile_for(self, *arguments, **named)
+
+    Dispatcher._compile_for_args = note
+    return noted
+
+
+def run_default(directory: Path, *overrides: str) -> None:
+    run(composed("dataset=desk", *overrides), directory, {})
+
+
+def run_others() -> None:
+    """Each registered stage in place of the default one, but for detectors: they share their kernels, or have none."""
+    config = composed(*FEW)
+    Settings.of(config).apply()
+    detector = Remembered(build(Detector, config.detector))
+    video = build(RGBDSequence, config.dataset)
+    for stage in ("refiner", "fuser", "tracker"):
+        for option in sorted((CHECKOUT / "conf" / stage).glob("*.yaml")):
+            if option.stem == "trajectory_file":  # needs a file, and has no kernels
+                continue
+            own = composed(*FEW, f"{stage}={option.stem}")
+            pipeline = Pipeline(
+                detector,
+                build(PoseTracker, own.tracker),
+                build(ClusterRefiner, own.refiner),
+                build(MapFuser, own.fuser),
+                ahead=0,
+            )
+            pipeline.run(video)
+            pipeline.fuser.scene.mesh()
+            pipeline.fuser.scene.instances()
+
+
+def run_rendered(directory: Path) -> None:
+    """A made-up room: what renders it, and what compares a map with its true surface."""
+    config = composed(
+        "dataset=synthetic", "detector=simulated", "dataset.frames=8", "dataset.width=160", "dataset.height=120"
+    )
+    run(config, directory, {})
+
+
+def sections(whole: bool) -> dict[str, set[str]]:
+    """The lines of the list, by section; without `whole` a shorter default run, which calls no others."""
+    noted = calls()
+    with tempfile.TemporaryDirectory() as directory:
+        run_default(Path(directory), *(() if whole else ("dataset.stride=2", "dataset.stop=24")))
+    default = set(noted)
+    run_others()
+    with tempfile.TemporaryDirectory() as directory:
+        run_rendered(Path(directory))
+    return {DEFAULT: default, OTHERS: set(noted) - default}
+
+
+def record() -> None:
+    """Writes the list. Runs compile what was listed before, as far as it is still there, in other processes."""
+    found = sections(whole=True)
+    text = "\n\n".join("\n".join([section, *sorted(lines)]) for section, lines in found.items())
+    LIST.write_text(f"{text}\n", encoding="utf-8")
+
+
+def check() -> None:
+    """Prints what runs call that is not listed, and what they compile."""
+    compiled = Compiled()
+    event.register("numba:compile", compiled)
+    found = sections(whole=False)
+    known = set(LIST.read_text(encoding="utf-8").splitlines())
+    for line in sorted(set().union(*found.values()) - known):
+        print(f"not listed: {line}")
+    for name in compiled.names:
+        print(f"compiled: {name}")
+
+
+def main() -> None:
+    os.chdir(CHECKOUT)
+    if sys.argv[1:]:
+        {"--check": check, "--record": record}[sys.argv[1]]()
+        return
+    LIST.write_text("", encoding="utf-8")
+    for _ in range(2):  # what a kernel calls that is compiled here is not asked for again: the second time, none is
+        subprocess.run([sys.executable, "-m", "tests.support.kernel_calls", "--record"], check=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,68 @@
+"""What clusters over one pixel say, and a voxel that sees it."""
+
+import numpy as np
+
+from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
+from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
+from framework.mapping.labels.label_evidence import Combine, Evidence, Measurement, class_said, named_classes
+
+FLOOR = 0.05
+UNITS = 1 << 16  # as fine as in exact storage
+BARE, COVERED = np.int32(0), np.int32(1)  # numbers of the lists of clusters over the pixel: none, all of a measurement
+
+
+def blank() -> Evidence:
+    """Of one voxel with slots."""
+    return Evidence(
+        np.zeros((1, 512), np.int32),
+        np.zeros((1, INSTANCE_SLOTS), np.int32),
+        np.zeros((1, INSTANCE_SLOTS), np.float32),
+        np.full((1, CLASS_SLOTS), NO_CLASS, np.uint8),
+        np.zeros((1, CLASS_SLOTS), np.int64),
+    )
+
+
+def measured(
+    ids: list[int],
+    scores: list[float],
+    distributions: np.ndarray,
+    absence: float,
+    last_id: int,
+) -> Measurement:
+    """Every cluster covers the one pixel that there is."""
+    said = np.flatnonzero(ids).astype(np.int32)
+    matched = np.zeros(last_id + 1, np.bool_)
+    matched[ids] = True
+    gains, named, bits = named_classes(np.log(distributions), logarithmic=True)
+    return Measurement(
+        np.full((1, 1), COVERED),
+        np.array([0, 0, len(said)], np.int32),
+        said,
+        np.array(ids, np.int32),
+        np.log(np.array(scores) / FLOOR).astype(np.float32),
+        np.float32(np.log(absence)),
+        matched,
+        class_said(gains, UNITS, bits, np.int64),
+        named,
+        int(Combine.SUM),
+        1 << 62,
+    )
+
+
+def voted(ids: list[int], weights: list[float], classes: list[int], combine: Combine, number: int = 6) -> Measurement:
+    """Clusters over the one pixel, each for an instance and one class, by a rule that is not Bayes'."""
+    evidence = np.zeros((len(ids), number))
+    evidence[np.arange(len(ids)), classes] = weights
+    gains, named, bits = named_classes(evidence, logarithmic=False)
+    every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
+    return every._replace(
+        instance_gain=np.array(weights, np.float32),
+        class_said=class_said(gains, 100, bits, np.int64),
+        named_classes=named,
+        combine=int(combine),
+    )
+
+
+def distribution(rng: np.random.Generator, classes: int) -> np.ndarray:
+    p = rng.dirichlet(np.full(classes, 0.3))
+    return 0.9 * p + 0.1 / classes

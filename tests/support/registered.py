@@ -1,0 +1,36 @@
+"""Every option of every config group, for tests that run on all of them."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from omegaconf import DictConfig
+
+from framework.commands.installation.plugins import registered
+from framework.files.search_paths import CONF
+from framework.registry import GROUPS, build, find_class
+
+OPTION = {(option.stage, option.name): option for option in registered(*GROUPS)}
+OPTIONS = [*OPTION]
+
+
+def names(stage: str, kind: type = object) -> list[str]:
+    """The options of one stage, or those of them whose class is of a kind."""
+    return [
+        option.name
+        for option in OPTION.values()
+        if option.stage == stage and issubclass(find_class(GROUPS[stage], option.target), kind)
+    ]
+
+
+def composed(stage: str, name: str, *overrides: str) -> DictConfig:
+    """The main config with this option and no other stage."""
+    others = [f"~{other}" for other in GROUPS if other != stage]
+    with initialize_config_dir(str(CONF), version_base="1.3"):
+        return compose("config", overrides=[f"{stage}={name}", *others, *overrides])
+
+
+def built(stage: str, name: str, *overrides: str) -> Any:
+    """The option as the command would build it."""
+    return build(GROUPS[stage], composed(stage, name, *overrides)[stage])

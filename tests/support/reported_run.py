@@ -1,0 +1,46 @@
+"""A small run with true instances, for tests of what is made from records."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from omegaconf import OmegaConf
+
+from framework.commands.running.run import run
+from framework.config import composition
+
+FAKES = Path(__file__).resolve().parent / "fake_conf"
+CONFIG: dict[str, Any] = {
+    "seed": 0,
+    "device": "cpu",
+    "threads": 0,
+    "ahead": 0,
+    "detection_cache": "off",
+    "dataset": {"_target_": "tests.support.scenes.corner_room.CornerRoom", "frames": 6},
+    "detector": {"_target_": "tests.support.scenes.corner_room.SphereDetector"},
+    "tracker": {"_target_": "tests.support.scenes.corner_room.GivenPose"},
+    "refiner": {"_target_": "tests.support.scenes.corner_room.KeepAll"},
+    "fuser": {"_target_": "plugins.fusers.bayesian_tsdf.BayesianTsdf", "voxel_size": 0.03, "min_observations": 2},
+    "viewer": {"_target_": "plugins.viewers.none.NoViewer"},
+}
+
+
+def write_run(directory: Path, **dataset: Any) -> Path:
+    """Maps the corner of a room with its spheres."""
+    config = CONFIG | {"dataset": CONFIG["dataset"] | dataset}
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(composition, "_added", [FAKES])
+        run(OmegaConf.create(config), directory, {})
+    return directory
+
+
+def rename_class(directory: Path, name: str) -> None:
+    """Gives the first object another name, as a hostile record may."""
+    path = directory / "instances.json"
+    entries = json.loads(path.read_text())
+    entries[0]["class"] = name
+    entries[0]["class_probabilities"] = {name: 0.9, "sphere": 0.1}
+    path.write_text(json.dumps(entries))

@@ -1,0 +1,281 @@
+"""The contracts' room as videos, with the faults that tests need, and the simplest plugins that can map it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from framework.data import (
+    Box,
+    Camera,
+    Detections,
+    Frame,
+    Instance,
+    InstanceMesh,
+    PointClusters,
+    Pose,
+    SceneTruth,
+    View,
+)
+from framework.errors import DataError, FrameError, MapFullError
+from framework.files.atomic_write import written_whole
+from framework.geometry import back_project, transform
+from framework.interfaces import (
+    ClusterRefiner,
+    Detector,
+    FrameReader,
+    LiveVideo,
+    MapFuser,
+    PoseTracker,
+    RGBDSequence,
+    SceneMap,
+)
+from framework.testing.corner_room import CAMERA, CLASSES, frame_at, look, pose_at, spheres_in
+
+
+@dataclass
+class CornerRoom(RGBDSequence):
+    """The room as a video."""
+
+    frames: int = 6
+    unreadable: int = -1  # this frame raises FrameError; -1 = none
+    truth: bool = True  # whether poses and instances are known
+    unposed: tuple[int, ...] = ()  # frames whose true pose is not known
+    slow_s: float = 0.0  # how long reading a frame takes
+    scene: str = ""  # any name: all are the same room
+    start: int = 0
+    stop: int = -1  # -1 = to the end
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        self.camera, self.name = CAMERA, "corner_room"
+        self._chosen = range(self.frames)[self.start : None if self.stop < 0 else self.stop : self.stride]
+
+    def __len__(self) -> int:
+        return len(self._chosen)
+
+    def __getitem__(self, k: int) -> Frame:
+        index = self._chosen[k]
+        time.sleep(self.slow_s)
+        if index == self.unreadable:
+            raise FrameError(f"frame {index}: depth/{index:06d}.png is truncated")
+        frame = frame_at(index, self.truth)
+        return replace(frame, T_world_camera=None) if index in self.unposed else frame
+
+    def scene_truth(self) -> SceneTruth | None:
+        if not self.truth:
+            return None
+        depth, _, _, ids = look(CAMERA, pose_at(0))
+        v, u = np.nonzero(depth > 0)
+        points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])
+        return SceneTruth(points, ids[v, u], dict(enumerate(CLASSES, start=1)))
+
+
+@dataclass
+class LiveRoom(LiveVideo):
+    """The room as a camera in it sends it, with true poses."""
+
+    frames_sent: int = 6  # then it ends
+    period_s: float = -1.0  # from frame to frame; -1 = each comes when the one before was read, so that none is dropped
+    unreadable: int = -1  # reading this frame raises FrameError; -1 = none
+    fails_after: int = -1  # it breaks down after so many frames; -1 = never
+
+    def __post_init__(self) -> None:
+        self.name = "live_room"
+        self.room = CornerRoom(frames=self.frames_sent, unreadable=self.unreadable)
+        self.sent = self.read = 0
+        self.closed = False
+
+    def has_poses(self) -> bool:
+        return True
+
+    def frames(self) -> Generator[FrameReader | None]:
+        try:
+            yield None
+            for k in range(self.frames_sent):
+                if k == self.fails_after:
+                    raise DataError("live_room: the cable is out")
+                due = time.monotonic() + self.period_s
+                while time.monotonic() < due or (self.period_s < 0 and self.read < k):
+                    time.sleep(0.001)
+                    yield None
+                self.sent += 1
+                yield partial(self._read, k, time.time())
+        finally:
+            self.closed = True
+
+    def _read(self, k: int, timestamp: float) -> Frame:
+        self.read += 1
+        return replace(self.room[k], timestamp=timestamp)
+
+
+@dataclass
+class SphereDetector(Detector):
+    """Finds both spheres where they really are, in several frames at once."""
+
+    concurrent = True
+    broken_at: int = -1  # raises FrameError at this frame
+
+    def __post_init__(self) -> None:
+        self.classes = CLASSES
+
+    def detect(self, frame: Frame) -> Detections:
+        if frame.index == self.broken_at:
+            raise FrameError(f"frame {frame.index}: the detector cannot use it")
+        return spheres_in(frame)
+
+
+@dataclass
+class GivenPose(PoseTracker):
+    """Passes the true pose on, but for the frames in [lost_from, lost_to)."""
+
+    pose_source = "ground_truth"
+    lost_from: int = 0
+    lost_to: int = 0
+
+    def track(self, frame: Frame, scene: SceneMap) -> Pose:
+        if frame.T_world_camera is None:
+            raise DataError(f"frame {frame.index} has no true pose: choose a tracker that needs none")
+        lost = self.lost_from <= frame.index < self.lost_to
+        return Pose(frame.T_world_camera, lost, "too few points associate" if lost else "")
+
+
+@dataclass
+class KeepAll(ClusterRefiner):
+    """Changes nothing."""
+
+    def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
+        return clusters
+
+
+@dataclass
+class GridMap(SceneMap):
+    """Each frame that was fused, as a grid of triangles of its own."""
+
+    vertices: list[np.ndarray] = field(default_factory=list)
+    colors: list[np.ndarray] = field(default_factory=list)
+    ids: list[np.ndarray] = field(default_factory=list)
+    triangles: list[np.ndarray] = field(default_factory=list)
+    classes: tuple[str, ...] = CLASSES
+    slow_save_s: float = 0.0
+
+    @property
+    def voxel_count(self) -> int:
+        return sum(map(len, self.vertices))
+
+    @property
+    def byte_count(self) -> int:
+        return 28 * self.voxel_count
+
+    def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
+        depth, normals, color, ids = look(camera, T_world_camera)  # as a perfect map would
+        return View(camera, T_world_camera, depth, normals.astype(np.float32), color, ids, ids - 1)
+
+    def mesh(self) -> InstanceMesh:
+        ids = np.concatenate([np.zeros(0, np.int32), *self.ids])
+        return InstanceMesh(
+            vertices=np.concatenate([np.zeros((0, 3), np.float32), *self.vertices]),
+            triangles=np.concatenate([np.zeros((0, 3), np.int32), *self.triangles]),
+            colors=np.concatenate([np.zeros((0, 3), np.uint8), *self.colors]),
+            instance_ids=ids,
+            class_ids=ids - 1,
+            classes=self.classes,
+        )
+
+    def instances(self) -> Mapping[int, Instance]:
+        mesh = self.mesh()
+        found = {}
+        for key in np.unique(mesh.instance_ids[mesh.instance_ids > 0]).tolist():
+            vertices = np.flatnonzero(mesh.instance_ids == key).astype(np.int32)
+            points = mesh.vertices[vertices].astype(np.float64)
+            low, high = points.min(0), points.max(0)
+            box = Box((low + high) / 2, high - low, np.eye(3))
+            sure = np.array([0.9, 0.1] if key == 1 else [0.2, 0.8], np.float32)
+            found[key] = Instance(key, sure, float(sure.max()), len(self.vertices), 0, 0, vertices, box, box)
+        return found
+
+    def save(self, path: Path | str) -> None:
+        mesh = self.mesh()
+        with written_whole(path) as temporary:
+            np.savez(
+                temporary,
+                vertices=mesh.vertices,
+                triangles=mesh.triangles,
+                colors=mesh.colors,
+                ids=mesh.instance_ids,
+            )
+            time.sleep(self.slow_save_s)
+
+    @classmethod
+    def load(cls, path: Path | str) -> GridMap:
+        with np.load(path) as saved:
+            return cls([saved["vertices"]], [saved["colors"]], [saved["ids"]], [saved["triangles"]])
+
+
+@dataclass
+class GridFuser(MapFuser):
+    """Puts each frame beside the others; cluster k is instance k + 1."""
+
+    capacity: int = 100  # frames
+    slow_s: float = 0.0  # how long fusing takes
+    slow_save_s: float = 0.0  # how long saving the map takes
+    note: str = ""  # a file that is there once a frame is in the map; "" = none
+
+    def __post_init__(self) -> None:
+        self.scene: GridMap = GridMap(slow_save_s=self.slow_save_s)
+
+    def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
+        time.sleep(self.slow_s)
+        scene = self.scene
+        if len(scene.vertices) >= self.capacity:
+            raise MapFullError(f"the map holds {self.capacity} frames: raise fuser.capacity")
+        height, width = frame.camera.shape
+        v, u = np.divmod(np.arange(height * width), width)
+        points = back_project(frame.camera, np.stack([u, v], 1).astype(np.int32), frame.depth.ravel())
+        ids = np.zeros((height, width), np.int32)
+        ids[clusters.pixels[:, 1], clusters.pixels[:, 0]] = clusters.cluster + 1
+        corner = (np.arange(height - 1)[:, None] * width + np.arange(width - 1)).ravel()
+        below = corner + width
+        triangles = np.concatenate(
+            [np.stack([corner, below, corner + 1], 1), np.stack([corner + 1, below, below + 1], 1)]
+        )
+        scene.triangles.append((triangles + scene.voxel_count).astype(np.int32))
+        scene.vertices.append(np.asarray(transform(pose.T_world_camera, points), np.float32))
+        scene.colors.append(frame.color.reshape(-1, 3))
+        scene.ids.append(ids.ravel())
+        if self.note:
+            Path(self.note).touch()
+
+
+def fault(kind: str) -> BaseException:
+    """What a stage may raise, by name."""
+    faults: dict[str, BaseException] = {
+        "OSError": OSError(5, "Input/output error", "weights.bin"),
+        "ValueError": ValueError("operands could not be broadcast together"),
+        "MemoryError": MemoryError("Unable to allocate 40 GiB"),
+        "SystemExit": SystemExit(7),
+    }
+    return faults[kind]
+
+
+@dataclass
+class FaultyDetector(SphereDetector):
+    """Fails at one frame: in a way that `fault` knows, or with masks of a wrong size."""
+
+    at: int = 3
+    kind: str = "OSError"
+
+    def detect(self, frame: Frame) -> Detections:
+        found = super().detect(frame)
+        if frame.index != self.at:
+            return found
+        if self.kind == "masks":
+            return Detections(
+                found.masks[:, ::2], found.boxes, found.scores, found.class_probabilities, classes=found.classes
+            )
+        raise fault(self.kind)

@@ -1,0 +1,28 @@
+"""The same computation by one thread and by two."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import numba
+import pytest
+
+from tests.support.cores import all_cores
+
+Made = TypeVar("Made")
+
+
+def by_one_thread_and_two(make: Callable[[], Made]) -> tuple[Made, Made]:
+    """What `make` returns with one numba thread and with two; skips the test on a machine with one core."""
+    if numba.config.NUMBA_NUM_THREADS < 2:
+        pytest.skip("this machine has one core")
+    usual = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        by_one = make()
+        numba.set_num_threads(2)
+        with all_cores():
+            return by_one, make()
+    finally:
+        numba.set_num_threads(usual)

@@ -1,0 +1,58 @@
+"""The density that a tree of mixtures stands for, in plain numpy: what its levels are judged by in tests."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from framework.refinement.mixtures.mixture_tree import MixtureTree
+
+
+def gaussian_densities(points: np.ndarray, weights: np.ndarray, means: np.ndarray, Sigmas: np.ndarray) -> np.ndarray:
+    """(S, K) pi_k N(x_i | mu_k, Sigma_k)."""
+    whitened = (points - means[:, None]) @ np.linalg.inv(np.linalg.cholesky(Sigmas)).transpose(0, 2, 1)  # (K, S, 3)
+    scales = weights / np.sqrt((2 * np.pi) ** 3 * np.linalg.det(Sigmas))
+    return (np.exp(-0.5 * (whitened**2).sum(axis=-1)) * scales[:, None]).T
+
+
+def leaves(tree: MixtureTree, depth: int) -> list[tuple[int, np.ndarray]]:
+    """The leaves of the trees cut off below `depth` levels: for each level its index and its leaves' rows."""
+    rows = []
+    for k in range(min(depth, len(tree.levels))):
+        last = k + 1 in (depth, len(tree.levels))
+        childless = np.ones(len(tree.levels[k]), bool) if last else np.diff(tree.levels[k + 1].firsts) == 0
+        rows.append((k, np.nonzero(childless)[0]))
+    return rows
+
+
+def owners(tree: MixtureTree, k: int) -> np.ndarray:
+    """(M,) the tree that each node of level `k` is in."""
+    found = tree.levels[0].parents
+    for level in tree.levels[1 : k + 1]:
+        found = found[level.parents]
+    return found
+
+
+def log_likelihoods(tree: MixtureTree, points: np.ndarray, starts: np.ndarray, depth: int | None = None) -> np.ndarray:
+    """(N,) mean log p(x), in nats, of the points of each set under the first `depth` levels, None = all of them.
+
+    p is the sum over the leaves, whatever branch a point would go down, with the uniform components. A set without
+    points gets 0; points where a tree has no density, -inf.
+    """
+    depth = len(tree.levels) if depth is None else depth
+    means = np.zeros(len(starts) - 1)
+    for k in range(len(means)):
+        own = points[starts[k] : starts[k + 1]].astype(np.float64)
+        density = np.zeros(len(own))
+        for level, rows in leaves(tree, depth):
+            rows = rows[owners(tree, level)[rows] == k]
+            part = tree.levels[level]
+            density += gaussian_densities(own, part.weights[rows], part.means[rows], part.covariances[rows]).sum(axis=1)
+        for level in range(depth):
+            above, part = owners(tree, level - 1) if level else np.arange(len(means)), tree.levels[level]
+            for q in np.nonzero((above == k) & (part.outlier_weights > 0))[0]:
+                low, high = part.outlier_boxes[q]
+                inside = ((own >= low) & (own <= high)).all(axis=1)
+                density += inside * part.outlier_weights[q] / np.prod(high - low)
+        with np.errstate(divide="ignore"):
+            means[k] = np.log(density).mean() if len(own) else 0.0
+    return means

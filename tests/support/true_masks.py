@@ -1,0 +1,47 @@
+"""The masks of an analytic scene, and what a fuser is given where they were detected."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from framework.data import Detections, Frame, Pose
+from framework.interfaces import MapFuser
+from framework.refinement.lifting import lift
+
+CLASSES = ("chair", "bed")
+PROBABILITIES = (0.7, 0.3)  # of every detection
+
+
+def masks_of(frame: Frame) -> list[np.ndarray]:
+    """(H, W) for each instance of the frame's truth."""
+    assert frame.truth is not None
+    return [frame.truth.instance_ids == i for i in frame.truth.class_names]
+
+
+def fuse_masks(
+    fuser: MapFuser,
+    frame: Frame,
+    masks: Sequence[np.ndarray],
+    scores: Sequence[float],
+    probabilities: Sequence[tuple[float, float]] | None = None,
+    embeddings: np.ndarray | None = None,
+    space: str = "words@1",
+) -> None:
+    """Fuses the frame at its true pose, with these masks detected, each with its distribution over the classes, and
+    with an embedding (n, D) of this space where there are some.
+    """
+    assert frame.T_world_camera is not None
+    n = len(masks)
+    detections = Detections(
+        masks=np.array(masks, np.bool_).reshape(n, *frame.depth.shape),
+        boxes=np.zeros((n, 4), np.float32),
+        scores=np.array(scores, np.float32),
+        class_probabilities=np.float32(probabilities or [PROBABILITIES] * n).reshape(n, 2),
+        classes=CLASSES,
+        embeddings=None if embeddings is None else embeddings.astype(np.float32),
+        embedding_space="" if embeddings is None else space,
+    )
+    pose = Pose(frame.T_world_camera)
+    fuser.fuse(frame, pose, lift(detections, frame, pose))
