@@ -21,9 +21,9 @@ class PlaneRemoval(ClusterRefiner):
     Planes are found in the depth of the whole frame (see `framework.refinement.segmentation.planes`); the gravity
     direction is not needed. One counts as structure when it is large (`min_area`, `min_share`) and the frame shows
     nearly nothing behind it (`max_behind`): there is a room below a table top or behind a screen, but nothing below a
-    floor. A cluster loses such a plane only if it holds at most `max_own` of the plane's points in the frame: the top of a table that
-    fills the image is the table's. A dropped point leaves the arrays, clusters keep their index. The refined clusters
-    know the planes as `structure`, where a mask's border needs no further doubt.
+    floor. A cluster loses such a plane only if it holds at most `max_own` of the plane's points in the frame: the top
+    of a table that fills the image is the table's. A dropped point leaves the arrays, clusters keep their index. The
+    refined clusters know the planes as `structure`, where a mask's border needs no further doubt.
     """
 
     distance: float = 0.01  # m, from 0, from the plane; three standard deviations of the plane's own noise come on top
