@@ -16,10 +16,7 @@ import numpy.typing as npt
 from framework.data import Array, Float32, Int32, Int64
 from framework.errors import DataError
 from framework.files.atomic_write import read_bytes, written_whole
-from framework.files.ply_binary import BinaryBody
-from framework.files.ply_header import TYPES, parse_header
-from framework.files.ply_rows import Body, Rows
-from framework.files.ply_text import TextBody
+from framework.files.ply_elements import TYPES, Element, read_elements
 
 LARGEST_FILE = 2**32  # bytes; the mesh of a room has some 2^26
 AXES = ("x", "y", "z")
@@ -43,16 +40,12 @@ def read_ply(path: Path) -> PlyMesh:
     Raises DataError, naming line or byte, for a file that is damaged, does not hold what its header announces, or has
     vertices that are not finite or triangles of vertices that it does not have.
     """
-    data = read_bytes(path, LARGEST_FILE)
-    header = parse_header(path, data)
-    body: Body = TextBody(path, data, header) if header.format == "ascii" else BinaryBody(path, data, header)
-    tables = {element.name: body.rows(element) for element in header.elements}
-    body.check_end()
-    if "vertex" not in tables:
+    header, elements = read_elements(path, read_bytes(path, LARGEST_FILE))
+    if "vertex" not in elements:
         raise DataError(f"{path}, line {header.lines}: the header has no element 'vertex'")
-    vertices = _vertices(path, tables["vertex"])
-    triangles = _triangles(path, tables["face"], len(vertices)) if "face" in tables else np.empty((0, 3), np.int32)
-    properties = {name: values for name, values in tables["vertex"].scalars.items() if name not in AXES}
+    vertices = _vertices(path, elements["vertex"])
+    triangles = _triangles(path, elements["face"], len(vertices)) if "face" in elements else np.empty((0, 3), np.int32)
+    properties = {name: values for name, values in elements["vertex"].scalars.items() if name not in AXES}
     return PlyMesh(vertices, triangles, properties, header.comments)
 
 
@@ -91,11 +84,11 @@ def write_ply(
         faces.tofile(file)
 
 
-def _vertices(path: Path, rows: Rows) -> Float32:
+def _vertices(path: Path, rows: Element) -> Float32:
     missing = [axis for axis in AXES if axis not in rows.scalars]
     if missing:
-        raise DataError(f"{path}: the header's element 'vertex' has no property {missing[0]!r} with one number")
-    with np.errstate(over="ignore"):  # too large for float32 is not finite, which is checked
+        raise DataError(f"{path}: element 'vertex' has no property {missing[0]!r} with one number")
+    with np.errstate(over="ignore"):  # a value too large for float32 is not finite
         vertices = np.stack([rows.scalars[axis].astype(np.float32) for axis in AXES], axis=1)
     if not np.isfinite(vertices).all():
         k = int(np.argmin(np.isfinite(vertices).all(axis=1)))
@@ -104,22 +97,22 @@ def _vertices(path: Path, rows: Rows) -> Float32:
     return vertices
 
 
-def _triangles(path: Path, rows: Rows, vertices: int) -> Int32:
-    lists = next((rows.lists[name] for name in INDICES if name in rows.lists), None)
-    if lists is None:
-        raise DataError(f"{path}: the header's element 'face' has no list of one of the names {', '.join(INDICES)}")
-    if lists.values.dtype.kind == "f":
-        raise DataError(f"{path}: the indices of the faces must be integers, found {lists.values.dtype}")
-    indices = cast(npt.NDArray[np.signedinteger], lists.values)
-    few = np.flatnonzero(lists.lengths < 3)
-    if few.size:
-        k = int(few[0])
-        raise DataError(f"{path}, {rows.place(k)}: face {k} has {lists.lengths[k]} vertices, at least 3 are needed")
-    if indices.size and (indices.min() < 0 or indices.max() >= vertices):
-        wrong = int(np.argmax((indices < 0) | (indices >= vertices)))
-        k = int(np.searchsorted(np.cumsum(lists.lengths), wrong, side="right"))
-        raise DataError(f"{path}, {rows.place(k)}: face {k} has vertex {indices[wrong]}, but there are {vertices}")
-    return _fans(indices.astype(np.int32, copy=False), lists.lengths)
+def _triangles(path: Path, rows: Element, vertices: int) -> Int32:
+    name = next((name for name in INDICES if name in rows.lists), None)
+    if name is None:
+        raise DataError(f"{path}: element 'face' has no list named {' or '.join(INDICES)}")
+    indices, lengths = rows.lists[name]
+    if indices.dtype.kind == "f":
+        raise DataError(f"{path}: {name}: expected integers, got {indices.dtype}")
+    if (lengths < 3).any():
+        k = int(np.argmax(lengths < 3))
+        raise DataError(f"{path}, {rows.place(k)}: face {k}: expected at least 3 vertices, got {lengths[k]}")
+    corners = cast(npt.NDArray[np.signedinteger], indices)
+    if corners.size and (corners.min() < 0 or corners.max() >= vertices):
+        wrong = int(np.argmax((corners < 0) | (corners >= vertices)))
+        k = int(np.searchsorted(np.cumsum(lengths), wrong, side="right"))
+        raise DataError(f"{path}, {rows.place(k)}: face {k} has vertex {corners[wrong]}, but there are {vertices}")
+    return _fans(corners.astype(np.int32, copy=False), lengths)
 
 
 def _fans(corners: Int32, lengths: Int64) -> Int32:

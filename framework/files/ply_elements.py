@@ -1,0 +1,353 @@
+"""The elements of a PLY file: the tables that its header announces, in any of the three encodings."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from framework.data import Array, Float64, Int64
+from framework.errors import DataError
+
+LARGEST_HEADER = 2**16  # bytes; a header has tens of lines
+LONGEST_LINE = 2**20  # bytes of a text file; splitting a longer line takes tens of times its memory
+FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
+TYPES = {
+    **dict(zip(("char", "uchar", "short", "ushort", "int", "uint", "float", "double"), "bBhHiIfd", strict=True)),
+    **{str(np.dtype(code)): code for code in "bBhHiIfd"},  # int8, uint8, ...
+}
+MOST_DIGITS = 18  # of a row count
+
+
+@dataclass(frozen=True)
+class Property:
+    """A column of an element: one number per row, or a list of numbers per row."""
+
+    name: str
+    dtype: np.dtype[Any]  # of the numbers, in the machine's byte order
+    count: np.dtype[Any] | None = None  # of the list's length; None = one number
+
+
+@dataclass(frozen=True)
+class Element:
+    """A table of the file with N rows. The arrays are empty until the rows are read."""
+
+    name: str
+    rows: int
+    properties: tuple[Property, ...] = ()
+    scalars: dict[str, Array] = field(default_factory=dict)  # (N,) each
+    lists: dict[str, tuple[Array, Int64]] = field(default_factory=dict)  # values (sum of lengths,), lengths (N,)
+    place: Callable[[int], str] = str  # where a row is in the file: "line 12" or "byte 340"
+
+
+@dataclass(frozen=True)
+class Header:
+    """The content of a file's header."""
+
+    format: str  # one of FORMATS
+    elements: tuple[Element, ...]  # in the file's order
+    comments: tuple[str, ...]  # without the word `comment`
+    lines: int
+    size: int  # bytes, including the line end_header
+
+
+def read_elements(path: Path, data: bytes) -> tuple[Header, dict[str, Element]]:
+    """Return the header of a file with this content, and its elements by name with their rows.
+
+    Raises:
+        DataError: The file is damaged or does not contain what its header announces; names the line or byte.
+    """
+    header = _parse_header(path, data)
+    body = _Body(path, data, header)
+    elements = {element.name: body.read(element) for element in header.elements}
+    body.check_end()
+    return header, elements
+
+
+def _parse_header(path: Path, data: bytes) -> Header:
+    lines = _header_lines(path, data)
+    format_name = ""
+    elements: list[Element] = []
+    comments: list[str] = []
+    for number, line in enumerate(lines, start=1):
+        words = line.decode("latin-1").split()
+        try:
+            match words:
+                case ["ply"] if number == 1:
+                    pass
+                case [] | ["obj_info", *_] | ["end_header"]:
+                    pass
+                case ["comment", *_]:
+                    comments.append(line.decode("latin-1").strip().removeprefix("comment").lstrip())
+                case ["format", name, "1.0"] if name in FORMATS and not format_name:
+                    format_name = name
+                case ["element", name, rows]:
+                    if not (rows.isascii() and rows.isdigit() and len(rows) <= MOST_DIGITS):
+                        raise ValueError(f"element {shown(name)}: expected a number of rows, got {shown(rows)}")
+                    if name in (element.name for element in elements):
+                        raise ValueError(f"duplicate element {shown(name)}")
+                    elements.append(Element(name, int(rows)))
+                case ["property", *declaration] if elements:
+                    elements[-1] = _with_property(elements[-1], declaration)
+                case _:
+                    raise ValueError(f"unknown header line {shown(' '.join(words))}")
+        except ValueError as error:
+            raise DataError(f"{path}, line {number}: {error}") from error
+    if not format_name:
+        raise DataError(f"{path}, line {len(lines)}: the header has no line 'format', one of {', '.join(FORMATS)}, 1.0")
+    header = Header(format_name, tuple(elements), tuple(comments), len(lines), sum(map(len, lines)))
+    _check_size(path, header, len(data) - header.size)
+    return header
+
+
+def _header_lines(path: Path, data: bytes) -> list[bytes]:
+    """Return the lines up to `end_header`, with their line ends."""
+    if data[:3] != b"ply" or data[3:4] not in (b"\n", b"\r", b" "):
+        raise DataError(f"{path}, line 1: expected 'ply', got {shown(data[:16].decode('latin-1'))}: not a PLY file")
+    lines = data[:LARGEST_HEADER].splitlines(keepends=True)
+    for k, line in enumerate(lines):
+        if line.strip() == b"end_header":
+            return lines[: k + 1]
+    searched = min(len(data), LARGEST_HEADER)
+    raise DataError(f"{path}, line {len(lines)}: the first {searched} bytes have no line 'end_header'")
+
+
+def _with_property(element: Element, declaration: list[str]) -> Element:
+    match declaration:
+        case ["list", count, kind, name]:
+            column = Property(name, _dtype(kind), _dtype(count))
+        case [kind, name]:
+            column = Property(name, _dtype(kind))
+        case _:
+            raise ValueError(
+                f"expected 'property TYPE NAME' or 'property list TYPE TYPE NAME', "
+                f"got {shown(' '.join(['property', *declaration]))}"
+            )
+    if column.count is not None and column.count.kind == "f":
+        raise ValueError(f"list {shown(name)}: expected an integer type for its length, got {count}")
+    if name in (other.name for other in element.properties):
+        raise ValueError(f"element {shown(element.name)}: duplicate property {shown(name)}")
+    return replace(element, properties=(*element.properties, column))
+
+
+def _dtype(name: str) -> np.dtype[Any]:
+    if name not in TYPES:
+        raise ValueError(f"unknown type {shown(name)}, expected one of {', '.join(TYPES)}")
+    return np.dtype(TYPES[name])
+
+
+def _check_size(path: Path, header: Header, body: int) -> None:
+    """Raise DataError if the rows cannot fit into a body of so many bytes, so that no array exceeds the file's size."""
+    least = 0
+    for element in header.elements:
+        if element.rows and not element.properties:
+            raise DataError(f"{path}, line {header.lines}: element {shown(element.name)} has rows but no properties")
+        if header.format == "ascii":
+            row = 2 * len(element.properties)  # a digit and a separator each
+        else:
+            row = sum((column.count or column.dtype).itemsize for column in element.properties)
+        least += element.rows * row
+    if least > body + (header.format == "ascii"):  # the last line needs no end
+        announced = ", ".join(f"{element.rows} {shown(element.name)}" for element in header.elements[:4])
+        raise DataError(
+            f"{path}, byte {header.size}: expected at least {least} bytes for {announced}, got {body}: "
+            "the file is truncated or its header is wrong"
+        )
+
+
+class _Body:
+    """The numbers after the header: bytes of a binary file, or the words of a text file, each as a float64.
+
+    Positions and sizes count bytes in a binary file and words in a text file. float64 holds all PLY types exactly.
+    """
+
+    def __init__(self, path: Path, data: bytes, header: Header) -> None:
+        self._path = path
+        self._text = header.format == "ascii"
+        self._order: Literal["little", "big", "="] = "=" if self._text else "little"
+        if header.format == "binary_big_endian":
+            self._order = "big"
+        self._position = 0
+        self._offset = header.size  # bytes before position 0
+        self._data: memoryview | Float64 = memoryview(data)[header.size :]
+        self._end = len(self._data)
+        if self._text:
+            self._split_lines(data[header.size :].splitlines(), header.lines)
+
+    def read(self, element: Element) -> Element:
+        """Return the element with its rows, which begin at the current position."""
+        sizes = [0] * len(element.properties)
+        if element.rows:
+            sizes = self._row(element, 0, self._position)
+        if self._rows_are_alike(element, sizes):
+            return self._uniform(element, sizes)
+        return self._ragged(element)
+
+    def check_end(self) -> None:
+        """Raise DataError if numbers follow the rows that the header announces."""
+        if self._position < self._end and (self._text or bytes(self._data[self._position :]).strip()):
+            count = self._end - self._position
+            raise DataError(
+                f"{self._path}, {self._place(self._position)}: {count} {'numbers' if self._text else 'bytes'} follow "
+                "the last row that the header announces"
+            )
+
+    def _split_lines(self, lines: list[bytes], before: int) -> None:
+        words = array("d")
+        starts, numbers = array("q"), array("q")
+        for number, line in enumerate(lines, start=before + 1):
+            if len(line) > LONGEST_LINE:
+                raise DataError(f"{self._path}, line {number}: the line is longer than {LONGEST_LINE} bytes")
+            found = line.split()
+            if found:
+                starts.append(len(words))
+                numbers.append(number)
+                try:
+                    words.extend(map(float, found))
+                except ValueError as error:
+                    raise DataError(
+                        f"{self._path}, line {number}: expected numbers, got {shown(str(error))}"
+                    ) from error
+        self._data, self._end = np.array(words), len(words)
+        self._line_starts = np.array([*starts, len(words)], np.int64)  # of each line with numbers
+        self._line_numbers = np.array([*numbers, before + len(lines)], np.int64)
+
+    def _place(self, position: int) -> str:
+        if not self._text:
+            return f"byte {self._offset + position}"
+        return f"line {self._line_numbers[np.searchsorted(self._line_starts, position, side='right') - 1]}"
+
+    def _size(self, dtype: np.dtype[Any]) -> int:
+        return 1 if self._text else dtype.itemsize
+
+    def _row(self, element: Element, row: int, start: int) -> list[int]:
+        """Return how many numbers each column has in the row that begins at `start`."""
+        position, lengths = start, []
+        where = f"{shown(element.name)} {row}"
+        for column in element.properties:
+            length = 1
+            if column.count is not None:
+                count = self._view(column.count, position, 1, 1, 0)
+                length = int(count[0, 0]) if count.size and np.isfinite(count[0, 0]) else 0
+                if length < 0:
+                    raise DataError(f"{self._path}, {self._place(position)}: {where} has a list of {length} numbers")
+                position += self._size(column.count)
+            lengths.append(length)
+            position += length * self._size(column.dtype)
+        line_end = self._end
+        if self._text and start < self._end:
+            line_end = int(self._line_starts[np.searchsorted(self._line_starts, start, side="right")])
+        if start < self._end and self._text and position != line_end:
+            expected, found = position - start, line_end - start
+            raise DataError(f"{self._path}, {self._place(start)}: {where}: expected {expected} numbers, got {found}")
+        if position > self._end:
+            raise DataError(
+                f"{self._path}, {self._place(self._end)}: the file ends in {where}, "
+                f"but its header announces {element.rows} rows"
+            )
+        return lengths
+
+    def _view(self, dtype: np.dtype[Any], start: int, rows: int, length: int, stride: int) -> npt.NDArray[Any]:
+        """Return (rows, length) numbers: the first at `start`, each row `stride` after the last; empty past the end."""
+        if start + (rows - 1) * stride + length * self._size(dtype) > self._end:
+            return np.empty((0, 0))
+        stored = np.dtype(np.float64) if self._text else dtype.newbyteorder(self._order)
+        unit = 8 if self._text else 1
+        return np.ndarray((rows, length), stored, self._data, start * unit, (stride * unit, stored.itemsize))
+
+    def _rows_are_alike(self, element: Element, lengths: list[int]) -> bool:
+        """Return true if the lists of all rows are as long as those of the first one."""
+        stride = self._stride(element, lengths)
+        end = self._position + element.rows * stride
+        if not element.rows or end > self._end:
+            return not element.rows
+        position = self._position
+        for column, length in zip(element.properties, lengths, strict=True):
+            if column.count is not None:
+                if (self._view(column.count, position, element.rows, 1, stride) != length).any():
+                    return False
+                position += self._size(column.count)
+            position += length * self._size(column.dtype)
+        if self._text:
+            begin = int(np.searchsorted(self._line_starts, self._position))
+            starts = self._line_starts[begin : begin + element.rows + 1]
+            return np.array_equal(starts, np.arange(self._position, end + 1, stride))
+        return True
+
+    def _stride(self, element: Element, lengths: list[int]) -> int:
+        counts = sum(self._size(column.count) for column in element.properties if column.count is not None)
+        return counts + sum(n * self._size(c.dtype) for c, n in zip(element.properties, lengths, strict=True))
+
+    def _uniform(self, element: Element, lengths: list[int]) -> Element:
+        """Read rows that all have the same length, as strided views."""
+        stride, start, position = self._stride(element, lengths), self._position, self._position
+        scalars: dict[str, Array] = {}
+        lists: dict[str, tuple[Array, Int64]] = {}
+        for column, length in zip(element.properties, lengths, strict=True):
+            position += 0 if column.count is None else self._size(column.count)
+            view = np.empty((0, 1))
+            if element.rows:
+                view = self._view(column.dtype, position, element.rows, length, stride)
+            positions = position + stride * np.arange(element.rows)[:, None] + np.arange(length) if self._text else None
+            values = self._native(column, view, positions)
+            if column.count is None:
+                scalars[column.name] = values
+            else:
+                lists[column.name] = values, np.broadcast_to(np.int64(length), element.rows)
+            position += length * self._size(column.dtype)
+        self._position += element.rows * stride
+        return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(start + row * stride))
+
+    def _ragged(self, element: Element) -> Element:
+        """Read rows whose lists have different lengths: each begins where the previous one ends."""
+        lengths = np.empty((len(element.properties), element.rows), np.int64)
+        starts = np.empty(element.rows, np.int64)
+        for row in range(element.rows):
+            starts[row] = self._position
+            found = self._row(element, row, self._position)
+            lengths[:, row] = found
+            self._position += self._stride(element, found)
+        scalars: dict[str, Array] = {}
+        lists: dict[str, tuple[Array, Int64]] = {}
+        ends = starts.copy()
+        for column, counts in zip(element.properties, lengths, strict=True):
+            size = self._size(column.dtype)
+            ends += (0 if column.count is None else self._size(column.count)) + counts * size
+            before_end = np.repeat(np.cumsum(counts), counts) - np.arange(counts.sum())
+            first = np.repeat(ends, counts) - before_end * size
+            if isinstance(self._data, memoryview):
+                taken = np.frombuffer(self._data, np.uint8)[first[:, None] + np.arange(size)].reshape(-1)
+                stored = taken.view(column.dtype.newbyteorder(self._order))
+            else:
+                stored = self._data[first]
+            values = self._native(column, stored, first)
+            if column.count is None:
+                scalars[column.name] = values
+            else:
+                lists[column.name] = values, counts
+        return replace(element, scalars=scalars, lists=lists, place=lambda row: self._place(int(starts[row])))
+
+    def _native(self, column: Property, stored: npt.NDArray[Any], positions: Int64 | None) -> Array:
+        """Return the numbers, one after the other, in the column's type; scalars have memory of their own.
+
+        Raises DataError if a text file has a number that the type does not hold.
+        """
+        if self._text and positions is not None and column.dtype.kind != "f":
+            limits = np.iinfo(column.dtype)
+            wrong = ~((stored == np.rint(stored)) & (stored >= limits.min) & (stored <= limits.max))
+            if wrong.any():
+                place, value = self._place(int(positions[wrong][0])), stored[wrong][0]
+                raise DataError(f"{self._path}, {place}: {column.name}: expected a {column.dtype}, got {value:g}")
+        with np.errstate(over="ignore"):  # finite numbers are checked where they are needed
+            values = np.ascontiguousarray(stored.reshape(-1), column.dtype)
+        return values if column.count is not None or values.flags.owndata else values.copy()
+
+
+def shown(text: str) -> str:
+    """Return a word of the file, quoted for an error of one line."""
+    return repr(text if len(text) <= 40 else text[:37] + "...")
