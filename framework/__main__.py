@@ -29,7 +29,6 @@ COMMANDS = {
     "new-plugin": "writes a repository with a plugin of your own: package, option, tests, CI",
     "synthesize": "writes a benchmark of furnished rooms in SceneNN's own format",
     "train-detector": "trains Mask R-CNN on rendered rooms",
-    "train-words": "trains the network that knows rendered rooms in words",
     "convert-weights": "converts a Mask R-CNN of torchvision or detectron2",
     "convert-oni": "converts SceneNN's raw video to the images that dataset=scenenn reads",
 }
@@ -39,7 +38,7 @@ FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
     "results": ("tables", "ranks", "figures", "report", "diff", "export", "query", "evaluate"),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
-    "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "train-words", "convert-weights"),
+    "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }
 """The folder of framework.commands that contains the module of each command."""
 

@@ -22,7 +22,6 @@ PAGES = {
     "examples/README.md": "tutorials/examples.md",
     "plugins/detectors/mask_rcnn_rooms.md": "guides/mask_rcnn_rooms.md",
     "plugins/detectors/maskrcnn2go.md": "guides/maskrcnn2go.md",
-    "plugins/detectors/room_words.md": "guides/room_words.md",
 }
 """The pages that show files of the project."""
 

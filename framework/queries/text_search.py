@@ -20,7 +20,7 @@ BY = ("embeddings", "names")
 LEAST_MATCH = 0.1  # of names: below, an object is hardly what was asked for
 LONGEST_QUERY = 1000  # characters
 NAME_IT = "name it by --model, from Python by model="
-WITH_EMBEDDINGS = "detector=with_embeddings, or detector=room_words in synthetic rooms"
+WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
 
 
 @dataclass(frozen=True)
@@ -79,10 +79,10 @@ def search(scene: Map, question: Question, run: Path | None = None) -> Answer:
 
 def _embedded(question: Question, space: str, run: Path | None) -> Float32:
     """The question's words (D,) in a map's space."""
-    from framework.detection.embeddings.image_text import open_image_text
+    from framework.detection.embeddings.image_text import ImageTextModel
 
     name, revision = _model_of(run) if question.model is None else (question.model, "main")
-    opened = open_image_text(name, revision, "cpu", half=False)
+    opened = ImageTextModel(name, revision, "cpu", half=False)
     if opened.space != space:
         found = f"the embeddings of {run or 'this map'} are of {space}, and {name} is {opened.space}"
         raise DataError(f"{found}: the words need that very model, {NAME_IT}")

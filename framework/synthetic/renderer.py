@@ -49,11 +49,6 @@ class Renderer:
         buffer = self._rasterizer.draw(camera, T_world_camera)
         return buffer.depth, self._ids(buffer)
 
-    def material_rows(self, camera: Camera, T_world_camera: Float64) -> Int32:
-        """The row (H, W) of the material table that each pixel shows, -1 = nothing."""
-        triangle = self._rasterizer.draw(camera, T_world_camera).triangle
-        return np.append(self.surfaces.materials, np.int32(-1))[triangle]
-
     def _ids(self, buffer: VisibilityBuffer) -> Int32:
         return _of_triangles(self.surfaces.instance_ids, buffer.triangle)
 

@@ -105,10 +105,6 @@ class Synthetic(RGBDSequence):
         """Exact depth (H, W) m and instance ids (H, W) from any pose."""
         return self._renderer.depth_and_ids(self.camera, T_world_camera)
 
-    def materials_seen(self, T_world_camera: Float64) -> Int32:
-        """The row (H, W) of `room.surfaces.material_table` that each pixel shows from any pose, -1 = nothing."""
-        return self._renderer.material_rows(self.camera, T_world_camera)
-
     def scene_truth(self) -> SceneTruth:
         """The labelled surface within the sensor's range in the chosen frames, from their exact depth."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))

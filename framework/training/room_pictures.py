@@ -13,7 +13,7 @@ import json
 import multiprocessing
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from functools import partial
@@ -60,17 +60,12 @@ def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: in
     """Renders the rooms number `first` and following into `folder`; those that are there already are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
-    each_in_a_process(partial(render_room, folder, views), missing, processes, "rendering rooms")
-
-
-def each_in_a_process(render: Callable[[int], None], numbers: Sequence[int], processes: int, saying: str) -> None:
-    """Calls `render` with the number of each room, by several processes, and shows how many are done."""
-    if not numbers:
+    if not missing:
         return
     # not forked: threads of numba and OpenCV do not survive that
     workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), numba.set_num_threads, (1,))
-    with workers, tqdm(total=len(numbers), desc=saying, unit="room", disable=None) as bar:
-        for _ in workers.map(render, numbers):
+    with workers, tqdm(total=len(missing), desc="rendering rooms", unit="room", disable=None) as bar:
+        for _ in workers.map(partial(render_room, folder, views), missing):
             bar.update()
 
 

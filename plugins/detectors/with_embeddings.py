@@ -8,9 +8,9 @@ import numpy as np
 
 from framework.config.validation import check_bounds
 from framework.data import Detections, Float32, Frame, UInt8
-from framework.detection.domain import RENDERED_ROOMS, domain_of
+from framework.detection.domain import domain_of
 from framework.detection.embeddings.crops import square_crops
-from framework.detection.embeddings.image_text import ROOM_WORDS_SUFFIX, open_image_text
+from framework.detection.embeddings.image_text import ImageTextModel
 from framework.detection.stored.cache import FRAME_FIELDS, ReadsFields, identity_of
 from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
@@ -20,17 +20,17 @@ from framework.interfaces import Detector
 class WithEmbeddings(Detector):
     """Adds to each detection of another detector the embedding of its picture by a model that knows words, too.
 
-    The model is CLIP or SigLIP of Hugging Face transformers (extra `transformers`), or a file that `train-words` made.
+    The model is CLIP or SigLIP of Hugging Face transformers (extra `transformers`).
     """
 
     of: Detector  # what finds the objects; detector@detector.of=NAME chooses another one
-    model: str = "google/siglip2-base-patch16-224"  # id on huggingface.co, a folder, or a .safetensors of train-words
+    model: str = "google/siglip2-base-patch16-224"  # id on huggingface.co, or a folder
     revision: str = "main"  # branch, tag or commit of a model id
     every: int = 1  # frames, >= 1: only those whose number is a multiple are embedded, to save time
     min_score: float = 0.3  # in [0, 1]: only detections this good are embedded; weaker ones are wrong too often
     min_pixels: int = 200  # px >= 1, of a mask: less of an object tells little
     context: float = 1.2  # >= 1, side of the square picture over the longer side of the object's box
-    surroundings: float = 0.4  # in [0, 1]: how much of what is around the object a model sees that takes no mask
+    surroundings: float = 0.4  # in [0, 1]: contrast that the background keeps: 0 = gray, 1 = all
     batch: int = 16  # pictures at once, >= 1
     half: bool = True  # half precision on CUDA
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
@@ -45,9 +45,9 @@ class WithEmbeddings(Detector):
             surroundings=(0.0, 1.0),
             batch=(1, 4096),
         )
-        self._model = open_image_text(self.model, self.revision, self.device, self.half)
+        self._model = ImageTextModel(self.model, self.revision, self.device, self.half)
         self.classes = self.of.classes
-        self.domain = RENDERED_ROOMS if self.model.endswith(ROOM_WORDS_SUFFIX) else domain_of(self.of)
+        self.domain = domain_of(self.of)
         reads = self.of.reads if isinstance(self.of, ReadsFields) else FRAME_FIELDS
         self.reads = tuple(dict.fromkeys((*reads, "color", *(["index"] if self.every > 1 else []))))
 
@@ -62,8 +62,7 @@ class WithEmbeddings(Detector):
         chosen = np.flatnonzero((found.scores >= self.min_score) & (areas >= self.min_pixels))
         if not len(chosen):
             return found
-        surroundings = 1.0 if self._model.sees_mask else self.surroundings
-        crops = square_crops(frame.color, found.masks[chosen], self._model.side, self.context, surroundings)
+        crops = square_crops(frame.color, found.masks[chosen], self._model.side, self.context, self.surroundings)
         vectors = self._embedded(crops)
         embeddings = np.zeros((len(found), vectors.shape[1]), np.float32)
         embeddings[chosen] = vectors

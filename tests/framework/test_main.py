@@ -182,7 +182,6 @@ FAULTY = {
     "new-plugin": ["refiner", "gmm_em"],
     "synthesize": ["new", "--scenes=999"],
     "train-detector": ["device=tpu"],
-    "train-words": ["schedule.epochs=0"],
     "convert-weights": ["nothing.pth", "out.safetensors"],
     "convert-oni": ["nothing.oni", "out"],
 }

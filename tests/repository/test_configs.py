@@ -26,7 +26,6 @@ from framework.registry import (
 from framework.runs.provenance import WITHOUT_EFFECT
 from framework.tables.comparison import TableChoice
 from framework.training.trainer import Schedule
-from framework.training.word_trainer import WordSchedule
 from tests.support import registered
 
 
@@ -106,9 +105,6 @@ def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> N
     schedule = OmegaConf.load(CONF / "train_detector.yaml").schedule
     assert Schedule(**schedule) == Schedule()
     assert set(schedule) == {field.name for field in dataclasses.fields(Schedule)} - {"seed", "budget"}
-    words = OmegaConf.load(CONF / "train_words.yaml").schedule
-    assert WordSchedule(**words) == WordSchedule()
-    assert set(words) == {field.name for field in dataclasses.fields(WordSchedule)} - {"seed"}
     table = OmegaConf.load(CONF / "parts" / "experiment.yaml").table
     assert TableChoice.of(table) == TableChoice(columns=list(table.columns))
     assert set(table) == {field.name for field in dataclasses.fields(TableChoice)}

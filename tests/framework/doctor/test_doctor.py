@@ -151,7 +151,7 @@ def test_every_option_of_a_detector_that_names_weights_is_listed() -> None:
         for key, value in given.items():
             found.add(value if value in PUBLISHED else path.stem if len(given) == 1 else f"{path.stem}.{key}")
     assert found | PUBLISHED.keys() == set(named)
-    assert {"with_embeddings", "room_words", "open_vocabulary.model", "open_vocabulary.masks"} < found
+    assert {"with_embeddings", "open_vocabulary.model", "open_vocabulary.masks"} < found
 
 
 def test_a_new_option_with_weights_is_listed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

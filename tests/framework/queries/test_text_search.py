@@ -14,12 +14,14 @@ import pytest
 import instancemap
 from framework.api import query
 from framework.commands.results.query import main
+from framework.detection.embeddings.image_text import ImageTextModel
 from framework.errors import ConfigError, DataError
 from framework.interfaces import MapFuser
 from framework.queries.map_queries import Map
 from framework.queries.text_search import by_embedding, by_names, color_fit
 from framework.vocabulary.color_names import COLOR_NAMES
 from tests.support import registered
+from tests.support.networks.tiny_image_text import SIDE, write_image_text
 from tests.support.scenes.analytic_scene import room, walk
 from tests.support.true_masks import fuse_masks, masks_of
 
@@ -27,12 +29,12 @@ EMBEDDINGS = np.float32([[1, 0], [0.6, 0.8], [0, 0]])
 PROBABILITIES = [(0.9, 0.1), (0.2, 0.8), (0.6, 0.4)]
 
 
-def mapped(embeddings: np.ndarray | None) -> Map:
+def mapped(embeddings: np.ndarray | None, space: str = "words@1") -> Map:
     """The analytic room's three objects: chair, bed and, less surely, chair."""
     fuser: MapFuser = registered.built("fuser", "bayesian_tsdf", "fuser.voxel_size=0.08")
     for k, T in enumerate(walk(4)):
         frame = room().frame(T, k)
-        fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, PROBABILITIES, embeddings)
+        fuse_masks(fuser, frame, masks_of(frame), [0.9] * 3, PROBABILITIES, embeddings, space)
     return Map(fuser.scene)
 
 
@@ -157,6 +159,32 @@ def test_embeddings_need_the_model_that_they_are_of(
     assert status == 1
     assert "expected the directory of a run" in err
     assert asked(monkeypatch, capsys, str(run), "a bed", "--top", "0")[0] == 2
+
+
+def test_query_with_embeddings_uses_model_of_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("transformers")
+    folder = write_image_text(tmp_path / "siglip")
+    model = ImageTextModel(str(folder), "main", "cpu", half=False)
+    crops = np.random.default_rng(3).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
+    scene = mapped(model.embed_crops(crops), model.space)
+    scene.save(tmp_path / "map.npz")
+    (tmp_path / "config.yaml").write_text(f"detector: {{model: {folder}}}\n")
+    text = model.embed_text("red chair")
+    cosines = {k: float(one.embedding @ text) for k, one in scene.instances().items() if one.embedding is not None}
+    ranked = sorted(cosines, key=lambda k: -cosines[k])
+    assert len(ranked) == 3
+    status, out, _ = asked(monkeypatch, capsys, str(tmp_path), "red chair")
+    assert status == 0
+    assert out.splitlines()[0].startswith(f"by embeddings of {model.space}")
+    assert [int(line.split()[0]) for line in out.splitlines()[2:]] == ranked
+    for answer in (query(tmp_path, "red chair"), query(scene, "red chair", model=folder)):
+        assert (answer.by, answer.space) == ("embeddings", model.space)
+        assert {one.instance.id: one.similarity for one in answer.objects} == pytest.approx(cosines)
+    clip = write_image_text(tmp_path / "clip", "clip")
+    with pytest.raises(DataError, match=f"are of {model.space}, and {clip} is clip@"):
+        query(scene, "red chair", model=clip)
 
 
 def test_a_map_is_asked_as_its_run_is(embedded: Map, run: Path, run_without: Path) -> None:

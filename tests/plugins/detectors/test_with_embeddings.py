@@ -11,7 +11,7 @@ import torch
 
 from framework.data import Camera, Detections, Frame
 from framework.detection.embeddings.crops import square_crops
-from framework.detection.embeddings.hub_image_text import HubImageText
+from framework.detection.embeddings.image_text import ImageTextModel
 from framework.detection.stored.cache import identity_of
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector
@@ -21,7 +21,6 @@ from tests.support.networks.tiny_image_text import SIDE, write_image_text
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 transformers = pytest.importorskip("transformers")
-CPU = torch.device("cpu")
 KINDS = ("siglip", "clip")
 
 
@@ -58,7 +57,7 @@ def picture(index: int = 0) -> Frame:
 def test_pictures_and_words_are_embedded_as_transformers_does_it(folder: Path) -> None:
     from transformers import AutoModel, AutoTokenizer
 
-    model = HubImageText(str(folder), "main", CPU, half=False)
+    model = ImageTextModel(str(folder), "main", "cpu", half=False)
     crops = np.random.default_rng(0).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
     network = AutoModel.from_pretrained(folder).eval()
     is_clip = network.config.model_type == "clip"
