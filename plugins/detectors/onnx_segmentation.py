@@ -1,4 +1,4 @@
-"""An instance segmentation network of the YOLO family from an ONNX or .tflite file that the user brings."""
+"""An instance segmentation network of the YOLO family from an ONNX file that the user brings."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ class OnnxSegmentation(Detector):
     each a box, C class scores and M coefficients of the prototypes. Or suppression is part of it, as in exports with
     `nms=True` and of networks without duplicates: then the first is (1, K, 6 + M), with x1 y1 x2 y2, score and label.
     Boxes are in px of the input or in 0..1. Which of these a file is, its shapes and its answer to a black image show,
-    see `framework.detection.segmentation_output`; what they do not show is refused. A file that ends with .tflite runs
-    in LiteRT (the extra `litert`), every other one in onnxruntime (the extra `onnx`).
+    see `framework.detection.segmentation_output`; what they do not show is refused. It runs in
+    onnxruntime (the extra `onnx`).
 
     The class distribution of a detection is its class scores divided by their sum; its score is the largest of them
     before the division. With suppression inside, the scores of the other classes are lost: what the score lacks to 1 is
@@ -38,7 +38,7 @@ class OnnxSegmentation(Detector):
     are part of this project.
     """
 
-    weights: Path  # ONNX or .tflite file; a relative path is tried from the working, then the project folder
+    weights: Path  # ONNX file; a relative path is tried from the working, then the project folder
     sha256: str = ""  # what the file must have; "" = whatever it is
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
     objectness: bool = False  # an objectness stands before the class scores, as in YOLOv5

@@ -8,17 +8,15 @@ import numpy as np
 
 from framework.config.validation import LONGEST_SIDE, require
 from framework.data import UInt8
-from framework.detection.litert_network import LitertNetwork
 from framework.detection.masks.letterbox import Letterbox, Placement, network_input
 from framework.detection.runtimes.network_outputs import Outputs
 from framework.detection.runtimes.onnx_network import OnnxNetwork
 
 
 class ImageNetwork:
-    """A network in a file, and how it wants its images; the arguments are parameters of the detectors that have one.
+    """An ONNX network and how it wants its images; the arguments are parameters of the detectors that have one.
 
-    A file that ends with .tflite runs in LiteRT, every other one in onnxruntime. Raises ConfigError for a parameter out
-    of its bounds, and what `OnnxNetwork` raises.
+    Raises ConfigError for a parameter out of its bounds, and what `OnnxNetwork` raises.
     """
 
     def __init__(
@@ -40,8 +38,9 @@ class ImageNetwork:
         require(0 <= padding <= 255, "detector.padding", padding, "in [0, 255]")
         require(bool(np.isfinite([black, white]).all()) and black != white, "detector.white", white, f"not {black}")
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
-        kind = LitertNetwork if path.suffix.lower() == ".tflite" else OnnxNetwork
-        self._network: LitertNetwork | OnnxNetwork = kind(path, sha256, device, input_size)
+        onnx = "an ONNX file; convert a .tflite file with tf2onnx (docs/guides/detectors.md)"
+        require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
+        self._network = OnnxNetwork(path, sha256, device, input_size)
         whole = self._network.dtype != "uint8" or (black, white) == (0, 255)
         require(whole, "detector.black and white", f"{black} and {white}", "0 and 255 for a network of whole numbers")
         self.shape = self._network.shape  # (height, width) px

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,14 +10,7 @@ import cv2
 import numpy as np
 
 from framework.data import Array
-from framework.detection.hub.weights_file import (
-    Shape,
-    checked_hash,
-    find_file,
-    image_input,
-    input_shape,
-    is_channels_last,
-)
+from framework.detection.hub.weights_file import checked_hash, find_file
 from framework.detection.runtimes.export_metadata import ExportMetadata
 from framework.detection.runtimes.network_outputs import Outputs, finite_outputs, one_line
 from framework.errors import ConfigError, DataError
@@ -24,6 +18,7 @@ from framework.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
 
+Shape = tuple[int, ...]  # 0 = any
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # numpy's names
 
 
@@ -48,14 +43,14 @@ class OnnxNetwork:
         self.sha256 = checked_hash(self.path, sha256)
         self._session = _loaded(self.path, device)
         self.metadata = ExportMetadata.parse(self._session.get_modelmeta().custom_metadata_map)
-        image, shape = image_input(self.path, self._session.get_inputs(), _shape, _described)
+        image, shape = _image_input(self.path, self._session.get_inputs())
         if image.type not in INPUT_DTYPES:
             wanted = ", ".join(INPUT_DTYPES.values())
             raise DataError(f"{self.path}: the input must be one of {wanted}, found {_described(image)}")
         self._name = image.name
         self.dtype = INPUT_DTYPES[image.type]
-        self.channels_last = is_channels_last(shape)
-        self.shape = input_shape(self.path, _described(image), shape, input_size, self.metadata)
+        self.channels_last = shape[3] == 3 and shape[1] != 3  # (1, H, W, 3), as in networks from TensorFlow
+        self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
 
     def __call__(self, image: Array) -> Outputs:
         """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
@@ -92,6 +87,39 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     if device == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
         raise ConfigError("detector.device must be cpu or auto where CUDA cannot be started, found cuda")
     return session
+
+
+def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]:
+    """The only input, an image, and its shape. Raises DataError for a network with other inputs."""
+    found = ", ".join(map(_described, inputs))
+    wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
+    if len(inputs) != 1:
+        raise DataError(f"{path}: {wanted}, found {len(inputs)} inputs: {found}")
+    shape = _shape(inputs[0])
+    if len(shape) != 4 or shape[0] > 1 or 3 not in (shape[1], shape[3]):
+        raise DataError(f"{path}: {wanted}, found {found}")
+    return inputs[0], shape
+
+
+def _input_shape(
+    path: Path, image: NodeArg, channels_last: bool, input_size: int, metadata: ExportMetadata
+) -> tuple[int, int]:
+    """(height, width) in px of a network's input of this shape, 0 = any.
+
+    What is open comes from `input_size`, else from what the file says that it was exported for.
+    """
+    shape, described = _shape(image), _described(image)
+    height, width = shape[1:3] if channels_last else shape[2:]
+    if height and width:
+        if input_size and (height, width) != (input_size, input_size):
+            raise ConfigError(
+                f"detector.input_size must be 0 or the network's own, found {input_size}: {path} takes {described}"
+            )
+        return height, width
+    open_height, open_width = (input_size, input_size) if input_size else metadata.image_size
+    if not (open_height and open_width):
+        raise ConfigError(f"detector.input_size must be given in px: {path} takes any size: {described}")
+    return height or open_height, width or open_width
 
 
 def _described(tensor: NodeArg) -> str:

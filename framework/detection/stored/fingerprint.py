@@ -14,7 +14,7 @@ from framework.errors import ConfigError
 from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
-LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "ai-edge-litert", "transformers")
+LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
 """Another version may give other last digits."""
 
 SHARED_SOURCES = ("detection/**/*.py", "vocabulary/label_spaces.*")  # in framework/: what detectors are built from

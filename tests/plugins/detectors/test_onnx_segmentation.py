@@ -72,19 +72,20 @@ def check_cup_and_chair(found):
     np.testing.assert_allclose(found.class_probabilities, [[6 / 7, 1 / 7], [1 / 9, 8 / 9]], rtol=1e-5)
 
 
-def test_a_tflite_file_as_tensorflow_writes_it(tmp_path):
-    """Channels last, and boxes in 0..1."""
-    pytest.importorskip("ai_edge_litert")
-    from tests.support.networks.tiny_litert import constant_litert_network
-
+def test_tensorflow_export_channels_last_and_unit_boxes(tmp_path):
     table, prototypes = outputs().values()
     table[:, :4] /= SIZE
     (tmp_path / "labels.txt").write_text("\n".join(LABELS))
-    weights = constant_litert_network(
-        tmp_path / "n.tflite", (1, SIZE, SIZE, 3), {"a": np.moveaxis(prototypes, 1, -1), "b": table}
+    weights = constant_network(
+        tmp_path / "n.onnx", (1, SIZE, SIZE, 3), {"a": np.moveaxis(prototypes, 1, -1), "b": table}
     )
     detector = OnnxSegmentation(weights=weights, labels=str(tmp_path / "labels.txt"), device="cpu")
     check_cup_and_chair(detector.detect(frame()))
+
+
+def test_tflite_file_error_names_converter(tmp_path):
+    with pytest.raises(ConfigError, match=r"detector\.weights must be an ONNX file; .* tf2onnx .*n\.tflite"):
+        OnnxSegmentation(weights=tmp_path / "n.tflite", device="cpu")
 
 
 def suppressed(folder, **parameters):
