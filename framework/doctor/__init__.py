@@ -1,4 +1,1 @@
-"""What of the things that InstanceMap can use is there on this machine: what `doctor` says.
-
-Nothing here is imported that may be missing or broken, but where that is looked at: the standard library does the rest.
-"""
+"""Checks of the installation, as printed by `instancemap doctor`. Nothing here needs a working installation."""

@@ -27,4 +27,11 @@ def block(language: str, containing: str) -> str:
     return found
 
 
-LINES = list(dict.fromkeys(line for code in blocks("console") for line in code.splitlines()))
+LINES = list(
+    dict.fromkeys(
+        re.sub(r"^instancemap ", "python -m framework ", line)  # the same command
+        for code in blocks("console")
+        for line in code.splitlines()
+    )
+)
+"""Every line of the console blocks, with `python -m framework` for `instancemap`."""

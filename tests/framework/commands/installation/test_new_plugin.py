@@ -17,7 +17,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from framework.commands.installation.new_plugin import LONGEST_NAME, check_name, files_of, write_repository
-from framework.doctor.requirements import NOT_OF_USERS
+from framework.doctor.packages import DEVELOPERS
 from framework.errors import ConfigError
 from framework.registry import GROUPS
 from tests.support import option_files
@@ -175,10 +175,10 @@ def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: P
 
 def test_an_installed_package_examines_itself_and_writes_plugins(place: Path) -> None:
     sections = json.loads(run(place, "instancemap", "doctor", "--json"))
-    found = {of["title"]: {one["name"]: one for one in of["findings"]} for of in sections}
+    found = {section["title"]: {check["name"]: check for check in section["checks"]} for section in sections}
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
     assert set(found["Libraries"]) == {Requirement(line).name for line in project["dependencies"]}
-    assert set(found["Extras, optional"]) == project["optional-dependencies"].keys() - NOT_OF_USERS
+    assert set(found["Extras (optional)"]) == project["optional-dependencies"].keys() - DEVELOPERS
     assert found["InstanceMap"]["commit"]["detail"] == "no checkout"
     assert "written: instancemap-other" in run(place, "instancemap", "new-plugin", "tracker", "other")
     assert (place / "instancemap-other" / "instancemap_other" / "other.py").exists()

@@ -1,0 +1,54 @@
+"""The result of one check, and a runner that survives a failing one."""
+
+from __future__ import annotations
+
+import getpass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+
+
+class Status(Enum):
+    """The result of a check; the value is the mark in front of it."""
+
+    OK = "ok"
+    MISSING = "--"  # optional
+    ERROR = "!!"  # required by a run with the default stages
+
+
+@dataclass(frozen=True)
+class Check:
+    """One result."""
+
+    name: str
+    status: Status
+    detail: str
+    fix: str = ""  # the command that fixes it; "" = none is needed or known
+
+
+def run_checks(*checks: Callable[[], Iterable[Check]]) -> list[Check]:
+    """Return all results; a check that raises becomes an error of its own."""
+    results: list[Check] = []
+    for check in checks:
+        try:
+            results += check()
+        except Exception as error:  # a broken installation can raise anything
+            results.append(Check(check.__name__.replace("_", " "), Status.ERROR, one_line(error)))
+    return results
+
+
+def one_line(error: BaseException) -> str:
+    return anonymous(f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": "))[:300]
+
+
+def anonymous(text: str) -> str:
+    """Return the text without the user's home and name, so that it can be pasted into an issue."""
+    home = str(Path.home())
+    if home != "/":
+        text = text.replace(home, "~")
+    try:
+        user = getpass.getuser()
+    except (KeyError, OSError):  # a user in a container may have no name
+        return text
+    return text.replace(f"/{user}/", "/USER/") if user != "root" else text
