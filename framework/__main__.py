@@ -12,7 +12,6 @@ from pathlib import Path
 
 COMMANDS = {
     "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
-    "ranks": "whether the rows of an experiment rank alike in several places: Spearman's rho",
     "figures": "run records below a folder become the paper's figures",
     "report": "shows a run, or several side by side, as a page for the browser",
     "import": "turns a recording of a phone or a sensor into a folder that can be mapped",
@@ -36,7 +35,7 @@ COMMANDS = {
 
 FOLDERS = {
     "running": ("run", "detect", "show-refinement"),
-    "results": ("tables", "ranks", "figures", "report", "diff", "export", "query", "evaluate"),
+    "results": ("tables", "figures", "report", "diff", "export", "query", "evaluate"),
     "recordings": ("import", "check", "synthesize", "convert-oni"),
     "installation": ("compile", "doctor", "plugins", "new-plugin", "train-detector", "convert-weights"),
 }
@@ -44,7 +43,6 @@ FOLDERS = {
 
 PRINTING = (
     "tables",
-    "ranks",
     "figures",
     "report",
     "diff",

@@ -161,12 +161,11 @@ def test_a_misspelt_command_suggests_the_nearest(tmp_path: Path) -> None:
     done = words("tabels", "outputs", directory=tmp_path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "error: there is no command 'tabels'; did you mean tables?\n"
-    assert "the commands are tables, ranks, figures" in words("xyz", directory=tmp_path).stderr
+    assert "the commands are tables, figures" in words("xyz", directory=tmp_path).stderr
 
 
 FAULTY = {
     "tables": ["nowhere"],
-    "ranks": ["nowhere", "elsewhere"],
     "figures": ["nowhere"],
     "import": ["old", "new"],
     "check": ["out=check.jpg"],

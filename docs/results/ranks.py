@@ -1,7 +1,11 @@
-"""How alike the rows of an experiment rank in several places: their means and ranks, and Spearman's rho."""
+"""Compare how the rows of an experiment rank on several datasets: means, ranks and Spearman's rho.
+
+Run it with the folders of the experiment's runs: `python docs/results/ranks.py DIR DIR... --metric instances.ap50`.
+"""
 
 from __future__ import annotations
 
+import argparse
 import csv
 import io
 import math
@@ -14,6 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Float64
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
@@ -124,6 +129,28 @@ class Ranking:
             yield f"{one.name}, {other.name}", Agreement.of(one, [other])
         if OTHERS in self.columns:
             yield f"{self.places[0].name}, {OTHERS}", Agreement.of(self.places[0], self.places[1:])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description="Compare an experiment's rows across datasets: the mean and rank of each row on each dataset, and "
+        "Spearman's rho between datasets with bootstrap intervals.",
+    )
+    parser.add_argument(
+        "directory",
+        metavar="DIR",
+        nargs="+",
+        type=Path,
+        help="folder of the experiment's runs on one dataset; three or more: the first is also compared with the mean "
+        "of the others",
+    )
+    parser.add_argument(
+        "--metric", metavar="KEY", nargs="+", default=["instances.ap50"], help="keys of metrics.json, one table each"
+    )
+    parser.add_argument("--out", metavar="FOLDER", type=Path, help="also write ranks.md and ranks.csv to this folder")
+    options = arguments(parser)
+    with one_line_errors():
+        print(write_ranks(options.directory, options.metric, options.out), end="")
 
 
 def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | None) -> str:
@@ -298,3 +325,7 @@ def _notes(ranking: Ranking) -> Iterator[str]:
             f"{place.name}: {chosen}, poses {counted(row.poses for row in place.comparison.rows)}; annotation: "
             f"{annotation}; code {code}; SHA-256 of all configs: {digest(records)}."
         )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,10 +1,14 @@
-"""Ranks in several places, against values computed by hand and against scipy's own rank correlation."""
+"""docs/results/ranks.py, against values computed by hand and against scipy's rank correlation."""
 
 from __future__ import annotations
 
 import csv
+import importlib.util
 import json
 import math
+import shlex
+import subprocess
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -16,7 +20,16 @@ from scipy.stats import spearmanr
 from framework.errors import DataError
 from framework.runs.provenance import config_hash
 from framework.tables.comparison import Comparison
-from framework.tables.ranks import Agreement, Ranking, ranks, spearman, write_ranks
+from tests.support.doc_pages import CHECKOUT, LINES
+
+SCRIPT = CHECKOUT / "docs" / "results" / "ranks.py"
+COMMAND = "python docs/results/ranks.py "
+
+script = sys.modules["ranks_script"] = importlib.util.module_from_spec(
+    importlib.util.spec_from_file_location("ranks_script", SCRIPT)
+)
+script.__spec__.loader.exec_module(script)
+Ranking, ranks, spearman, write_ranks = script.Ranking, script.ranks, script.spearman, script.write_ranks
 
 AP50, IOU = "instances.ap50", "instances.mean_iou"
 Figures = Mapping[str, Sequence[float | None]]  # by row, one for each seed; None = not defined
@@ -111,7 +124,7 @@ def test_means_that_differ_by_rounding_alone_share_a_rank() -> None:
     assert spearman(np.array([[0.1 + 0.2, 0.0, 0.3]]), np.array([[0.3, 0.0, 0.1 + 0.2]])) == pytest.approx([1])
 
 
-def agreement(places: Sequence[Path]) -> Agreement:
+def agreement(places: Sequence[Path]) -> object:
     [(_, found), *_] = Ranking.of(AP50, [Comparison.below(place) for place in places]).agreements()
     return found
 
@@ -230,3 +243,30 @@ def test_what_cannot_be_compared_is_one_line(places: list[Path], asked: list[str
     with pytest.raises(DataError, match=said) as caught:
         write_ranks([root / name for name in asked], keys, None)
     assert "\n" not in str(caught.value)
+
+
+def start(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    environment = {"PATH": "/usr/bin:/bin", "PYTHONPATH": str(CHECKOUT), "HOME": str(directory)}
+    line = [sys.executable, str(SCRIPT), *arguments]
+    return subprocess.run(line, cwd=directory, env=environment, capture_output=True, text=True, timeout=120)
+
+
+def test_documented_command_prints_and_writes_tables(tmp_path: Path) -> None:
+    [command] = [line.removeprefix(COMMAND) for line in LINES if line.startswith(COMMAND)]
+    folders = [word for word in shlex.split(command) if word.startswith("outputs/ranks_")]
+    assert len(folders) == 3
+    for folder in folders:
+        experiment(tmp_path / folder, {"a": (0.9,), "b": (0.8,), "c": (0.7,), "d": (0.6,)})
+    done = start(tmp_path, *shlex.split(command))
+    assert done.returncode == 0, done.stderr
+    [out] = tmp_path.rglob("ranks.md")
+    assert out.read_text() == done.stdout
+    assert out.with_name("ranks.csv").exists()
+    assert "+1.00" in done.stdout
+
+
+def test_script_error_is_one_line(tmp_path: Path) -> None:
+    experiment(tmp_path / "rooms", {"a": (0.9,), "b": (0.8,), "c": (0.7,)})
+    done = start(tmp_path, "rooms", "flat")
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "error: flat is not a folder with records of runs\n"
