@@ -299,7 +299,7 @@ def export(
     """
     from framework.exporting import exports
 
-    kinds = [exports.one_of(exports.Format, "a format", one) for one in formats]
+    kinds = [exports.one_of(exports.ExportFormat, "a format", one) for one in formats]
     chosen = exports.Chosen.named(objects, **choices)
     return exports.export(Path(run), kinds, None if out is None else Path(out), chosen, up, floor)
 

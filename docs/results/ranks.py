@@ -22,9 +22,9 @@ from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Float64
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
-from framework.runs.run_rows import CHOICE, CONFIDENCE, Row, Run
-from framework.tables.comparison import Comparison
-from framework.tables.grid import Grid, decimals, figure, markdown_grid
+from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, RunRow
+from framework.tables.comparison import ComparisonTable
+from framework.tables.grid import TextTable, decimals, figure, markdown_grid
 from framework.tables.layouts import NOTHING, head
 from framework.tables.sequences import mean_by_sequence
 from framework.tables.table_notes import counted, digest
@@ -41,7 +41,7 @@ class Place:
     """An experiment folder, with the rows that all places have."""
 
     name: str  # of the folder
-    comparison: Comparison
+    comparison: ComparisonTable
     values: Float64  # (R, S) a figure of each row in each sequence, or with each seed; all rows have the same
     runs: int  # of each row, of which S sequences are the means
     left_out: int  # runs that not every row has
@@ -88,7 +88,7 @@ class Ranking:
     absent: dict[str, list[str]]  # rows that are left out, by name: the places that do not have them
 
     @classmethod
-    def of(cls, key: str, comparisons: Sequence[Comparison]) -> Ranking:
+    def of(cls, key: str, comparisons: Sequence[ComparisonTable]) -> Ranking:
         """Raises DataError where a folder has no such figure, or where there is too little in common."""
         names = _names(comparisons)
         found = [{row.name: row for row in one.rows if row.values(key)} for one in comparisons]
@@ -163,7 +163,7 @@ def write_ranks(directories: Sequence[Path], keys: Sequence[str], out: Path | No
         raise DataError(f"ranks compares two folders or more, found {len(directories)}")
     if len({directory.resolve() for directory in directories}) < len(directories):
         raise DataError(f"ranks compares different folders, found one twice: {', '.join(map(str, directories))}")
-    comparisons = [Comparison.below(directory) for directory in directories]
+    comparisons = [ComparisonTable.below(directory) for directory in directories]
     rankings = [Ranking.of(key, comparisons) for key in keys]
     text = markdown(rankings)
     if out is not None:
@@ -183,7 +183,7 @@ def markdown(rankings: Sequence[Ranking]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def rank_grid(ranking: Ranking) -> Grid:
+def rank_grid(ranking: Ranking) -> TextTable:
     """A line a row: its mean and its rank in each place."""
     columns = [(means, ranks(means)) for means in ranking.columns.values()]
     digits = decimals(float(value) for means, _ in columns for value in means)
@@ -194,17 +194,17 @@ def rank_grid(ranking: Ranking) -> Grid:
         ]
         for k, row in enumerate(ranking.rows)
     ]
-    return Grid(["row", *(text for name in ranking.columns for text in (name, "rank"))], body)
+    return TextTable(["row", *(text for name in ranking.columns for text in (name, "rank"))], body)
 
 
-def agreement_grid(ranking: Ranking) -> Grid:
+def agreement_grid(ranking: Ranking) -> TextTable:
     """A line a pair of places."""
     share = f"{CONFIDENCE:.0%}"
     body = [
         [pair, str(len(ranking.rows)), _signed(one.rho), _between(one.over_rows), _between(one.over_runs)]
         for pair, one in ranking.agreements()
     ]
-    return Grid(["Spearman's rho of", "rows", "rho", f"{share} over rows", f"{share} over runs"], body)
+    return TextTable(["Spearman's rho of", "rows", "rho", f"{share} over rows", f"{share} over runs"], body)
 
 
 def comma_separated(rankings: Sequence[Ranking]) -> str:
@@ -252,7 +252,7 @@ def _mean(values: Sequence[Float64]) -> Float64:
     return np.asarray(np.mean(values, axis=0), np.float64)
 
 
-def _place(name: str, comparison: Comparison, rows: Sequence[Row], key: str) -> Place:
+def _place(name: str, comparison: ComparisonTable, rows: Sequence[RunRow], key: str) -> Place:
     """Of the runs that every row has: another seed or sequence may be harder."""
     values = [row.values(key) for row in rows]
     shared: set[Run] = set(values[0]).intersection(*values)
@@ -264,13 +264,13 @@ def _place(name: str, comparison: Comparison, rows: Sequence[Row], key: str) -> 
     return Place(name, comparison, matrix, len(shared), len(set().union(*values)) - len(shared))
 
 
-def _names(comparisons: Sequence[Comparison]) -> list[str]:
+def _names(comparisons: Sequence[ComparisonTable]) -> list[str]:
     """What the folders are called; by their path where two have the same name."""
     titles = [one.title for one in comparisons]
     return [one.title if titles.count(one.title) == 1 else str(one.root) for one in comparisons]
 
 
-def _unknown(key: str, comparison: Comparison) -> str:
+def _unknown(key: str, comparison: ComparisonTable) -> str:
     known = sorted({name for row in comparison.rows for one in row.records.values() for name in one.metrics})
     close = get_close_matches(key, known, n=1)
     suggestion = f"; did you mean {close[0]}?" if close and close[0] != key else ""

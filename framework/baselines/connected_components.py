@@ -12,7 +12,7 @@ from framework.baselines.class_evidence import ClassEvidence, best_class
 from framework.data import Float64, Int32, UInt8
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.vertex_labels import CHUNK, CORNERS, color_of, corner_voxels, keep_near, majority
-from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, Grid, device
 from framework.refinement.segmentation.union_find import root, unite
 
@@ -40,7 +40,7 @@ def _label(grid, evidence, log_missed, vertices, voxels, colors, class_ids):
 
 
 def vertex_classes(
-    grid: Grid, evidence: ClassEvidence, log_missed: np.float32, surface: Surface
+    grid: Grid, evidence: ClassEvidence, log_missed: np.float32, surface: UnlabeledMesh
 ) -> tuple[UInt8, Int32]:
     """(colors (V, 3), class ids (V,)) of the surface's vertices, class -1 = background.
 
@@ -127,7 +127,12 @@ def _collect(grid, evidence, log_missed, voxels, instance_ids, sums, masked, fir
 
 
 def component_statistics(
-    grid: Grid, evidence: ClassEvidence, log_missed: np.float32, surface: Surface, instance_ids: Int32, classes: int
+    grid: Grid,
+    evidence: ClassEvidence,
+    log_missed: np.float32,
+    surface: UnlabeledMesh,
+    instance_ids: Int32,
+    classes: int,
 ) -> ComponentStatistics:
     """What the map says of each of the components that `instance_ids` (V,) name."""
     vertices = np.bincount(instance_ids, minlength=1)

@@ -48,7 +48,7 @@ from framework.mapping.storage.map_file import (
 )
 from framework.mapping.voxels.frustum import boxes_in_view
 from framework.mapping.voxels.integration_parameters import pinhole
-from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, VoxelGrid
 
@@ -184,7 +184,7 @@ class ObjectMap(SceneMap):
     def mesh(self) -> InstanceMesh:
         return self.background.mesh(self._labeled)
 
-    def _labeled(self, background: Surface) -> InstanceMesh:
+    def _labeled(self, background: UnlabeledMesh) -> InstanceMesh:
         """The background's surface, with the object that it most probably belongs to, and the objects' own surfaces.
 
         Both were measured by the same readings and nearly coincide: were the background's without a label there, which
@@ -279,7 +279,7 @@ class _Part(NamedTuple):
     instance_ids: Int32  # (V,), 0 = none
 
 
-def _part(surface: Surface, voxels: VoxelGrid, chosen: Bool, instance_ids: Int32) -> _Part:
+def _part(surface: UnlabeledMesh, voxels: VoxelGrid, chosen: Bool, instance_ids: Int32) -> _Part:
     """The chosen (V,) vertices of a grid's surface, and the triangles between them."""
     number = np.cumsum(chosen, dtype=np.int32) - np.int32(1)
     triangles = surface.triangles[chosen[surface.triangles].all(axis=1)]

@@ -16,7 +16,7 @@ from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_list import aligned_box, box_around, vertices_by_id, vertices_of_area
 from framework.mapping.storage.map_file import faults_of, read_map, write_map
 from framework.mapping.voxels.integration_parameters import pinhole
-from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import voxel_seen
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 
@@ -97,7 +97,7 @@ class SemanticMap(SceneMap):
     def mesh(self) -> InstanceMesh:
         return self.volume.mesh(self._labeled)
 
-    def _labeled(self, surface: Surface) -> InstanceMesh:
+    def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
         colors, class_ids = vertex_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface)
         least = vertices_of_area(self.min_area, self.volume.voxel_size)
         instance_ids = connected_components(surface.triangles, class_ids, least)

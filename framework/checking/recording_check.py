@@ -14,7 +14,7 @@ from framework.checking.finding import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair, Matcher
 from framework.checking.pose_delay import delayed, find_delay
 from framework.checking.pose_fit import PLAUSIBLE, USUAL_SCALES, PoseJudgement
-from framework.checking.registration import Agreement, EdgeComparison, color_gradient
+from framework.checking.registration import EdgeAlignment, EdgeComparison, color_gradient
 from framework.data import Camera, Float64, Frame
 from framework.datasets.frames.conventions import PoseReading
 from framework.datasets.frames.sequence_reader import Recording
@@ -42,7 +42,7 @@ class RecordingCheck:
     findings: tuple[Finding, ...]
     summary: str
     frames: tuple[Frame, ...]  # those looked at
-    by_delay: tuple[Agreement, ...]
+    by_delay: tuple[EdgeAlignment, ...]
     poses: PoseJudgement
     pair: MatchedPair | None  # of stored poses, which a picture shows
     meant: MatchedPair | None  # the same with the poses that belong to its frames

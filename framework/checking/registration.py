@@ -31,7 +31,7 @@ WEAKEST = 0.25  # standard deviations of the gradient at depth edges: what chanc
 
 
 @dataclass(frozen=True)
-class Agreement:
+class EdgeAlignment:
     """How well the depth edges lie on colour edges when the depth image is that of `delay` frames later, zoomed."""
 
     delay: int  # frames
@@ -54,7 +54,7 @@ class EdgeComparison:
         self.chosen = chosen
         self._edges = lru_cache(maxsize=None)(self._look)
 
-    def agreement(self, delay: int = 0, zoom: float = 1.0) -> Agreement | None:
+    def agreement(self, delay: int = 0, zoom: float = 1.0) -> EdgeAlignment | None:
         """None where too few frames have edges."""
         surfaces = [self._surface(k, k + delay, zoom) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
         seen = [surface for surface in surfaces if surface is not None]
@@ -63,14 +63,14 @@ class EdgeComparison:
         mean = np.mean(seen, axis=0)
         row, column = np.unravel_index(int(mean.argmax()), mean.shape)
         shift = (int(column) - LONGEST_SHIFT) / WIDTH, (int(row) - LONGEST_SHIFT) / WIDTH
-        return Agreement(delay, zoom, float(mean.max()), shift, len(seen))
+        return EdgeAlignment(delay, zoom, float(mean.max()), shift, len(seen))
 
-    def by_delay(self) -> list[Agreement]:
+    def by_delay(self) -> list[EdgeAlignment]:
         """Of each delay that can be told."""
         found = [self.agreement(delay) for delay in range(-LONGEST_DELAY, LONGEST_DELAY + 1)]
         return [agreement for agreement in found if agreement is not None]
 
-    def by_zoom(self, delay: int) -> list[Agreement]:
+    def by_zoom(self, delay: int) -> list[EdgeAlignment]:
         found = [self.agreement(delay, zoom) for zoom in ZOOMS]
         return [agreement for agreement in found if agreement is not None]
 
@@ -122,7 +122,7 @@ def depth_edges(depth: Float32) -> Bool:
 
 
 def judge(
-    by_delay: Sequence[Agreement], by_zoom: Sequence[Agreement], applied_delay: int, step: float
+    by_delay: Sequence[EdgeAlignment], by_zoom: Sequence[EdgeAlignment], applied_delay: int, step: float
 ) -> tuple[Finding, int]:
     """What the agreements say, and by how many frames the depth images must be taken later.
 

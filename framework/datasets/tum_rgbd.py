@@ -113,7 +113,7 @@ class TumRgbd(Recording):
             calibration.distortion if self.undistort else None,
         )
 
-    def _calibration(self) -> Calibration:
+    def _calibration(self) -> TumCalibration:
         if self.intrinsics is not Intrinsics.AUTO:
             return _published(self.intrinsics)
         named, own = re.search(r"freiburg[123]", self.name), self.folder / "camera.json"
@@ -128,7 +128,7 @@ class TumRgbd(Recording):
 
 
 @dataclass(frozen=True)
-class Calibration:
+class TumCalibration:
     """What is known of the camera."""
 
     camera: Camera
@@ -137,16 +137,16 @@ class Calibration:
     distortion: Distortion | None  # None = a pinhole
 
 
-def _published(intrinsics: Intrinsics) -> Calibration:
+def _published(intrinsics: Intrinsics) -> TumCalibration:
     source = f"dataset.intrinsics={intrinsics.name}"
-    return Calibration(CAMERAS[intrinsics], source, DEPTH_SCALE, DISTORTIONS[intrinsics])
+    return TumCalibration(CAMERAS[intrinsics], source, DEPTH_SCALE, DISTORTIONS[intrinsics])
 
 
-def _read_calibration(path: Path) -> Calibration:
+def _read_calibration(path: Path) -> TumCalibration:
     content = read_json_object(path)
     check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
     camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
-    return Calibration(camera, path, depth_scale, distortion_of(path, content))
+    return TumCalibration(camera, path, depth_scale, distortion_of(path, content))
 
 
 @dataclass(frozen=True)

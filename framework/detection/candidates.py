@@ -19,7 +19,7 @@ from framework.errors import DataError
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
 
-class Layout(Enum):
+class OutputLayout(Enum):
     """What a box detector's outputs are: K candidates, C classes, optionally an axis of length 1 in front."""
 
     yolox = "yolox"  # (K, 5 + C): dx, dy, log w, log h in cells; objectness; C class scores
@@ -50,16 +50,16 @@ class Candidates:
         return chosen[kept].astype(np.int32)
 
 
-def decode(layout: Layout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
+def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
     """The candidates in a network's `outputs` by name, for an input of `shape` (height, width) px and C classes.
 
     Raises DataError when the outputs do not have the layout.
     """
-    if layout is Layout.yolox:
+    if layout is OutputLayout.yolox:
         candidates = _decode_yolox(rows_of(only(outputs), 5 + classes), shape)
-    elif layout is Layout.yolo:
+    elif layout is OutputLayout.yolo:
         candidates = decode_yolo(rows_of(only(outputs), 4 + classes, "yolo_objectness"), objectness=False)
-    elif layout is Layout.yolo_objectness:
+    elif layout is OutputLayout.yolo_objectness:
         candidates = decode_yolo(rows_of(only(outputs), 5 + classes, "yolo"), objectness=True)
     else:
         candidates = _decode_ssd(layout, outputs, shape, classes)
@@ -134,7 +134,9 @@ def _decode_yolox(rows: Float32, shape: tuple[int, int]) -> Candidates:
     return Candidates(corners(np.concatenate([centers, sizes], axis=1)), class_scores)
 
 
-def _decode_ssd(layout: Layout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
+def _decode_ssd(
+    layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int
+) -> Candidates:
     """Boxes, and scores by class where the network has them, else a score and a label for each box.
 
     Outputs are known by their names, as in TensorFlow's object detection API (detection_boxes, detection_classes,
@@ -161,11 +163,11 @@ def _decode_ssd(layout: Layout, outputs: Mapping[str, Float32], shape: tuple[int
     )
 
 
-def _ssd_candidates(layout: Layout, boxes: Float32, class_scores: Float32, shape: tuple[int, int]) -> Candidates:
+def _ssd_candidates(layout: OutputLayout, boxes: Float32, class_scores: Float32, shape: tuple[int, int]) -> Candidates:
     check_scores(class_scores)
-    if layout is Layout.ssd_tensorflow:
+    if layout is OutputLayout.ssd_tensorflow:
         boxes = boxes[:, [1, 0, 3, 2]]
-    if layout is not Layout.ssd_torchvision:
+    if layout is not OutputLayout.ssd_torchvision:
         boxes = boxes * np.array([shape[1], shape[0]] * 2, np.float32)
     return Candidates(boxes, class_scores)
 

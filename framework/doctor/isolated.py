@@ -15,7 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from framework.doctor.check import one_line
+from framework.doctor.check_result import one_line
 
 TIMEOUT_S = 120.0  # for all names of one process
 ROOT = Path(__file__).resolve().parents[2]

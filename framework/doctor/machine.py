@@ -10,7 +10,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from framework.doctor.check import Check, Status, anonymous
+from framework.doctor.check_result import Check, Status, anonymous
 
 MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB, a benchmark of rooms gigabytes
 MIN_MEMORY_GIB = 2.0  # the demo takes 1.2

@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from framework.doctor.check import Check, Status, anonymous
+from framework.doctor.check_result import Check, Status, anonymous
 from framework.files.search_paths import CONF, PROJECT_ROOT
 
 INCLUDED = "plugins/"  # prefix of the paths of included weights

@@ -12,7 +12,7 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from framework.doctor.check import Check, Status
+from framework.doctor.check_result import Check, Status
 
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
 DEVELOPERS = ("dev", "docs", "evaluation-oracle")  # extras that users do not need

@@ -20,7 +20,7 @@ from framework.exporting.object_meshes import Part, object_parts, parts
 from framework.exporting.occupancy import plan
 from framework.exporting.ros_map import write_ros_map
 from framework.exporting.scene_graph import write_scene_graph
-from framework.exporting.upright_room import Room, read_room
+from framework.exporting.upright_room import UprightRoom, read_room
 from framework.exporting.usd import Collision, check_usd, write_usd
 from framework.files.atomic_write import written_whole
 from framework.runs.run_directory import LIKELY
@@ -28,7 +28,7 @@ from framework.runs.run_directory import LIKELY
 log = logging.getLogger(__name__)
 
 
-class Format(Enum):
+class ExportFormat(Enum):
     """What a run is exported to."""
 
     GLB = "glb"
@@ -39,7 +39,7 @@ class Format(Enum):
     GRAPH = "graph"
 
 
-MESHES = {Format.GLB: ".glb", Format.PLY: ".ply", Format.USD: ".usdc", Format.OBJ: ".obj"}
+MESHES = {ExportFormat.GLB: ".glb", ExportFormat.PLY: ".ply", ExportFormat.USD: ".usdc", ExportFormat.OBJ: ".obj"}
 """Formats of surfaces, and how the names of their files end."""
 
 
@@ -86,7 +86,7 @@ def one_of(kind: type[Option], name: str, value: object) -> Option:
 
 def export(
     run: Path,
-    formats: Iterable[Format],
+    formats: Iterable[ExportFormat],
     out: Path | None = None,
     chosen: Chosen | None = None,
     up: Sequence[float] | None = None,
@@ -98,7 +98,7 @@ def export(
     along up, say what the run's record does not tell. Raises DataError where there is no run, or not what is asked for.
     """
     formats, chosen = list(dict.fromkeys(formats)), chosen or Chosen()
-    if Format.USD in formats:
+    if ExportFormat.USD in formats:
         check_usd()
     room = read_room(run, up, floor)
     _check_known(run, room, formats)
@@ -111,30 +111,30 @@ def export(
         written += _write_surfaces(room, surfaces, directory, chosen)
     asked = [one for one in formats if one not in MESHES]
     found = plan(room, chosen.resolution, chosen.robot_height) if asked and room.floor_known else None
-    if Format.FLOORPLAN in asked and found is not None:
+    if ExportFormat.FLOORPLAN in asked and found is not None:
         write_floor_plan(directory / "floor_plan.png", room, found, chosen.robot_height)
         write_geojson(directory / "floor_plan.geojson", room)
         written += [directory / "floor_plan.png", directory / "floor_plan.geojson", *write_ros_map(directory, found)]
-    if Format.GRAPH in asked:
+    if ExportFormat.GRAPH in asked:
         write_scene_graph(directory / "scene_graph.json", room, found)
         written.append(directory / "scene_graph.json")
     return written
 
 
-def _check_known(run: Path, room: Room, formats: Sequence[Format]) -> None:
+def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) -> None:
     """Raises DataError where a run does not tell what a format needs; surfaces do without."""
     flat = [one.value for one in formats if one not in MESHES]
     if not room.up_known and flat:
         raise DataError(f"{run} does not tell which way is up, which {flat[0]} needs: --up X Y Z --floor M say it")
     if not room.up_known:
         log.warning("%s does not tell which way is up: the world's z is taken for it; --up X Y Z says another", run)
-    elif not room.floor_known and Format.FLOORPLAN in formats:
+    elif not room.floor_known and ExportFormat.FLOORPLAN in formats:
         raise DataError(f"{run} does not tell how high the floor is, which floorplan needs: --floor M says it")
-    elif not room.floor_known and Format.GRAPH in formats:
+    elif not room.floor_known and ExportFormat.GRAPH in formats:
         log.warning("%s does not tell how high the floor is: the graph is without floor, walls and rooms", run)
 
 
-def _write_surfaces(room: Room, formats: Sequence[Format], directory: Path, chosen: Chosen) -> list[Path]:
+def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
     """The scene, unless some objects only are asked for, and each object by itself."""
     files: list[tuple[str, list[Part]]] = []
     if not chosen.objects:
@@ -153,12 +153,12 @@ def _write_surfaces(room: Room, formats: Sequence[Format], directory: Path, chos
     return written
 
 
-def _writer(kind: Format, chosen: Chosen) -> Callable[[Path, Sequence[Part]], None]:
-    if kind is Format.PLY:
+def _writer(kind: ExportFormat, chosen: Chosen) -> Callable[[Path, Sequence[Part]], None]:
+    if kind is ExportFormat.PLY:
         return lambda path, shown: write_parts_ply(path, shown, chosen.coloring)
-    if kind is Format.OBJ:
+    if kind is ExportFormat.OBJ:
         return lambda path, shown: write_parts_obj(path, shown, chosen.coloring)
-    if kind is Format.USD:
+    if kind is ExportFormat.USD:
         return lambda path, shown: write_usd(path, shown, chosen.coloring, chosen.collision)
     return lambda path, shown: _write_glb(path, shown, chosen.coloring)
 

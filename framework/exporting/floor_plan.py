@@ -17,7 +17,7 @@ from matplotlib.transforms import Bbox
 from framework.data import UInt8
 from framework.exporting.geojson import outline
 from framework.exporting.occupancy import Plan
-from framework.exporting.upright_room import Room, RoomObject
+from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.atomic_write import written_whole
 from framework.rendering.palette import FAINT_INK, INK, PAPER
 
@@ -42,7 +42,7 @@ MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1
 """How a name moves aside, in its own widths and heights."""
 
 
-def write_floor_plan(path: Path, room: Room, plan: Plan, robot_height: float) -> None:
+def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
     """Draws the plan to a PNG; the same room gives the same bytes."""
     with warnings.catch_warnings(), written_whole(path) as temporary:
         warnings.filterwarnings(
@@ -61,7 +61,7 @@ def tones(plan: Plan) -> UInt8:
     return image
 
 
-def _drawn(room: Room, plan: Plan, robot_height: float) -> Figure:
+def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
     left, right, bottom, top = plan.extent
     scale = LONGER_SIDE / max(right - left, top - bottom)
     width, height = max((right - left) * scale, SHORTEST_SIDE), max((top - bottom) * scale, SHORTEST_SIDE / 2)
@@ -87,7 +87,7 @@ def _drawn(room: Room, plan: Plan, robot_height: float) -> Figure:
     return figure
 
 
-def _draw_outlines(axes: Axes, room: Room) -> None:
+def _draw_outlines(axes: Axes, room: UprightRoom) -> None:
     """The hulls of the objects, the low ones first, so that what stands on another is seen."""
     for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
         dark = _share([round(DARKER * channel) for channel in one.color.tolist()])

@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 
 from framework.data import Float64
-from framework.exporting.upright_room import Room, RoomObject
+from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.json_file import write_json
 
 COORDINATES = "metres in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."
 DIGITS = 4  # behind the point, of metres
 
 
-def write_geojson(path: Path, room: Room) -> None:
+def write_geojson(path: Path, room: UprightRoom) -> None:
     """Writes a polygon for each object: the outline of its convex hull, counterclockwise."""
     write_json(
         path,
@@ -32,14 +32,14 @@ def write_geojson(path: Path, room: Room) -> None:
     )
 
 
-def outline(room: Room, one: RoomObject) -> Float64:
+def outline(room: UprightRoom, one: RoomObject) -> Float64:
     """(N, 2) m, the corners of an object's hull on the floor, counterclockwise; of its box where it has no area."""
     points = room.mesh.vertices[one.vertices, :2]
     hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)
     return hull if len(hull) >= 3 else one.footprint
 
 
-def _feature(room: Room, one: RoomObject) -> dict[str, Any]:
+def _feature(room: UprightRoom, one: RoomObject) -> dict[str, Any]:
     ring = np.round(outline(room, one), DIGITS).tolist()
     return {
         "type": "Feature",

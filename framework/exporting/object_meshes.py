@@ -10,7 +10,7 @@ import numpy as np
 from framework.data import Float64, InstanceMesh
 from framework.exporting.decimation import decimated
 from framework.exporting.submeshes import corners_of, submesh
-from framework.exporting.upright_room import Room, RoomObject
+from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.geometry import inverse, transform
 from framework.runtime.progress import Progress
 
@@ -35,12 +35,12 @@ class Part:
         return replace(self, T_room_part=np.eye(4))
 
 
-def parts(room: Room, triangles: int | None = None) -> list[Part]:
+def parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
     """The rest of the room, then its objects; together with about so many triangles, None = as many as there are."""
     return _with_fewer([rest(room), *(object_part(room, one) for one in room.objects)], triangles)
 
 
-def object_parts(room: Room, triangles: int | None = None) -> list[Part]:
+def object_parts(room: UprightRoom, triangles: int | None = None) -> list[Part]:
     """Each object, with at most about so many triangles."""
     found = [object_part(room, one) for one in room.objects]
     if triangles is None:
@@ -48,7 +48,7 @@ def object_parts(room: Room, triangles: int | None = None) -> list[Part]:
     return _decimated(found, [triangles] * len(found))
 
 
-def object_part(room: Room, one: RoomObject) -> Part:
+def object_part(room: UprightRoom, one: RoomObject) -> Part:
     """An object's mesh in its own frame: upright, along the sides of its box, whose base has its middle at 0."""
     T_room_part = np.eye(4)
     T_room_part[:3, :3] = one.box.rotation
@@ -58,7 +58,7 @@ def object_part(room: Room, one: RoomObject) -> Part:
     return Part(replace(mesh, vertices=placed), T_room_part, one)
 
 
-def rest(room: Room) -> Part:
+def rest(room: UprightRoom) -> Part:
     """What is of none of the room's objects, with the triangles between them, so that there is no gap."""
     owner = _marked(room.mesh, room.objects)
     corners = owner[room.mesh.triangles]

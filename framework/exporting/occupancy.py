@@ -23,7 +23,7 @@ import numpy as np
 from framework.data import Bool, Float64, Int32, Int64
 from framework.errors import DataError
 from framework.exporting.surface_points import SurfacePoints, surface_points
-from framework.exporting.upright_room import Room
+from framework.exporting.upright_room import UprightRoom
 from framework.geometry import inverse, project, transform
 from framework.queries.changes import EYE, LOOKS
 from framework.rendering.rasterizer import Rasterizer
@@ -65,7 +65,7 @@ class Plan:
         return x, x + columns * self.resolution, y, y + rows * self.resolution
 
 
-def plan(room: Room, resolution: float, robot_height: float) -> Plan:
+def plan(room: UprightRoom, resolution: float, robot_height: float) -> Plan:
     """The floor of a room, whose height is known, with cells of `resolution` m, for a robot of `robot_height` m.
 
     Raises DataError where nothing was mapped, or there are too many cells.
@@ -92,7 +92,7 @@ def plan(room: Room, resolution: float, robot_height: float) -> Plan:
     return replace(drawn, free=_free(room, drawn, robot_height))
 
 
-def _free(room: Room, drawn: Plan, robot_height: float) -> Bool:
+def _free(room: UprightRoom, drawn: Plan, robot_height: float) -> Bool:
     """(H, W), see the module."""
     free = drawn.floor & ~drawn.occupied
     rows, columns = np.nonzero(free)
@@ -104,7 +104,7 @@ def _free(room: Room, drawn: Plan, robot_height: float) -> Bool:
     return free
 
 
-def looked_through(room: Room, places: Float64) -> Bool:
+def looked_through(room: UprightRoom, places: Float64) -> Bool:
     """(P,) whether a camera of the run saw a surface behind a place (P, 3) m of the room, and none before it."""
     through = np.zeros(len(places), np.bool_)
     rasterizer = Rasterizer(room.mesh.vertices, room.mesh.triangles)

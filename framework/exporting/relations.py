@@ -18,7 +18,7 @@ from scipy.spatial import KDTree
 from framework.data import Bool, Float32, Float64, Int64
 from framework.exporting.occupancy import Plan
 from framework.exporting.surface_points import surface_points
-from framework.exporting.upright_room import Room, RoomObject
+from framework.exporting.upright_room import RoomObject, UprightRoom
 
 SPACING = 0.02  # m, of the points that stand for a surface
 CELL = 0.03  # m, of footprints
@@ -48,7 +48,7 @@ class Relation:
     measures: Mapping[str, float] = field(default_factory=dict)  # m
 
 
-def relations(room: Room, plan: Plan | None) -> list[Relation]:
+def relations(room: UprightRoom, plan: Plan | None) -> list[Relation]:
     """All relations of a room's objects, by their ids. Without a plan nothing is said of floor and walls."""
     found = surface_points(room, SPACING)
     things = [_thing(room, one, found.points, found.owner == one.id, found.level) for one in room.objects]
@@ -97,7 +97,7 @@ class _Thing:
         return {(i + di, j + dj) for i, j in self.foot for di in steps for dj in steps} - self.foot
 
 
-def _thing(room: Room, one: RoomObject, points: Float32, own: Bool, level: Bool) -> _Thing:
+def _thing(room: UprightRoom, one: RoomObject, points: Float32, own: Bool, level: Bool) -> _Thing:
     if own.any():
         return _Thing(one.id, one, points[own], level[own])
     vertices = room.mesh.vertices[one.vertices]  # of too few for a triangle

@@ -10,18 +10,18 @@ import numpy as np
 from framework.exporting.occupancy import Plan
 from framework.exporting.relations import Relation, relations
 from framework.exporting.rooms import Rooms, rooms
-from framework.exporting.upright_room import Room, RoomObject
+from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.json_file import write_json
 
 DIGITS = 4  # behind the point, of metres
 
 
-def write_scene_graph(path: Path, room: Room, plan: Plan | None) -> None:
+def write_scene_graph(path: Path, room: UprightRoom, plan: Plan | None) -> None:
     """Writes the graph of a room; without a plan, as where the floor is not known, without floor, walls and rooms."""
     write_json(path, scene_graph(room, plan))
 
 
-def scene_graph(room: Room, plan: Plan | None) -> dict[str, Any]:
+def scene_graph(room: UprightRoom, plan: Plan | None) -> dict[str, Any]:
     """The graph as JSON has it."""
     divided = rooms(plan) if plan is not None else None
     nodes = [_object_node(one) for one in room.objects]
@@ -60,7 +60,7 @@ def _room_nodes(divided: Rooms) -> list[dict[str, Any]]:
     ]
 
 
-def _edges(room: Room, found: list[Relation]) -> list[dict[str, Any]]:
+def _edges(room: UprightRoom, found: list[Relation]) -> list[dict[str, Any]]:
     names: dict[int | str, str] = {one.id: one.name for one in room.objects}
     return [
         {
@@ -73,7 +73,7 @@ def _edges(room: Room, found: list[Relation]) -> list[dict[str, Any]]:
     ]
 
 
-def _room_edges(room: Room, divided: Rooms) -> list[dict[str, Any]]:
+def _room_edges(room: UprightRoom, divided: Rooms) -> list[dict[str, Any]]:
     """Which room each object is in, and which rooms have a door between them."""
     inside = [(one, divided.of(room.mesh.vertices[one.vertices, :2].astype(np.float64))) for one in room.objects]
     placed = [{"source": one.name, "relation": "in", "target": f"room_{k}"} for one, k in inside if k]

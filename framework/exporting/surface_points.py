@@ -8,7 +8,7 @@ import numpy as np
 
 from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.errors import DataError
-from framework.exporting.upright_room import Room
+from framework.exporting.upright_room import UprightRoom
 
 MOST_POINTS = 2**24  # of a room; one of 100 m^2 of surface has 4 million, a voxel of 1 cm giving 2 triangles
 LEVEL = float(np.cos(np.radians(30.0)))  # z of a normal, from which on a surface is one that things may stand on
@@ -34,7 +34,7 @@ class SurfacePoints:
         return np.asarray(np.abs(self.normal_z) < UPRIGHT)
 
 
-def surface_points(room: Room, spacing: float) -> SurfacePoints:
+def surface_points(room: UprightRoom, spacing: float) -> SurfacePoints:
     """The middles of a room's triangles, each cut into pieces whose sides are at most `spacing` m.
 
     Raises DataError where that would be more than MOST_POINTS.

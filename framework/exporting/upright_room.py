@@ -77,7 +77,7 @@ class RoomObject:
 
 
 @dataclass(frozen=True)
-class Room:
+class UprightRoom:
     """A stored run's surface and objects."""
 
     mesh: InstanceMesh  # vertices in the room; labels of all objects, also of those that are not among `objects`
@@ -91,7 +91,7 @@ class Room:
     def surface(self) -> Surface:
         return Surface(self.mesh.vertices, self.mesh.triangles)
 
-    def chosen(self, asked: Sequence[str], min_confidence: float) -> Room:
+    def chosen(self, asked: Sequence[str], min_confidence: float) -> UprightRoom:
         """With the objects that are asked for, by id or class, and with a class those of some confidence; all = ().
 
         Raises DataError for an object or a class that there is not.
@@ -119,7 +119,7 @@ def plain_name(class_name: str, key: int) -> str:
     return f"{plain if plain[:1].isalpha() else f'object_{plain}'.rstrip('_')}_{key}"
 
 
-def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> Room:
+def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None = None) -> UprightRoom:
     """The room of a run, whole or partial; `up` (3,) and `floor` (m along up) say what its record does not tell.
 
     Raises DataError where there is no run, or its files cannot be read or are not of one run.
@@ -135,7 +135,7 @@ def read_room(run: Path, up: Sequence[float] | None = None, floor: float | None 
     T_room_world = upright(UP if direction is None else direction, height or 0.0)
     _, poses = read_tum(run / TRAJECTORY) if is_there(run / TRAJECTORY) else (None, np.zeros((0, 4, 4)))
     placed = replace(mesh, vertices=transform(T_room_world, mesh.vertices.astype(np.float64)).astype(np.float32))
-    return Room(
+    return UprightRoom(
         mesh=placed,
         objects=objects_of(placed, instances),
         poses=T_room_world @ poses,

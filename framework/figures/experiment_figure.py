@@ -19,7 +19,7 @@ from framework.figures.map_figure import CaptionedLine, map_figure, panel_size
 from framework.figures.map_panels import panel_line
 from framework.figures.stage_times import WINDOW, MeanTimes, stage_times_figure
 from framework.runs.reevaluation import Truth
-from framework.runs.run_rows import Row, Run, natural, rows_of
+from framework.runs.run_rows import Run, RunRow, natural, rows_of
 from framework.runs.stored_map import StoredMap
 from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
 from framework.runs.sweep_file import SWEEP
@@ -50,7 +50,7 @@ class Pictured:
     """The runs that a picture shows."""
 
     choice: FigureChoice
-    rows: Mapping[str, Row | None]  # by what it is called; None = no run of it is complete
+    rows: Mapping[str, RunRow | None]  # by what it is called; None = no run of it is complete
     incomplete: Sequence[Incomplete]
 
     @classmethod
@@ -78,9 +78,9 @@ class Pictured:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
             raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
         found = rows_of(records, choice.over, overrides)
-        rows: dict[str, Row | None] = {}
+        rows: dict[str, RunRow | None] = {}
         for system in dict.fromkeys([*overrides, *(row.system for row in found)]):
-            of_system: dict[str, Row | None] = {choice.called(row): row for row in found if row.system == system}
+            of_system: dict[str, RunRow | None] = {choice.called(row): row for row in found if row.system == system}
             rows |= of_system or {choice.names.get(system, system): None}
         return cls(choice, rows, incomplete)
 
@@ -126,7 +126,7 @@ def _stage_times(pictured: Pictured) -> Page:
     return stage_times_figure(means, f"{note} {_origin(pictured.records)}")
 
 
-def _times_of(row: Row | None) -> dict[Run, StageTimes]:
+def _times_of(row: RunRow | None) -> dict[Run, StageTimes]:
     """Of the runs that can be read."""
     records = row.records if row else {}
     read = {run: _if_readable(_times, record) for run, record in records.items()}

@@ -7,7 +7,7 @@ from typing import Any
 
 from framework.config.validation import checked_block
 from framework.errors import ConfigError
-from framework.runs.run_rows import Row
+from framework.runs.run_rows import RunRow
 
 KINDS = ("stage_times", "maps")
 
@@ -36,7 +36,7 @@ class FigureChoice:
         """What a config's `figure` describes. Raises ConfigError for keys and types that it does not have."""
         return cls(**checked_block(cls, "figure", node))
 
-    def called(self, row: Row) -> str:
+    def called(self, row: RunRow) -> str:
         """What a row is called in the picture."""
         return ", ".join([self.names.get(row.system, row.system), *row.variant])
 

@@ -25,7 +25,7 @@ from framework.figures.figure_page import (
     text_width,
 )
 from framework.figures.map_panels import Name, Panel, PanelLine, Window
-from framework.rendering.camera_path import CameraPath
+from framework.rendering.camera_path import ProjectedPath
 
 HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
 LEFT_MM, RIGHT_MM = 3.5, 0.3  # beside the panels
@@ -100,7 +100,7 @@ def _draw(axes: Axes, panel: Panel | None, otherwise: str) -> None:
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
 
 
-def _draw_path(axes: Axes, path: CameraPath) -> None:
+def _draw_path(axes: Axes, path: ProjectedPath) -> None:
     """Thin where something stands before it."""
     shades = path.shades() / 255.0
     segments = [path.pixels[k : k + 2] for k in range(len(path.pixels) - 1)]

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from framework.data import Camera, Float64, Int32, SceneTruth, UInt8
-from framework.rendering.camera_path import CameraPath
+from framework.rendering.camera_path import ProjectedPath
 from framework.rendering.lit_view import LitView
 from framework.rendering.object_colors import ObjectColors, relabeled
 from framework.rendering.surface import FrontSides, Surface
@@ -37,7 +37,7 @@ class Panel:
 
     image: UInt8  # (H, W, 3) RGB
     names: Sequence[Name]  # the largest first
-    path: CameraPath | None = None  # None = it says nothing that the other columns do not
+    path: ProjectedPath | None = None  # None = it says nothing that the other columns do not
 
 
 @dataclass(frozen=True)
@@ -135,7 +135,7 @@ class _Column:
 
     def seen_from(self, camera: Camera, T_world_camera: Float64) -> _View:
         lit = LitView(self.surface, camera, T_world_camera)
-        path = CameraPath.of(self.poses, camera, T_world_camera, lit.hits)
+        path = ProjectedPath.of(self.poses, camera, T_world_camera, lit.hits)
         return _View(self, lit, lit.hits.nearest(self.objects), path)
 
 
@@ -144,7 +144,7 @@ class _View:
     column: _Column
     lit: LitView
     objects: Int32  # (H, W)
-    path: CameraPath
+    path: ProjectedPath
 
     def panel(self, colors: ObjectColors, with_path: bool) -> Panel:
         image = self.lit.in_instances(self.column.colors, self.column.objects, colors.color_of)

@@ -18,7 +18,7 @@ from framework.data import Detections, Float64, Frame, Pose
 from framework.errors import in_one_line
 from framework.interfaces import SceneMap
 from framework.live_view.rate_limit import Pace
-from framework.live_view.updates import Drawing, FrameNote, MapSnapshot, Picture
+from framework.live_view.updates import Drawing, FrameNote, FrameUpdate, MapSnapshot
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ class Background:
         self._lock = threading.Lock()  # of what follows
         self._notes: list[FrameNote] = []
         self._faults: list[str] = []
-        self._picture: Picture | None = None
+        self._picture: FrameUpdate | None = None
         self._snapshot: MapSnapshot | None = None  # that nobody has begun to draw
         self._ending = self._failed = False
         self._wanted = threading.Event()
@@ -62,7 +62,7 @@ class Background:
                 return
             self._notes.append(note)
             if self._frames % self._every == 0:
-                self._picture = Picture(frame, detections, pose)
+                self._picture = FrameUpdate(frame, detections, pose)
         self._frames += 1
         if self._snapshot is None and self._snapshots.due() and self._maps.due():
             self._take_snapshot()

@@ -17,7 +17,7 @@ from framework.live_view import rerun_layout as at
 from framework.live_view.instance_colors import InstanceColors
 from framework.live_view.mesh_regions import MeshRegions
 from framework.live_view.seen_instances import seen_instances
-from framework.live_view.updates import FrameNote, MapSnapshot, Picture
+from framework.live_view.updates import FrameNote, FrameUpdate, MapSnapshot
 from framework.mapping.instances.instance_list import box_around, vertices_by_id
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ class RerunDrawing:
         recording.log(at.STAGE_MS, rerun.SeriesLines(names=stages, colors=colors), static=True)
         self._name_masks()
 
-    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: Picture | None) -> None:
+    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
         for note in notes:
             self._note(note)
         self._draw_times(notes)
@@ -155,7 +155,7 @@ class RerunDrawing:
             rows = self._rr.Scalars.columns(scalars=np.ravel(ms)).partition([len(at.STAGE_COLORS)] * len(notes))
             self._recording.send_columns(at.STAGE_MS, indexes=[frames, seconds], columns=rows)
 
-    def _draw_picture(self, picture: Picture) -> None:
+    def _draw_picture(self, picture: FrameUpdate) -> None:
         frame, stride = picture.frame, self._stride
         color = frame.color
         if stride > 1:
@@ -169,7 +169,7 @@ class RerunDrawing:
         self._recording.log(at.DEPTH, depth)
         self._draw_found(picture)
 
-    def _draw_found(self, picture: Picture) -> None:
+    def _draw_found(self, picture: FrameUpdate) -> None:
         """The masks in the colours of their instances, and their names."""
         found, stride = picture.detections, self._stride
         ids = np.zeros(len(found), np.int32)

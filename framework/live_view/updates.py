@@ -20,7 +20,7 @@ class FrameNote:
 
 
 @dataclass(frozen=True)
-class Picture:
+class FrameUpdate:
     """A frame with what was found in it."""
 
     frame: Frame
@@ -42,7 +42,7 @@ class MapSnapshot:
 class Drawing(Protocol):
     """Where the news go; called in one thread, which reads no map."""
 
-    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: Picture | None) -> None:
+    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
         """The frames since the last call, in order; why others were skipped; the newest picture, None = no new one."""
 
     def draw_map(self, snapshot: MapSnapshot) -> None:

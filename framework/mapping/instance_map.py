@@ -30,7 +30,7 @@ from framework.mapping.storage.map_file import (
     write_map,
 )
 from framework.mapping.voxels.integration_parameters import pinhole
-from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 
@@ -117,7 +117,7 @@ class InstanceMap(SceneMap):
     def mesh(self) -> InstanceMesh:
         return self.volume.mesh(self._labeled)
 
-    def _labeled(self, surface: Surface) -> InstanceMesh:
+    def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
         grid, counts = self.volume.voxels.grid, self.confirmation.counts(self.table)
         colors, instance_ids, class_ids = vertex_labels(grid, self.labels.evidence, counts, surface)
         too_small = self.confirmation.too_small(instance_ids, self.volume.voxel_size)

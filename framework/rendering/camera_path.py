@@ -16,14 +16,14 @@ PATH_START, PATH_END = (40, 110, 220), (235, 90, 40)
 
 
 @dataclass(frozen=True)
-class CameraPath:
+class ProjectedPath:
     """Where a moving camera was, in the pixels of another one that looks at the scene."""
 
     pixels: Float64  # (F, 2) u v
     hidden: Bool  # (F,) behind the surface
 
     @classmethod
-    def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> CameraPath:
+    def of(cls, poses: Float64, camera: Camera, T_world_camera: Float64, hits: Hits) -> ProjectedPath:
         """The positions of `poses` (F, 4, 4) that lie before `camera`, which sees the surface as `hits`."""
         positions = poses[:, :3, 3]
         points = transform(inverse(T_world_camera), positions)

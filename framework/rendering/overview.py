@@ -11,7 +11,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from framework.data import Float64, InstanceMesh, Int32, UInt8
 from framework.files.atomic_write import written_whole
-from framework.rendering.camera_path import CameraPath
+from framework.rendering.camera_path import ProjectedPath
 from framework.rendering.labels import draw_labels, place_labels, text_size
 from framework.rendering.lit_view import LitView
 from framework.rendering.palette import FAINT_INK, INK, PAPER, instance_colors
@@ -61,7 +61,7 @@ def _panels(
     surface = Surface.seen_from(mesh.vertices, mesh.triangles, poses)
     camera, T_world_camera = best_view(surface, ids, poses, PANEL_WIDTH, PANEL_HEIGHT)
     view = LitView(surface, camera, T_world_camera)
-    path = CameraPath.of(poses, camera, T_world_camera, view.hits)
+    path = ProjectedPath.of(poses, camera, T_world_camera, view.hits)
     left = Image.fromarray(view.in_colors(mesh.colors))
     right = Image.fromarray(view.in_instances(mesh.colors, ids, colors))
     path.draw(left)

@@ -21,7 +21,7 @@ from framework.reporting.object_table import object_data, object_table
 from framework.reporting.pictures import Photographer, Picture, webp_url
 from framework.reporting.progress_pictures import GrowthPicture, growth_pictures
 from framework.reporting.run_contents import RunContents
-from framework.reporting.run_source import Recording, TruePath
+from framework.reporting.run_source import RunSource, TruePath
 from framework.reporting.source_frames import Footage
 from framework.reporting.time_charts import growth, stage_areas, stage_rows
 from framework.reporting.trajectory_chart import (
@@ -49,7 +49,7 @@ class RunReport:
 
     contents: RunContents
     scene: MapScene | None  # None = nothing was mapped
-    recording: Recording
+    recording: RunSource
     pictures: Mapping[int, Picture]
     true_path: TruePath | None
     check: TruthCheck | None
@@ -58,7 +58,7 @@ class RunReport:
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
         """Looks at the recording again, where it can be read."""
-        recording = Recording.of(contents)
+        recording = RunSource.of(contents)
         chosen = spread_out(len(contents.poses))
         footage = Footage.of(recording, chosen, recording.camera or NOT_CAMERA)
         scene = MapScene.of(contents, footage)

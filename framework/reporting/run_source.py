@@ -21,7 +21,7 @@ SAME_TIME_S = 1e-5  # trajectories are stored with nine digits of a second, of w
 
 
 @dataclass(frozen=True)
-class Recording:
+class RunSource:
     """A run's video, and which of its frames were tracked."""
 
     contents: RunContents
@@ -29,7 +29,7 @@ class Recording:
     why_not: str  # why there is no video, "" = there is one
 
     @classmethod
-    def of(cls, contents: RunContents) -> Recording:
+    def of(cls, contents: RunContents) -> RunSource:
         """Opened by the run's config. A video that cannot be read is none: a report is made without it."""
         config = contents.record.config
         if any("${" in str(value) for _, value in leaves({"dataset": config.get("dataset")})):

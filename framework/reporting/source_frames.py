@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from framework.data import Camera, Float64, UInt8
-from framework.reporting.run_source import Recording
+from framework.reporting.run_source import RunSource
 
 LARGEST = 640  # px, the width of the pictures that are kept
 BLURRED = 0.3  # the least clarity: a blurred picture of an object is better than one from far away
@@ -26,7 +26,7 @@ class Footage:
     clarity: Mapping[int, float]  # in [BLURRED, 1], 1 = as sharp as half of them, or sharper
 
     @classmethod
-    def of(cls, recording: Recording, chosen: Sequence[int], camera: Camera) -> Footage:
+    def of(cls, recording: RunSource, chosen: Sequence[int], camera: Camera) -> Footage:
         """Reads the frames of the chosen poses."""
         small = camera.scaled(min(1.0, LARGEST / camera.width))
         images, frames, positions, sharpness = {}, {}, {}, {}

@@ -53,7 +53,7 @@ class Mean:
 
 
 @dataclass(frozen=True)
-class Row:
+class RunRow:
     """Runs that differ in nothing but the keys that are averaged over."""
 
     name: str
@@ -87,7 +87,7 @@ class Row:
     def mean(self, column: str) -> Mean:
         return Mean.of(self.values(column).values())
 
-    def differences(self, base: Row, column: str) -> dict[Run, float]:
+    def differences(self, base: RunRow, column: str) -> dict[Run, float]:
         """This row's figure less the base's, for the runs that both rows have.
 
         Runs of one seed have the same room and the same detections: most of what varies between seeds cancels.
@@ -98,7 +98,7 @@ class Row:
 
 def rows_of(
     records: Sequence[Record], over: Sequence[str], overrides: Mapping[str, Sequence[str]] | None = None
-) -> list[Row]:
+) -> list[RunRow]:
     """The rows that `records` make: those named in `overrides` first, the others by name.
 
     A row is what an experiment calls `row`, else what was chosen: the stages' options and the parameters in which the
@@ -131,9 +131,9 @@ def rows_of(
     return [_row(system, variant, rows[system, variant]) for system, variant in order]
 
 
-def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -> Row:
+def _row(system: str, variant: tuple[str, ...], records: Mapping[Run, Record]) -> RunRow:
     name = ", ".join([system, *variant] if system else variant) or "all runs"
-    return Row(name, dict(sorted(records.items(), key=lambda item: natural(item[0]))), system, variant)
+    return RunRow(name, dict(sorted(records.items(), key=lambda item: natural(item[0]))), system, variant)
 
 
 def _changed(override: str) -> str:

@@ -18,7 +18,7 @@ Numbers = npt.NDArray[np.floating] | npt.NDArray[np.integer]
 
 
 @dataclass(frozen=True)
-class Hits:
+class RayHits:
     """Where rays met the surface, with the shape of the rays in front."""
 
     distance: Float32  # in lengths of the ray's direction, inf = nothing was met
@@ -38,11 +38,11 @@ class RayCaster:
             _tensor(np.ascontiguousarray(vertices, np.float32)), _tensor(np.ascontiguousarray(triangles, np.uint32))
         )
 
-    def cast(self, rays: Float32) -> Hits:
+    def cast(self, rays: Float32) -> RayHits:
         """The first hits of rays (..., 6), origin and direction."""
         answer = self._scene.cast_rays(_tensor(np.ascontiguousarray(rays)), get_num_threads())
         triangle = answer["primitive_ids"].numpy().view(np.int32)  # Embree's "nothing" is 2^32 - 1, which is -1
-        return Hits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
+        return RayHits(answer["t_hit"].numpy(), triangle, answer["primitive_uvs"].numpy())
 
     def occluded(self, origins: Float32, ends: Float32) -> Bool:
         """Whether something lies between the points (..., 3) and (..., 3), apart from what touches the ends."""

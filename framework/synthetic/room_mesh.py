@@ -16,18 +16,18 @@ LONGEST_EDGE = 0.02  # m
 
 
 @dataclass(frozen=True)
-class LabeledMesh:
+class RoomMesh:
     """Triangles whose vertices belong to one instance each."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3), counter-clockwise seen from outside
     instance_ids: Int32  # (V,), 0 = floor, wall or ceiling
 
-    def only(self, kept: Bool) -> LabeledMesh:
+    def only(self, kept: Bool) -> RoomMesh:
         """The vertices `kept` (V,), in their order, and the triangles between them."""
         number = np.cumsum(kept, dtype=np.int32) - 1
         triangles = self.triangles[kept[self.triangles].all(axis=1)]
-        return LabeledMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
+        return RoomMesh(self.vertices[kept], number[triangles], self.instance_ids[kept])
 
 
 def visible_mesh(
@@ -37,7 +37,7 @@ def visible_mesh(
     poses: Iterable[Float64],
     reach: tuple[float, float],
     longest_edge: float = LONGEST_EDGE,
-) -> LabeledMesh:
+) -> RoomMesh:
     """The surfaces, as far as they are seen from one of the poses T_world_camera at a depth within `reach` (m, m).
 
     `caster` has the triangles of `surfaces`. What no depth camera reads is not seen, nor what lies behind it.
@@ -46,14 +46,14 @@ def visible_mesh(
     return mesh.only(seen_from(mesh.vertices, caster, camera, poses, reach, surfaces.unreadable))
 
 
-def tessellate(surfaces: Surfaces, longest_edge: float) -> LabeledMesh:
+def tessellate(surfaces: Surfaces, longest_edge: float) -> RoomMesh:
     """The surfaces in triangles whose edges are at most `longest_edge` m long.
 
     A longer edge is halved until it is short enough, in all triangles that have it, so that no gaps come about.
     """
     instance_ids = np.zeros(len(surfaces.vertices), np.int32)
     instance_ids[surfaces.triangles.ravel()] = np.repeat(surfaces.instance_ids, 3)
-    mesh = _welded(LabeledMesh(surfaces.vertices, surfaces.triangles, instance_ids))
+    mesh = _welded(RoomMesh(surfaces.vertices, surfaces.triangles, instance_ids))
     vertices, instance_ids, open_triangles = mesh.vertices, mesh.instance_ids, mesh.triangles
     done: list[Int32] = []
     while len(open_triangles):
@@ -69,10 +69,10 @@ def tessellate(surfaces: Surfaces, longest_edge: float) -> LabeledMesh:
         vertices = np.concatenate([vertices, (vertices[low] + vertices[high]) / 2])
         instance_ids = np.concatenate([instance_ids, instance_ids[low]])
         open_triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return _welded(LabeledMesh(vertices, np.concatenate(done), instance_ids))
+    return _welded(RoomMesh(vertices, np.concatenate(done), instance_ids))
 
 
-def _welded(mesh: LabeledMesh) -> LabeledMesh:
+def _welded(mesh: RoomMesh) -> RoomMesh:
     """With vertices of one instance at exactly the same place made one, and without triangles that have no area."""
     rows = np.empty((len(mesh.vertices), 4), np.int32)
     rows[:, :3] = (mesh.vertices + np.float32(0)).view(np.int32)  # -0 is at the same place as 0
@@ -85,7 +85,7 @@ def _welded(mesh: LabeledMesh) -> LabeledMesh:
     triangles = number[mesh.triangles]
     a, b, c = triangles.T
     kept = order[new]
-    return LabeledMesh(
+    return RoomMesh(
         mesh.vertices[kept], triangles[(a != b) & (b != c) & (c != a)], np.ascontiguousarray(mesh.instance_ids[kept])
     )
 

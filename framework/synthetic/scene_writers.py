@@ -31,14 +31,14 @@ from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import written_whole
 from framework.files.json_file import read_json
 from framework.synthetic.benchmark import SceneSpec
-from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
+from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
 
 FRAMES_AT_ONCE = 8  # few, so that all processes end at about the same time
 
 Piece = Callable[[SceneNNScene], int]  # writes some files, returns how many of them are frames
 
 
-def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Recording, jobs: int) -> None:
+def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: BenchmarkSettings, jobs: int) -> None:
     """Writes the scenes into `root`, by `jobs` processes; what is there of the same recording is kept.
 
     Raises ConfigError when `root` holds something else, DataError when a file or a process fails.
@@ -72,7 +72,7 @@ def write_scenes(root: Path, specs: Mapping[str, SceneSpec], recording: Recordin
                 last[pool].running -= 1
 
 
-def _begin(root: Path, recording: Recording) -> None:
+def _begin(root: Path, recording: BenchmarkSettings) -> None:
     """The files that all scenes share; refuses a folder that holds anything else."""
     made_by = root / MADE_BY
     wanted = {"generation": GENERATION, **asdict(recording)}
@@ -98,7 +98,7 @@ def _begin(root: Path, recording: Recording) -> None:
 class _Scene:
     """What is left to write of one scene. The trajectory comes last: where it is, the scene is complete."""
 
-    def __init__(self, folder: Path, spec: SceneSpec, recording: Recording) -> None:
+    def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.spec = folder, spec
         self.running = 0  # pieces being written
         self.touched = False
@@ -182,7 +182,7 @@ def _end_with_parent() -> None:
 _in_memory: list[SceneNNScene] = []  # of this process: the scene that it wrote last, if any
 
 
-def _write(folder: Path, spec: SceneSpec, recording: Recording, piece: Piece) -> int:
+def _write(folder: Path, spec: SceneSpec, recording: BenchmarkSettings, piece: Piece) -> int:
     """Writes a piece of the scene, in one of the processes."""
     with _interruptible():
         if not _in_memory or _in_memory[0].folder != folder:

@@ -67,7 +67,7 @@ _NYU_CLASSES = {
 
 
 @dataclass(frozen=True)
-class Recording:
+class BenchmarkSettings:
     """What all scenes of one benchmark folder have in common."""
 
     seed: int = 0
@@ -105,7 +105,7 @@ class Recording:
 class SceneNNScene:
     """One furnished room and the walk through it, written piece by piece to its folder, in any order."""
 
-    def __init__(self, folder: Path, spec: SceneSpec, recording: Recording) -> None:
+    def __init__(self, folder: Path, spec: SceneSpec, recording: BenchmarkSettings) -> None:
         self.folder, self.recording = folder, recording
         for kind in ("image", "depth"):
             (folder / kind).mkdir(parents=True, exist_ok=True)

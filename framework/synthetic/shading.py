@@ -34,7 +34,7 @@ class LitSurfaces(NamedTuple):
     table: Float32  # (M, 14), see textures.material_table
 
 
-class View(NamedTuple):
+class Viewpoint(NamedTuple):
     """From where the kernels look."""
 
     T_world_camera: Float64
@@ -44,7 +44,7 @@ class View(NamedTuple):
     cy: float
 
     @classmethod
-    def of(cls, camera: Camera, T_world_camera: Float64) -> View:
+    def of(cls, camera: Camera, T_world_camera: Float64) -> Viewpoint:
         T = np.ascontiguousarray(T_world_camera, np.float64)
         return cls(T, float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy))
 
@@ -72,7 +72,7 @@ def shade(
 
     Pixels at the border between two parts become the mean of several rays of `caster`.
     """
-    view = View.of(camera, T_world_camera)
+    view = Viewpoint.of(camera, T_world_camera)
     light, incidence = np.empty((*camera.shape, 3), np.float32), np.empty(camera.shape, np.float32)
     _shade(surfaces, view, buffer.triangle, buffer.depth, buffer.uv, light, incidence)
     v, u = np.nonzero(edges(buffer, surfaces.parts))
@@ -100,7 +100,7 @@ def edges(buffer: VisibilityBuffer, parts: Int32) -> Bool:
 
 @njit(cache=True, nogil=True)
 def _shade(
-    s: LitSurfaces, view: View, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
+    s: LitSurfaces, view: Viewpoint, triangle: Int32, depth: Float32, uv: Float32, light: Float32, incidence: Float32
 ) -> None:
     """Writes the linear light (H, W, 3) that each pixel receives, and the cosines (H, W); black where nothing is."""
     texture, irradiance, triangles, normals, materials, _, table = s
@@ -187,7 +187,7 @@ def _edges(triangle: Int32, parts: Int32, depth: Float32) -> Bool:
 @njit(cache=True, nogil=True)
 def _smooth(
     s: LitSurfaces,
-    view: View,
+    view: Viewpoint,
     u: Int64,
     v: Int64,
     offsets: Float64,

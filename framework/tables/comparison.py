@@ -13,7 +13,7 @@ from typing import Any
 from framework.config.validation import checked_block
 from framework.errors import ConfigError, DataError
 from framework.runs.metrics import is_evaluation
-from framework.runs.run_rows import CHOICE, Row, Run, natural, rows_of
+from framework.runs.run_rows import CHOICE, Run, RunRow, natural, rows_of
 from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
 from framework.runs.sweep_file import SWEEP, asked_runs, sweep_rows
 from framework.tables.published import (
@@ -91,12 +91,12 @@ class TableChoice:
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparisonTable:
     """All that a table says, before it is written in one format or another."""
 
     title: str
     choice: TableChoice
-    rows: list[Row]  # in their order, each with a run or more
+    rows: list[RunRow]  # in their order, each with a run or more
     overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
     asked: list[Run]  # what the sweep was last asked for, of every row; some may not have begun
     incomplete: list[Incomplete]
@@ -105,7 +105,7 @@ class Comparison:
     left_out: Sequence[str] = ()  # of PLAIN, what no run has a figure of; without an experiment only
 
     @classmethod
-    def below(cls, directory: Path) -> Comparison:
+    def below(cls, directory: Path) -> ComparisonTable:
         """From the records at and below `directory`, as the experiment that ran there says, else with the figures of
         PLAIN that there are.
 
@@ -150,7 +150,7 @@ class Comparison:
         """What is shown one by one, in a word: `scene` for dataset.scene."""
         return (self.choice.split_key or "").rpartition(".")[2]
 
-    def base_of(self, row: Row) -> Row | None:
+    def base_of(self, row: RunRow) -> RunRow | None:
         """The row that `row` is compared with, of the same poses and the like; None for that one, and without it."""
         named = [other for other in self.rows if other.name == self.base_name]
         bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
@@ -161,7 +161,7 @@ class Comparison:
         return any(self.base_name in (row.name, row.system) for row in self.rows)
 
     @property
-    def compared(self) -> list[tuple[Row, Row]]:
+    def compared(self) -> list[tuple[RunRow, RunRow]]:
         """The rows that have one to be compared with, and that one."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
@@ -208,13 +208,13 @@ class Comparison:
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
-    def called(self, row: Row, without: str = "") -> str:
+    def called(self, row: RunRow, without: str = "") -> str:
         """What a row is called, without the part of its name that says which `without` it has."""
         named = self.choice.names.get(row.system, row.system)
         variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
         return ", ".join([named, *variant] if named else variant) or row.name
 
-    def missing(self) -> Iterator[tuple[Row, list[Run]]]:
+    def missing(self) -> Iterator[tuple[RunRow, list[Run]]]:
         """The runs that a row should have: they were asked for, or other rows have their seeds and sequences."""
         runs = self._runs
         if self.choice.split_key:
@@ -230,7 +230,7 @@ class Comparison:
         return [*(run for row in self.rows for run in row.records), *self.asked]
 
 
-def _without_figure(columns: Sequence[str], rows: Sequence[Row]) -> list[str]:
+def _without_figure(columns: Sequence[str], rows: Sequence[RunRow]) -> list[str]:
     """The columns that would be empty; none of them where all would, as a table without a column says nothing."""
     empty = [key for key in columns if not any(row.values(key) for row in rows)]
     return empty if len(empty) < len(columns) else []

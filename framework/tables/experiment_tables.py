@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from framework.files.atomic_write import written_whole
-from framework.tables.comparison import Comparison
-from framework.tables.grid import Grid, latex_grid, markdown_grid
+from framework.tables.comparison import ComparisonTable
+from framework.tables.grid import TextTable, latex_grid, markdown_grid
 from framework.tables.layouts import difference_grid, row_grid
 from framework.tables.sequence_layouts import across_grid, by_grid, difference_across_grid
 from framework.tables.sequences import mean_difference
@@ -22,7 +22,7 @@ def write_tables(directory: Path) -> str:
 
     Raises DataError when there is no complete record.
     """
-    comparison = Comparison.below(directory)
+    comparison = ComparisonTable.below(directory)
     text = markdown(comparison)
     separated = comma_separated_runs if comparison.choice.split_key else comma_separated_rows
     for name, content in (("md", text), ("tex", latex(comparison)), ("csv", separated(comparison))):
@@ -31,13 +31,13 @@ def write_tables(directory: Path) -> str:
     return text
 
 
-def markdown(comparison: Comparison) -> str:
+def markdown(comparison: ComparisonTable) -> str:
     parts = [f"# {comparison.title}", *map(markdown_grid, grids(comparison))]
     parts.append("\n".join(f"- {note}" for note in notes(comparison)))
     return "\n\n".join(parts) + "\n"
 
 
-def latex(comparison: Comparison) -> str:
+def latex(comparison: ComparisonTable) -> str:
     """Tabulars, with the notes as comments."""
     lines = [f"% {note}" for note in notes(comparison)]
     for grid in grids(comparison):
@@ -45,7 +45,7 @@ def latex(comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
-LAYOUTS: dict[str, tuple[Callable[[Comparison], Grid], Callable[[Comparison], Grid]]] = {
+LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[ComparisonTable], TextTable]]] = {
     "rows": (row_grid, difference_grid),
     "across": (across_grid, difference_across_grid),
     "by": (by_grid, difference_grid),
@@ -53,14 +53,14 @@ LAYOUTS: dict[str, tuple[Callable[[Comparison], Grid], Callable[[Comparison], Gr
 """By TableChoice.layout: the table of the figures, and that of the differences to the base."""
 
 
-def grids(comparison: Comparison) -> Iterator[Grid]:
+def grids(comparison: ComparisonTable) -> Iterator[TextTable]:
     figures, differences = LAYOUTS[comparison.choice.layout]
     yield figures(comparison)
     if comparison.compared:
         yield differences(comparison)
 
 
-def comma_separated_rows(comparison: Comparison) -> str:
+def comma_separated_rows(comparison: ComparisonTable) -> str:
     """One line a row, all digits; empty where nothing is known."""
     statistics = ("mean", "sd", "n", "difference", "se", "pairs")
     keys = [f"{column}.{name}" for column in comparison.choice.columns for name in statistics]
@@ -81,7 +81,7 @@ def comma_separated_rows(comparison: Comparison) -> str:
     return text.getvalue()
 
 
-def comma_separated_runs(comparison: Comparison) -> str:
+def comma_separated_runs(comparison: ComparisonTable) -> str:
     """One line a run and figure, all digits, for pandas; a figure that is not defined has no line."""
     split_key = comparison.choice.split_key
     assert split_key

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Grid:
+class TextTable:
     """Cells of text under heads."""
 
     heads: list[str]
@@ -30,7 +30,7 @@ def figure(value: float, spread: float, digits: int, signed: bool = False) -> st
     return text if math.isnan(spread) else f"{text} ± {spread:.{digits}f}"
 
 
-def markdown_grid(grid: Grid) -> str:
+def markdown_grid(grid: TextTable) -> str:
     """Padded, so that it reads as a table in a terminal, too."""
     cells = [[" ".join(cell.replace("|", "\\|").split()) for cell in line] for line in (grid.heads, *grid.body)]
     for line, column in grid.bold:
@@ -46,7 +46,7 @@ def _padded(line: list[str], widths: list[int], label_columns: int) -> list[str]
     return [cell.ljust(width) if k < label_columns else cell.rjust(width) for k, (cell, width) in pairs]
 
 
-def latex_grid(grid: Grid) -> list[str]:
+def latex_grid(grid: TextTable) -> list[str]:
     """The lines of a tabular for `\\usepackage{booktabs}`."""
     lines = [
         f"\\begin{{tabular}}{{{'l' * grid.label_columns}{'r' * (len(grid.heads) - grid.label_columns)}}}",

@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 
 from framework.runs.run_rows import Mean
-from framework.tables.comparison import Comparison
-from framework.tables.grid import Grid, decimals, figure
+from framework.tables.comparison import ComparisonTable
+from framework.tables.grid import TextTable, decimals, figure
 from framework.tables.published import NOT_KNOWN, Key, PublishedRow
 from framework.tables.sequences import mean_difference
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
@@ -47,7 +47,7 @@ def head(key: str) -> str:
     return HEADS.get(key, key)
 
 
-def row_grid(comparison: Comparison) -> Grid:
+def row_grid(comparison: ComparisonTable) -> TextTable:
     """Each row's mean and deviation."""
     rows = comparison.rows
     columns = [_Column([row.mean(key) for row in rows]) for key in comparison.choice.columns]
@@ -68,10 +68,10 @@ def row_grid(comparison: Comparison) -> Grid:
         annotation = [published.annotation] if comparison.judged else []
         body.append([published_name(published), NOTHING, *cells, published.poses, *annotation])
     heads = ["row", "runs", *map(head, comparison.choice.columns), "poses"] + ["annotation"] * comparison.judged
-    return Grid(heads, body, groups=frozenset({len(rows)}))
+    return TextTable(heads, body, groups=frozenset({len(rows)}))
 
 
-def difference_grid(comparison: Comparison) -> Grid:
+def difference_grid(comparison: ComparisonTable) -> TextTable:
     """Each row's mean difference to the base with its standard error."""
     compared = comparison.compared
     columns = [
@@ -84,7 +84,7 @@ def difference_grid(comparison: Comparison) -> Grid:
         expected = len({run[-1] for run in pairs})
         cells = [column.cell(k, column.means[k].error, expected, signed=True) for column in columns]
         body.append([comparison.called(row), str(len(pairs)), *cells])
-    return Grid([f"less {comparison.base_called}", "pairs", *map(head, comparison.choice.columns)], body)
+    return TextTable([f"less {comparison.base_called}", "pairs", *map(head, comparison.choice.columns)], body)
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from framework.runs.run_rows import Mean, Row
-from framework.tables.comparison import Comparison
-from framework.tables.grid import Grid, decimals, figure
+from framework.runs.run_rows import Mean, RunRow
+from framework.tables.comparison import ComparisonTable
+from framework.tables.grid import TextTable, decimals, figure
 from framework.tables.layouts import NOTHING, head, published_cell, published_name
 from framework.tables.published import PublishedRow
 from framework.tables.sequences import SequenceMean, mean_by_sequence, mean_difference, mean_over_sequences
@@ -28,7 +28,7 @@ class _Line:
     figures: Sequence[float] = ()  # for each cell; NaN = does not compete
 
 
-def across_grid(comparison: Comparison) -> Grid:
+def across_grid(comparison: ComparisonTable) -> TextTable:
     """A column a sequence: each row's mean over seeds there, and the mean of these."""
     [key] = comparison.choice.columns
     sequences, seeds = comparison.sequences, _seeds(comparison)
@@ -63,7 +63,7 @@ def across_grid(comparison: Comparison) -> Grid:
     return _grid([*_label_heads(comparison, "system"), *sequences, "mean"], [*sections, published], digits)
 
 
-def by_grid(comparison: Comparison) -> Grid:
+def by_grid(comparison: ComparisonTable) -> TextTable:
     """A group of lines a sequence, each line a row with all of its figures; the last group are their means."""
     keys, seeds = comparison.choice.columns, _seeds(comparison)
     rows = [row for rows in _by_variant(comparison.rows) for row in rows]
@@ -103,7 +103,7 @@ def by_grid(comparison: Comparison) -> Grid:
     return _grid([comparison.noun, *_label_heads(comparison, "system"), *map(head, keys)], titled, digits)
 
 
-def difference_across_grid(comparison: Comparison) -> Grid:
+def difference_across_grid(comparison: ComparisonTable) -> TextTable:
     """The base less each of the others, sequence by sequence, and the mean with its standard error."""
     [key] = comparison.choice.columns
     differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
@@ -124,7 +124,7 @@ def difference_across_grid(comparison: Comparison) -> Grid:
     return _grid(heads, sections, digits)
 
 
-def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) -> Grid:
+def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) -> TextTable:
     lines: list[_Line] = []
     bold: set[tuple[int, int]] = set()
     groups: set[int] = set()
@@ -134,7 +134,7 @@ def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) ->
         bold |= {(len(lines) + k, len(line.labels) + column) for k, line, column in _highest(section, digits)}
         lines += section
     label_columns = len(lines[0].labels)
-    return Grid(
+    return TextTable(
         heads, [[*line.labels, *line.cells] for line in lines], label_columns, frozenset(bold), frozenset(groups)
     )
 
@@ -151,37 +151,37 @@ def _highest(section: Sequence[_Line], digits: int) -> Iterable[tuple[int, _Line
                 yield k, line, column
 
 
-def _by_variant(rows: Sequence[Row]) -> list[list[Row]]:
+def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
     """The rows in groups of those that can be compared, in the order of each group's first."""
-    groups: dict[tuple[str, ...], list[Row]] = {}
+    groups: dict[tuple[str, ...], list[RunRow]] = {}
     for row in rows:
         groups.setdefault(row.variant, []).append(row)
     return list(groups.values())
 
 
-def _labels(comparison: Comparison, name: str, poses: str, annotation: str) -> list[str]:
+def _labels(comparison: ComparisonTable, name: str, poses: str, annotation: str) -> list[str]:
     """What a line, or the head, begins with: a name and what may not be averaged."""
     return [name, poses, annotation] if comparison.judged else [name, poses]
 
 
-def _row_labels(comparison: Comparison, row: Row) -> list[str]:
+def _row_labels(comparison: ComparisonTable, row: RunRow) -> list[str]:
     return _labels(comparison, comparison.called(row, without="tracker"), row.poses, row.annotation or NOTHING)
 
 
-def _published_labels(comparison: Comparison, one: PublishedRow) -> list[str]:
+def _published_labels(comparison: ComparisonTable, one: PublishedRow) -> list[str]:
     return _labels(comparison, published_name(one), one.poses, one.annotation)
 
 
-def _label_heads(comparison: Comparison, name: str) -> list[str]:
+def _label_heads(comparison: ComparisonTable, name: str) -> list[str]:
     return _labels(comparison, name, "poses", "annotation")
 
 
-def _seeds(comparison: Comparison) -> int:
+def _seeds(comparison: ComparisonTable) -> int:
     """How many runs a row should have in a sequence."""
     return len({run[:-1] for row in comparison.rows for run in row.records})
 
 
-def _comparable(row: Row, rows: Sequence[Row], means: Mapping[str, Mapping[str, Mean]], sequence: str) -> float:
+def _comparable(row: RunRow, rows: Sequence[RunRow], means: Mapping[str, Mapping[str, Mean]], sequence: str) -> float:
     """A row's mean in a sequence; NaN for that of fewer runs than a row has there that it competes with."""
     rivals = [means[other.name] for other in rows if other.variant == row.variant]
     most = max((found[sequence].count for found in rivals if sequence in found), default=0)
@@ -189,14 +189,14 @@ def _comparable(row: Row, rows: Sequence[Row], means: Mapping[str, Mapping[str, 
     return mean.value if mean and mean.count == most else math.nan
 
 
-def _comparable_mean(row: Row, rows: Sequence[Row], means: Mapping[str, SequenceMean]) -> float:
+def _comparable_mean(row: RunRow, rows: Sequence[RunRow], means: Mapping[str, SequenceMean]) -> float:
     """A row's mean; NaN for that of fewer sequences, or fewer runs of as many, than a row has that it competes with."""
     most = max((means[other.name].count, means[other.name].runs) for other in rows if other.variant == row.variant)
     mean = means[row.name]
     return mean.value if (mean.count, mean.runs) == most else math.nan
 
 
-def _cell(row: Row, means: Mapping[str, Mean], sequence: str, seeds: int, digits: int) -> str:
+def _cell(row: RunRow, means: Mapping[str, Mean], sequence: str, seeds: int, digits: int) -> str:
     """Mean ± deviation over seeds; with their number where a run is missing or has no such figure."""
     if not any(run[-1] == sequence for run in row.records):
         return MISSING

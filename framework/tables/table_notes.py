@@ -11,18 +11,18 @@ from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
 from framework.runs.stored_runs import Record
-from framework.tables.comparison import Comparison
+from framework.tables.comparison import ComparisonTable
 from framework.tables.layouts import head
 from framework.tables.sequences import mean_by_sequence
 
 
-def notes(comparison: Comparison) -> Iterator[str]:
+def notes(comparison: ComparisonTable) -> Iterator[str]:
     """Each of them one line."""
     for note in _notes(comparison):
         yield " ".join(note.split())
 
 
-def _notes(comparison: Comparison) -> Iterator[str]:
+def _notes(comparison: ComparisonTable) -> Iterator[str]:
     yield from _averaging(comparison)
     yield from _winners(comparison)
     if comparison.left_out:
@@ -40,7 +40,7 @@ def _notes(comparison: Comparison) -> Iterator[str]:
     yield from _missing(comparison)
 
 
-def _averaging(comparison: Comparison) -> Iterator[str]:
+def _averaging(comparison: ComparisonTable) -> Iterator[str]:
     """How figures come about, and how rows are compared."""
     choice, over = comparison.choice, ", ".join(comparison.choice.over)
     if others := following(comparison.records, choice.over):
@@ -79,7 +79,7 @@ def _with_needs(columns: Sequence[str]) -> str:
     return "; ".join(f"{', '.join(names)}{needs}" for needs, names in heads.items())
 
 
-def _winners(comparison: Comparison) -> Iterator[str]:
+def _winners(comparison: ComparisonTable) -> Iterator[str]:
     """In which sequences the base is better than each of the others, and in which it loses."""
     if not comparison.choice.across:
         return
@@ -94,7 +94,7 @@ def _winners(comparison: Comparison) -> Iterator[str]:
         )
 
 
-def _protocol(comparison: Comparison) -> Iterator[str]:
+def _protocol(comparison: ComparisonTable) -> Iterator[str]:
     """What the instances were compared with, and how."""
     kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if is_evaluation(key)}
     if not kinds:
@@ -106,7 +106,7 @@ def _protocol(comparison: Comparison) -> Iterator[str]:
         yield f"Transfer of to_map: each vertex of the map takes the instance of the nearest true vertex {near}."
 
 
-def _published(comparison: Comparison) -> Iterator[str]:
+def _published(comparison: ComparisonTable) -> Iterator[str]:
     if comparison.choice.published and not comparison.is_of_scenenn:
         yield "Published numbers are of the real SceneNN (sequences=scenenn): none stand below figures of other data."
     for row in comparison.published_rows:
@@ -115,7 +115,7 @@ def _published(comparison: Comparison) -> Iterator[str]:
         yield f"Published, but nobody has looked the numbers up: {'; '.join(unknown)}."
 
 
-def _missing(comparison: Comparison) -> Iterator[str]:
+def _missing(comparison: ComparisonTable) -> Iterator[str]:
     """The figures, rows, sequences and runs of which there is no record, and the runs that did not end well."""
     known_keys = {key for record in comparison.records for key in record.metrics}
     if absent := [key for key in comparison.choice.columns if key not in known_keys]:

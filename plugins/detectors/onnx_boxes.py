@@ -8,7 +8,7 @@ from pathlib import Path
 
 from framework.config.validation import MOST_DETECTIONS, check_count, require
 from framework.data import Bool, Detections, Frame
-from framework.detection.candidates import Layout, decode
+from framework.detection.candidates import OutputLayout, decode
 from framework.detection.masks.binary_masks import without_duplicates
 from framework.detection.masks.letterbox import Placement
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
@@ -34,7 +34,7 @@ class OnnxBoxes(Detector):
     weights: Path = field(metadata={"where": WHERE})  # ONNX file; relative: to the working, then project folder
     sha256: str = ""  # what the file must have; "" = whatever it is
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
-    layout: Layout = Layout.yolox  # what the outputs are
+    layout: OutputLayout = OutputLayout.yolox  # what the outputs are
     score_threshold: float = 0.1  # in (0, 1): low, for weak detections may still update instances that exist
     nms: float = 0.45  # IoU in (0, 1] above which a box falls to a better one of its class
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off

@@ -19,7 +19,7 @@ from scipy.stats import spearmanr
 
 from framework.errors import DataError
 from framework.runs.provenance import config_hash
-from framework.tables.comparison import Comparison
+from framework.tables.comparison import ComparisonTable
 from tests.support.doc_pages import CHECKOUT, LINES
 
 SCRIPT = CHECKOUT / "docs" / "results" / "ranks.py"
@@ -125,7 +125,7 @@ def test_means_that_differ_by_rounding_alone_share_a_rank() -> None:
 
 
 def agreement(places: Sequence[Path]) -> object:
-    [(_, found), *_] = Ranking.of(AP50, [Comparison.below(place) for place in places]).agreements()
+    [(_, found), *_] = Ranking.of(AP50, [ComparisonTable.below(place) for place in places]).agreements()
     return found
 
 

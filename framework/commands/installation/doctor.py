@@ -14,7 +14,7 @@ from typing import Any
 
 import framework
 from framework.doctor import machine, networks, packages
-from framework.doctor.check import Check, Status, anonymous, run_checks
+from framework.doctor.check_result import Check, Status, anonymous, run_checks
 from framework.doctor.isolated import probe_all
 
 

@@ -16,7 +16,7 @@ from tqdm import tqdm
 from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Array
 from framework.datasets.scenenn.oni import read_frames
-from framework.datasets.scenenn.oni_records import Contents, Stream, read_contents
+from framework.datasets.scenenn.oni_records import OniContents, Stream, read_contents
 from framework.datasets.scenenn.timestamps import MICROSECONDS, write_timestamps
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
@@ -72,7 +72,7 @@ def convert(source: Path, target: Path) -> None:
     _check_whole(contents, number)
 
 
-def _check_whole(contents: Contents, number: int) -> None:
+def _check_whole(contents: OniContents, number: int) -> None:
     if contents.cut_off:
         raise DataError(
             f"{contents.path} is cut off or damaged at byte {contents.end}: what was read is kept, up to"

@@ -10,11 +10,11 @@ from framework.errors import ConfigError
 from framework.runtime.process_settings import available_cores
 from framework.synthetic.benchmark import SCENES
 from framework.synthetic.scene_writers import write_scenes
-from framework.synthetic.scenenn_scene import Recording
+from framework.synthetic.scenenn_scene import BenchmarkSettings
 
 
 def main() -> None:
-    default = Recording()
+    default = BenchmarkSettings()
     parser = argparse.ArgumentParser(
         description="Writes made-up rooms into DIR, in SceneNN's format: images, depth, trajectory, labelled mesh. "
         "The same parameters give the same bytes. What is there already is kept.",
@@ -35,7 +35,7 @@ def main() -> None:
             raise ConfigError(f"there is no scene {unknown[0]!r}; the scenes are: {', '.join(SCENES)}")
         if asked.jobs < 1:
             raise ConfigError(f"jobs must be at least 1, found {asked.jobs}")
-        recording = Recording(asked.seed, asked.frames, asked.rate, asked.width, asked.haste)
+        recording = BenchmarkSettings(asked.seed, asked.frames, asked.rate, asked.width, asked.haste)
         write_scenes(asked.directory, {name: SCENES[name] for name in names}, recording, asked.jobs)
         root = asked.directory.resolve()
         print(f"{root} is complete: python -m framework dataset=scenenn dataset.root={root} dataset.scene={names[0]}")

@@ -57,7 +57,7 @@ def main() -> None:
     asked = arguments(parser)
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
     with one_line_errors():
-        from framework.exporting.exports import Chosen, Format, export  # here: wrong arguments are told at once
+        from framework.exporting.exports import Chosen, ExportFormat, export  # here: wrong arguments are told at once
 
         chosen = Chosen.named(
             asked.object,
@@ -68,5 +68,5 @@ def main() -> None:
             resolution=asked.resolution,
             robot_height=asked.robot_height,
         )
-        for path in export(asked.run, map(Format, asked.to), asked.out, chosen, asked.up, asked.floor):
+        for path in export(asked.run, map(ExportFormat, asked.to), asked.out, chosen, asked.up, asked.floor):
             print(path)

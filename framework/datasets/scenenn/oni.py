@@ -12,7 +12,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 
 from framework.data import UInt8, UInt16
-from framework.datasets.scenenn.oni_records import Contents, Images, Stream, playable
+from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
 from framework.datasets.scenenn.openni import OniImage, play
 from framework.errors import DataError, InstanceMapError
 
@@ -30,7 +30,7 @@ class OniFrame:
     depth_time: int  # us
 
 
-def read_frames(contents: Contents, scratch: Path) -> Generator[OniFrame]:
+def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
     """The frames of a recording; one that was cut off is copied into the folder `scratch` meanwhile.
 
     Raises ConfigError where OpenNI 2 is not installed, DataError when it does not play the recording to its end, or the

@@ -29,7 +29,7 @@ LARGEST_NODE = 255  # recorders number them from 1; OpenNI allocates as many as 
 LARGEST_FIELDS = 2**20  # bytes; OpenNI has a buffer of 5.8 MB for them and does not look
 
 
-class Record(IntEnum):
+class OniRecord(IntEnum):
     """The kinds of records that matter here."""
 
     NODE_ADDED_1_0_0_4 = 0x02
@@ -56,7 +56,7 @@ class Images:
 
 
 @dataclass(frozen=True)
-class Contents:
+class OniContents:
     """What the records of a file say."""
 
     path: Path
@@ -68,7 +68,7 @@ class Contents:
     table_notes: tuple[int, ...]  # where the places of the tables for seeking are noted
 
 
-def read_contents(path: Path) -> Contents:
+def read_contents(path: Path) -> OniContents:
     """The streams and their images; pixels are not looked at.
 
     Raises DataError when it is no recording, or has no image of depth or of colour.
@@ -82,7 +82,7 @@ def read_contents(path: Path) -> Contents:
 
 
 @contextmanager
-def playable(contents: Contents, scratch: Path) -> Iterator[Path]:
+def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
     """A file that OpenNI 2 plays: the recording, or a copy of its whole records in `scratch` where it was cut off.
 
     OpenNI looks for the tables for seeking at the recording's end, and without them refuses all of it.
@@ -101,7 +101,7 @@ def playable(contents: Contents, scratch: Path) -> Iterator[Path]:
                 file.seek(note)
                 file.write(place.pack(0))  # 0 = there is no table
             file.seek(contents.end)
-            file.write(record_header.pack(RECORD_MAGIC, Record.END, 0, record_header.size, 0, 0))
+            file.write(record_header.pack(RECORD_MAGIC, OniRecord.END, 0, record_header.size, 0, 0))
         yield copy
 
 
@@ -114,7 +114,7 @@ class _Record:
     end: int
 
 
-def _read_contents(path: Path, file: BinaryIO) -> Contents:
+def _read_contents(path: Path, file: BinaryIO) -> OniContents:
     wide = _read_version(path, file) >= FIRST_WIDE
     place, record_header = _layouts(wide)
     streams: dict[Stream, Images] = {}
@@ -122,23 +122,23 @@ def _read_contents(path: Path, file: BinaryIO) -> Contents:
     end, cut_off, largest_node = FILE_HEADER.size, True, 0
     for record in _records(file, record_header):
         end = record.end
-        if record.kind == Record.END:
+        if record.kind == OniRecord.END:
             cut_off = False
             break
         largest_node = max(largest_node, record.node)
-        if record.kind in (Record.NODE_ADDED_1_0_0_4, Record.NODE_ADDED_1_0_0_5, Record.NODE_ADDED):
+        if record.kind in (OniRecord.NODE_ADDED_1_0_0_4, OniRecord.NODE_ADDED_1_0_0_5, OniRecord.NODE_ADDED):
             stream = _added_stream(path, record)
             if stream is not None:
                 streams.setdefault(stream, Images(record.node))
-            if record.kind == Record.NODE_ADDED:
+            if record.kind == OniRecord.NODE_ADDED:
                 notes.append(record.fields_end - place.size)
-        elif record.kind == Record.NEW_DATA:
+        elif record.kind == OniRecord.NEW_DATA:
             _count(streams, record)
     missing = [stream.name.lower() for stream in Stream if stream not in streams or not streams[stream].count]
     if missing:
         where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
         raise DataError(f"{path} has no {' and no '.join(missing)} image{where}; it needs depth and color")
-    return Contents(path, streams, end, cut_off, largest_node, wide, tuple(notes))
+    return OniContents(path, streams, end, cut_off, largest_node, wide, tuple(notes))
 
 
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
@@ -173,11 +173,11 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
             magic != RECORD_MAGIC
             or not header.size <= fields_size <= LARGEST_FIELDS
             or end > size
-            or (node > LARGEST_NODE and kind != Record.END)  # OpenNI 1 ends with node 2^32 - 1, OpenNI 2 with 0
+            or (node > LARGEST_NODE and kind != OniRecord.END)  # OpenNI 1 ends with node 2^32 - 1, OpenNI 2 with 0
         ):
             return
         yield _Record(kind, node, file.read(fields_size - header.size), position + fields_size, end)
-        if kind == Record.END:
+        if kind == OniRecord.END:
             return
         position = end
 

@@ -44,7 +44,7 @@ MADE_BY = "synthesize.json"  # in the folder of rendered rooms
 log = logging.getLogger(__name__)
 
 
-class Sensor(StrEnum):
+class SceneNNSensor(StrEnum):
     """The camera of a recording: SceneNN has a file of intrinsics for each."""
 
     ASUS = "asus"
@@ -60,7 +60,7 @@ class SceneNN(LabeledRecording):
     """
 
     scene: str = "011"  # the sequence
-    sensor: Sensor = Sensor.ASUS  # names the file of intrinsics
+    sensor: SceneNNSensor = SceneNNSensor.ASUS  # names the file of intrinsics
     release: str = ""  # of the annotation, for tables: two exist and give other results; "" = what release.txt says
 
     def open(self) -> Contents:

@@ -24,7 +24,7 @@ LONGEST_SIDE = 1024  # px of a model's pictures
 HASH_DIGITS = 16  # of a local folder's content in the name of its space
 
 
-class Family(NamedTuple):
+class ImageTextFamily(NamedTuple):
     """What a kind of model wants."""
 
     prompt: str  # the words that published figures have around a class's name
@@ -35,9 +35,9 @@ class Family(NamedTuple):
 
 
 FAMILIES = {
-    "clip": Family("a photo of {}.", "longest", False, CLIP_MEAN, CLIP_STD),
+    "clip": ImageTextFamily("a photo of {}.", "longest", False, CLIP_MEAN, CLIP_STD),
     # https://huggingface.co/docs/transformers/model_doc/siglip2: padded to 64 tokens, in lower case
-    "siglip": Family("This is a photo of {}.", "max_length", True, (0.5,) * 3, (0.5,) * 3),
+    "siglip": ImageTextFamily("This is a photo of {}.", "max_length", True, (0.5,) * 3, (0.5,) * 3),
 }
 """By the `model_type` in config.json. SigLIP 2 of a fixed size (siglip2-base-patch16-224) is `siglip` there."""
 
@@ -109,7 +109,7 @@ class ImageTextModel:
         return np.asarray(vectors / lengths, np.float32)
 
 
-def _normalization(path: Path, family: Family) -> tuple[tuple[float, ...], tuple[float, ...], float]:
+def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ...], tuple[float, ...], float]:
     """Mean, standard deviation and the factor before them, by preprocessor_config.json."""
     content = read_json(path)
     if not isinstance(content, Mapping):

@@ -7,7 +7,7 @@ from numba import njit, prange
 
 from framework.data import Bool, Int32, UInt8
 from framework.mapping.labels.label_evidence import Evidence, best_class, best_counted_instance, labeled_voxel
-from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, UNSEEN, Grid, device, find_block, unpack_color
 from framework.mapping.voxels.voxel_walk import voxel_number
 
@@ -89,7 +89,7 @@ def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
 
 @device
 def color_of(color, voxel, out):
-    """The colour of a voxel, numbered as in a Surface, into `out` (3,)."""
+    """The colour of a voxel, numbered as in an UnlabeledMesh, into `out` (3,)."""
     red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
     out[0], out[1], out[2] = red / 4, green / 4, blue / 4
 
@@ -114,7 +114,7 @@ def _label(grid, evidence, counts, vertices, voxels, colors, instance_ids, class
             class_ids[v] = label
 
 
-def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: Surface) -> tuple[UInt8, Int32, Int32]:
+def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: UnlabeledMesh) -> tuple[UInt8, Int32, Int32]:
     """(colors (V, 3), instance ids (V,), class ids (V,)) of the surface's vertices.
 
     The colour is that of the nearest voxel. The instance is elected by the eight voxels around, by their trilinear
@@ -131,7 +131,7 @@ def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: Surface
 
 
 def vertex_colors(grid: Grid, voxels: Int32) -> UInt8:
-    """(V, 3) RGB of the voxels nearest to vertices, numbered as in a Surface."""
+    """(V, 3) RGB of the voxels nearest to vertices, numbered as in an UnlabeledMesh."""
     colors = np.empty((len(voxels), 3), np.uint8)
     _color(grid.color, voxels, colors)
     return colors

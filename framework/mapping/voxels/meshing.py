@@ -33,7 +33,7 @@ from framework.mapping.voxels.voxel_walk import voxel_number
 MAX_JUMP = 8.0
 
 
-class Surface(NamedTuple):
+class UnlabeledMesh(NamedTuple):
     """A mesh without colours and labels: `vertex_labels` has those."""
 
     vertices: Float32  # (V, 3) m, world
@@ -296,14 +296,14 @@ class SurfaceNets:
         self._cells = np.zeros((1, BLOCK_SIDE), np.uint64)
         self._first = np.zeros((0, BLOCK_SIDE), np.int32)  # number of the first vertex of each slice
         self._changed = np.zeros(0, np.bool_)  # (B,)
-        self._surface = Surface(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
+        self._surface = UnlabeledMesh(np.empty((0, 3), np.float32), np.empty((0, 3), np.int32), np.empty(0, np.int32))
 
     def changed(self, blocks: Int32) -> None:
         """Notes that voxels of these blocks were written. Blocks that are new since `extract` need not be named."""
         known = blocks[blocks < len(self._changed)]
         self._changed[known] = True
 
-    def extract(self) -> Surface:
+    def extract(self) -> UnlabeledMesh:
         """The surface as the grid is now. The order of vertices and triangles depends on the grid alone."""
         grid, count = self.voxels.grid, self.voxels.block_count
         self._grow(count)
@@ -329,7 +329,7 @@ class SurfaceNets:
         _write_triangles(grid, inside, cells, first, (ends - quads).astype(np.int32), quads, triangles)
         self._first = first
         self._changed[:] = False
-        self._surface = Surface(vertices, triangles, voxels)
+        self._surface = UnlabeledMesh(vertices, triangles, voxels)
         return self._surface
 
     def _grow(self, count: int) -> None:

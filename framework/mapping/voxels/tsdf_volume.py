@@ -13,7 +13,7 @@ from framework.mapping.storage.map_file import check_blocks, check_like, check_n
 from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration import Integrator, SeenBlocks
 from framework.mapping.voxels.integration_parameters import BOUNDS, Sensor
-from framework.mapping.voxels.meshing import Surface, SurfaceNets
+from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
 from framework.mapping.voxels.raycasting import render_near, render_surface
 from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, MOST_BLOCKS, VoxelGrid, find_solid_blocks
 
@@ -67,7 +67,7 @@ class TsdfVolume:
         elif self._nets is not None:
             self._nets.changed(blocks)
 
-    def surface(self) -> Surface:
+    def surface(self) -> UnlabeledMesh:
         """As it is now, without labels."""
         self._nets = self._nets or SurfaceNets(self.voxels)
         return self._nets.extract()
@@ -79,7 +79,7 @@ class TsdfVolume:
             self._up = self.gravity.up(surface.vertices, surface.triangles)
         return self._up
 
-    def mesh(self, label: Callable[[Surface], InstanceMesh]) -> InstanceMesh:
+    def mesh(self, label: Callable[[UnlabeledMesh], InstanceMesh]) -> InstanceMesh:
         """The surface as it is now, with the labels that `label` gives it; kept until the map changes."""
         if self._mesh is None:
             self._mesh = label(self.surface())

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from framework.detection.candidates import Candidates, Layout, decode
+from framework.detection.candidates import Candidates, OutputLayout, decode
 from framework.errors import DataError
 
 CLASSES = 3
@@ -19,7 +19,7 @@ def yolox_output(rng):
 
 def test_yolox():
     output = yolox_output(np.random.default_rng(0))
-    found = decode(Layout.yolox, {"output": output}, SHAPE, CLASSES)
+    found = decode(OutputLayout.yolox, {"output": output}, SHAPE, CLASSES)
     k = 0
     for stride in (8, 16, 32):
         for gy in range(SHAPE[0] // stride):
@@ -35,7 +35,7 @@ def test_yolox():
 
 @pytest.mark.parametrize("transposed", [False, True])
 @pytest.mark.parametrize("batch", [False, True])
-@pytest.mark.parametrize(("layout", "objectness"), [(Layout.yolo, False), (Layout.yolo_objectness, True)])
+@pytest.mark.parametrize(("layout", "objectness"), [(OutputLayout.yolo, False), (OutputLayout.yolo_objectness, True)])
 def test_yolo(layout, objectness, transposed, batch):
     rng = np.random.default_rng(1)
     rows = np.concatenate([rng.random((20, 4)) * 50, rng.random((20, CLASSES + objectness))], axis=1).astype("f4")
@@ -50,9 +50,9 @@ def test_yolo(layout, objectness, transposed, batch):
 
 SSD_BOXES = np.array([[0.1, 0.2, 0.5, 0.6], [0.0, 0.25, 1.0, 0.75]], np.float32)
 SSD_PIXELS = {
-    Layout.ssd_tensorflow: [[19.2, 6.4, 57.6, 32], [24, 0, 72, 64]],  # y1 x1 y2 x2
-    Layout.ssd_unit: [[9.6, 12.8, 48, 38.4], [0, 16, 96, 48]],
-    Layout.ssd_torchvision: [[0.1, 0.2, 0.5, 0.6], [0.0, 0.25, 1.0, 0.75]],
+    OutputLayout.ssd_tensorflow: [[19.2, 6.4, 57.6, 32], [24, 0, 72, 64]],  # y1 x1 y2 x2
+    OutputLayout.ssd_unit: [[9.6, 12.8, 48, 38.4], [0, 16, 96, 48]],
+    OutputLayout.ssd_torchvision: [[0.1, 0.2, 0.5, 0.6], [0.0, 0.25, 1.0, 0.75]],
 }
 
 
@@ -76,24 +76,24 @@ def test_tensorflows_names_padding_and_background():
         "raw_detection_scores": np.ones((1, 50, 4)),
     }
     outputs = {name: value.astype(np.float32) for name, value in outputs.items()}
-    found = decode(Layout.ssd_tensorflow, outputs, SHAPE, CLASSES)
+    found = decode(OutputLayout.ssd_tensorflow, outputs, SHAPE, CLASSES)
     expected = [[0.9, 0.05, 0.05], [0.25, 0.25, 0.5], [0, 0, 0], [0, 0, 0]]
     np.testing.assert_allclose(found.class_scores, expected, atol=1e-6)
     by_class = np.random.default_rng(2).random((1, 4, 1 + CLASSES)).astype(np.float32)
-    found = decode(Layout.ssd_tensorflow, {**outputs, "detection_multiclass_scores": by_class}, SHAPE, CLASSES)
+    found = decode(OutputLayout.ssd_tensorflow, {**outputs, "detection_multiclass_scores": by_class}, SHAPE, CLASSES)
     np.testing.assert_array_equal(found.class_scores, by_class[0, :, 1:])
 
 
 @pytest.mark.parametrize("background", [0, 1])
 def test_ssd_with_scores_by_class(background):
     scores = np.random.default_rng(3).random((1, 2, CLASSES + background)).astype(np.float32)
-    found = decode(Layout.ssd_unit, {"scores": scores, "boxes": SSD_BOXES[None]}, SHAPE, CLASSES)
+    found = decode(OutputLayout.ssd_unit, {"scores": scores, "boxes": SSD_BOXES[None]}, SHAPE, CLASSES)
     np.testing.assert_array_equal(found.class_scores, scores[0, :, background:])
 
 
 def test_ssd_that_found_nothing():
     outputs = {"boxes": np.zeros((0, 4), "f4"), "labels": np.zeros(0, "f4"), "scores": np.zeros(0, "f4")}
-    found = decode(Layout.ssd_torchvision, outputs, SHAPE, CLASSES)
+    found = decode(OutputLayout.ssd_torchvision, outputs, SHAPE, CLASSES)
     assert (found.boxes.shape, found.class_scores.shape) == ((0, 4), (0, CLASSES))
     assert found.best(0.1, 0.5, 10).tolist() == []
 
@@ -101,18 +101,18 @@ def test_ssd_that_found_nothing():
 @pytest.mark.parametrize(
     ("layout", "outputs", "message"),
     [
-        (Layout.yolo, {"y": np.zeros((1, 20, 8))}, r"7 columns .*\(1, 20, 8\).* \(perhaps yolo_objectness\)"),
-        (Layout.yolo_objectness, {"y": np.zeros((1, 7, 20))}, r"8 columns .*\(1, 7, 20\).* \(perhaps yolo\)"),
-        (Layout.yolox, {"y": np.zeros((1, 20, 8))}, "has 126 candidates, the network's output has 20"),
+        (OutputLayout.yolo, {"y": np.zeros((1, 20, 8))}, r"7 columns .*\(1, 20, 8\).* \(perhaps yolo_objectness\)"),
+        (OutputLayout.yolo_objectness, {"y": np.zeros((1, 7, 20))}, r"8 columns .*\(1, 7, 20\).* \(perhaps yolo\)"),
+        (OutputLayout.yolox, {"y": np.zeros((1, 20, 8))}, "has 126 candidates, the network's output has 20"),
         (
-            Layout.yolo,
+            OutputLayout.yolo,
             {"y": np.zeros((1, 9, 7)), "z": np.zeros(1)},
             r"must have one output, found y \(1, 9, 7\), z \(1,\)",
         ),
-        (Layout.yolo, {"y": np.full((1, 9, 7), 3.0)}, r"scores must be in \[0, 1\], found 3 to 3"),
-        (Layout.ssd_unit, {"boxes": np.zeros((9, 4))}, r"outputs named boxes .* found boxes \(9, 4\)"),
+        (OutputLayout.yolo, {"y": np.full((1, 9, 7), 3.0)}, r"scores must be in \[0, 1\], found 3 to 3"),
+        (OutputLayout.ssd_unit, {"boxes": np.zeros((9, 4))}, r"outputs named boxes .* found boxes \(9, 4\)"),
         (
-            Layout.ssd_unit,
+            OutputLayout.ssd_unit,
             {"boxes": np.zeros((2, 4)), "labels": np.array([4, 1]), "scores": np.ones(2)},
             "labels must be 1 to 3, found 4",
         ),

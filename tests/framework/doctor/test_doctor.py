@@ -18,7 +18,7 @@ from packaging.requirements import Requirement
 from framework.compilation.catalog import DEFAULT, listed
 from framework.detection.mask_rcnn.published_weights import PUBLISHED
 from framework.doctor import isolated, machine, networks, packages
-from framework.doctor.check import Check, Status, anonymous, run_checks
+from framework.doctor.check_result import Check, Status, anonymous, run_checks
 
 CHECKOUT = Path(__file__).resolve().parents[3]
 CHECKS = (networks.included, networks.published, networks.hugging_face)

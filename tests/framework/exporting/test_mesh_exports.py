@@ -23,11 +23,11 @@ from framework.data import Box
 from framework.errors import DataError
 from framework.exporting.coloring import Coloring, linear
 from framework.exporting.decimation import decimated
-from framework.exporting.exports import Chosen, Format, export
+from framework.exporting.exports import Chosen, ExportFormat, export
 from framework.exporting.glb import glb
 from framework.exporting.object_meshes import parts
 from framework.exporting.surface_points import surface_points
-from framework.exporting.upright_room import Room, facing, objects_of, read_room
+from framework.exporting.upright_room import UprightRoom, facing, objects_of, read_room
 from framework.exporting.usd import Collision, convex_hull
 from framework.rendering.palette import instance_colors
 from framework.runs.instances_file import StoredInstance
@@ -45,7 +45,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def room(run: Path) -> Room:
+def room(run: Path) -> UprightRoom:
     return read_room(run)
 
 
@@ -58,7 +58,7 @@ def bounds(low: tuple[float, ...], high: tuple[float, ...]) -> Any:
     return pytest.approx(np.array([low, high]), abs=1e-5)
 
 
-def test_the_room_stands_on_its_floor(room: Room) -> None:
+def test_the_room_stands_on_its_floor(room: UprightRoom) -> None:
     assert room.up_known
     assert room.floor_known
     assert room.mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
@@ -79,20 +79,22 @@ def test_where_z_is_up_the_room_has_the_worlds_x_and_y(tmp_path: Path) -> None:
     np.testing.assert_allclose(room.T_room_world, expected, atol=1e-12)
 
 
-@pytest.mark.parametrize(("kind", "ending"), [(Format.PLY, "ply"), (Format.OBJ, "obj"), (Format.GLB, "glb")])
-def test_objects_stand_on_the_origin_in_metres(kind: Format, ending: str, run: Path, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("kind", "ending"), [(ExportFormat.PLY, "ply"), (ExportFormat.OBJ, "obj"), (ExportFormat.GLB, "glb")]
+)
+def test_objects_stand_on_the_origin_in_metres(kind: ExportFormat, ending: str, run: Path, tmp_path: Path) -> None:
     written = export(run, [kind], tmp_path, Chosen(("cube", "1")))
     assert sorted(path.name for path in written) == [f"cube_2.{ending}", f"dining_table_1.{ending}"]
     for name, (x, y, z) in (("dining_table_1", TABLE_SIZE), ("cube_2", CUBE_SIZE)):
         found = trimesh.load(tmp_path / "objects" / f"{name}.{ending}", process=False).bounds
-        if kind is Format.GLB:  # y up
+        if kind is ExportFormat.GLB:  # y up
             assert found == bounds((-x / 2, 0, -y / 2), (x / 2, z, y / 2))
         else:
             assert found == bounds((-x / 2, -y / 2, 0), (x / 2, y / 2, z))
 
 
 def test_the_scene_has_everything_and_each_object_where_it_stands(run: Path, tmp_path: Path) -> None:
-    export(run, [Format.GLB, Format.PLY, Format.OBJ], tmp_path)
+    export(run, [ExportFormat.GLB, ExportFormat.PLY, ExportFormat.OBJ], tmp_path)
     whole = read_mesh(run / "mesh.ply")
     scene = trimesh.load(tmp_path / "scene.glb", process=False)
     assert {"room", "dining_table_1", "cube_2", "picture_3"} <= set(scene.graph.nodes)
@@ -110,7 +112,7 @@ def test_the_scene_has_everything_and_each_object_where_it_stands(run: Path, tmp
         assert found.area == pytest.approx(original.area, rel=1e-4)
 
 
-def test_triangles_between_objects_are_of_the_room(room: Room) -> None:
+def test_triangles_between_objects_are_of_the_room(room: UprightRoom) -> None:
     ids = np.where(room.mesh.vertices[:, 0] > 2.02, 1, 2).astype(np.int32)
     mesh = replace(room.mesh, instance_ids=ids)
     box = room.objects[0].box
@@ -132,7 +134,7 @@ def test_boxes_face_the_rooms_x_axis(degrees: float, yaw: float, swapped: bool) 
     assert np.degrees(np.arctan2(found.rotation[1, 0], found.rotation[0, 0])) == pytest.approx(yaw)
 
 
-def test_glb_nodes_say_what_objects_are(room: Room) -> None:
+def test_glb_nodes_say_what_objects_are(room: UprightRoom) -> None:
     found = header(glb(parts(room)))
     said = {node["name"]: node.get("extras") for node in found["nodes"]}
     assert said["cube_2"] == {"id": 2, "class": "cube", "probability": pytest.approx(0.9), "confidence": 0.8}
@@ -143,7 +145,7 @@ def test_glb_nodes_say_what_objects_are(room: Room) -> None:
     assert [material.get("doubleSided", False) for material in materials] == [False, True, True, True]
 
 
-def test_glb_colors_are_linear_with_16_bits(room: Room) -> None:
+def test_glb_colors_are_linear_with_16_bits(room: UprightRoom) -> None:
     data = glb(parts(room))
     found = header(data)
     cube = next(mesh for mesh in found["meshes"] if mesh["name"] == "cube_2")
@@ -166,7 +168,7 @@ def test_colors_tell_objects_or_classes(coloring: Coloring, tmp_path: Path) -> N
     entries = json.loads((run / "instances.json").read_text())
     entries[1]["class"] = "cube"
     (run / "instances.json").write_text(json.dumps(entries))
-    export(run, [Format.PLY, Format.GLB], tmp_path, Chosen(coloring=coloring))
+    export(run, [ExportFormat.PLY, ExportFormat.GLB], tmp_path, Chosen(coloring=coloring))
     mesh = read_mesh(tmp_path / "scene.ply")
     colors = [np.unique(mesh.colors[mesh.instance_ids == key], axis=0) for key in (0, 1, 2)]
     assert [len(each) for each in colors] == [1, 1, 1]
@@ -177,7 +179,7 @@ def test_colors_tell_objects_or_classes(coloring: Coloring, tmp_path: Path) -> N
 
 def test_open3d_and_trimesh_read_colors_and_labels(run: Path, tmp_path: Path) -> None:
     """Of the run's own mesh.ply and of what is exported: the same properties, by the same writer."""
-    export(run, [Format.PLY, Format.OBJ], tmp_path)
+    export(run, [ExportFormat.PLY, ExportFormat.OBJ], tmp_path)
     for path in (run / "mesh.ply", tmp_path / "scene.ply"):
         mesh = read_mesh(path)
         legacy = o3d.io.read_triangle_mesh(str(path))
@@ -201,7 +203,7 @@ def test_open3d_and_trimesh_read_colors_and_labels(run: Path, tmp_path: Path) ->
 def test_usd_is_a_stage_that_a_simulator_takes(run: Path, tmp_path: Path) -> None:
     from pxr import Usd, UsdGeom, UsdPhysics, UsdSemantics
 
-    export(run, [Format.USD], tmp_path)
+    export(run, [ExportFormat.USD], tmp_path)
     stage = Usd.Stage.Open(str(tmp_path / "scene.usdc"))
     assert UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
     assert UsdGeom.GetStageMetersPerUnit(stage) == 1.0
@@ -223,7 +225,7 @@ def test_usd_is_a_stage_that_a_simulator_takes(run: Path, tmp_path: Path) -> Non
     assert len(UsdGeom.Mesh(collision).GetPointsAttr().Get()) == 8
     room = stage.GetPrimAtPath("/World/room")
     assert UsdPhysics.MeshCollisionAPI(room).GetApproximationAttr().Get() == "none"
-    export(run, [Format.USD], tmp_path / "boxes", Chosen(("cube",), collision=Collision.BOX))
+    export(run, [ExportFormat.USD], tmp_path / "boxes", Chosen(("cube",), collision=Collision.BOX))
     alone = Usd.Stage.Open(str(tmp_path / "boxes" / "objects" / "cube_2.usdc"))
     proxy = UsdGeom.Cube(alone.GetPrimAtPath("/World/cube_2/collision"))
     bound = UsdGeom.BBoxCache(Usd.TimeCode.Default(), ["guide"]).ComputeWorldBound(proxy.GetPrim())
@@ -236,7 +238,7 @@ def test_usd_is_a_stage_that_a_simulator_takes(run: Path, tmp_path: Path) -> Non
 def test_without_usd_core_it_says_what_to_install(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(DataError, match=r"pip install instancemap\[usd\]"):
-        export(run, [Format.GLB, Format.USD], tmp_path / "out")
+        export(run, [ExportFormat.GLB, ExportFormat.USD], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -249,7 +251,7 @@ def test_hulls_face_out() -> None:
     assert convex_hull(corners[corners[:, 2] == 0]) is None
 
 
-def test_normals_of_lit_colors_have_length_1(room: Room) -> None:
+def test_normals_of_lit_colors_have_length_1(room: UprightRoom) -> None:
     """Also where triangles have no area, which Khronos' validator calls an error."""
     mesh = replace(room.mesh, vertices=room.mesh.vertices.copy())
     own = room.objects[1].vertices
@@ -270,13 +272,13 @@ def test_specks_are_of_the_room_and_not_of_the_object(tmp_path: Path) -> None:
     run = ExportedRoom(things={"dining table": [*table, speck]}).write(tmp_path / "run")
     [found] = read_room(run).objects
     assert found.box.extent == pytest.approx((1.2, 0.8, 0.75), abs=1e-4)
-    [loaded] = export(run, [Format.PLY], tmp_path, Chosen(("1",)))
+    [loaded] = export(run, [ExportFormat.PLY], tmp_path, Chosen(("1",)))
     assert len(read_mesh(loaded).vertices) == len(found.vertices)
-    whole = export(run, [Format.PLY], tmp_path)[0]
+    whole = export(run, [ExportFormat.PLY], tmp_path)[0]
     assert len(read_mesh(whole).triangles) == len(read_mesh(run / "mesh.ply").triangles)
 
 
-def test_fewer_triangles_keep_shape_colors_and_labels(room: Room) -> None:
+def test_fewer_triangles_keep_shape_colors_and_labels(room: UprightRoom) -> None:
     fewer = parts(room, 400)
     assert 200 < sum(len(part.mesh.triangles) for part in fewer) <= 420
     for full, part in zip(parts(room), fewer, strict=True):
@@ -287,7 +289,7 @@ def test_fewer_triangles_keep_shape_colors_and_labels(room: Room) -> None:
     assert decimated(room.mesh, len(room.mesh.triangles)) is room.mesh
 
 
-def test_a_terminal_sees_how_many_triangles_are_decimated(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_terminal_sees_how_many_triangles_are_decimated(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     ours, theirs = pty.openpty()
     fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 100, 0, 0))
     monkeypatch.delenv("TQDM_DISABLE", raising=False)
@@ -302,7 +304,7 @@ def test_a_terminal_sees_how_many_triangles_are_decimated(room: Room, monkeypatc
 
 
 def test_the_same_run_gives_the_same_bytes(run: Path, tmp_path: Path) -> None:
-    formats = [Format.GLB, Format.PLY, Format.USD, Format.OBJ]
+    formats = [ExportFormat.GLB, ExportFormat.PLY, ExportFormat.USD, ExportFormat.OBJ]
     first = export(run, formats, tmp_path / "a", Chosen(triangles=300))
     second = export(run, formats, tmp_path / "b", Chosen(triangles=300))
     assert len(first) == 16
@@ -315,7 +317,7 @@ def test_names_are_identifiers_whatever_the_class(tmp_path: Path) -> None:
     entries = json.loads((run / "instances.json").read_text())
     entries[0]["class"], entries[1]["class"] = "../../étagère 'x'", "日本"
     (run / "instances.json").write_text(json.dumps(entries))
-    written = export(run, [Format.GLB, Format.USD, Format.OBJ, Format.PLY], tmp_path / "out")
+    written = export(run, [ExportFormat.GLB, ExportFormat.USD, ExportFormat.OBJ, ExportFormat.PLY], tmp_path / "out")
     assert {path.stem for path in written} == {"scene", "tag_re_x_1", "object_2"}
     assert {path.parent for path in written} == {tmp_path / "out", tmp_path / "out" / "objects"}
     from pxr import Usd, UsdSemantics
@@ -323,14 +325,16 @@ def test_names_are_identifiers_whatever_the_class(tmp_path: Path) -> None:
     stage = Usd.Stage.Open(str(tmp_path / "out" / "scene.usdc"))
     prim = stage.GetPrimAtPath("/World/object_2")
     assert UsdSemantics.LabelsAPI(prim, "class").GetLabelsAttr().Get() == ["日本"]
-    assert export(run, [Format.GLB], tmp_path / "one", Chosen(("日本",))) == [tmp_path / "one/objects/object_2.glb"]
+    assert export(run, [ExportFormat.GLB], tmp_path / "one", Chosen(("日本",))) == [
+        tmp_path / "one/objects/object_2.glb"
+    ]
 
 
 def test_names_that_are_no_text_are_written_as_their_codes(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     path = run / "instances.json"
     path.write_text(path.read_text().replace('"class": "cube"', '"class": "cube \\ud800"'))
-    export(run, list(Format), tmp_path / "out")
+    export(run, list(ExportFormat), tmp_path / "out")
     nodes = header((tmp_path / "out/scene.glb").read_bytes())["nodes"]
     assert "cube \\ud800" in [node.get("extras", {}).get("class") for node in nodes]
 
@@ -345,7 +349,7 @@ def test_an_object_has_the_colour_of_overview_png_in_all_files(tmp_path: Path) -
     centroids = np.array([mesh.vertices[mesh.instance_ids == key].mean(axis=0) for key in (2, 3)], np.float64)
     expected = dict(zip((2, 3), instance_colors(centroids), strict=True))
     for objects in ((), ("2", "3"), ("3",)):
-        files = export(run, [Format.PLY], tmp_path / "out", Chosen(objects, coloring=Coloring.INSTANCE))
+        files = export(run, [ExportFormat.PLY], tmp_path / "out", Chosen(objects, coloring=Coloring.INSTANCE))
         for path in files:
             found = read_mesh(path)
             for key in {2, 3} & set(found.instance_ids.tolist()):
@@ -362,7 +366,7 @@ def test_an_object_of_three_vertices_is_exported(tmp_path: Path) -> None:
     entries = json.loads((run / "instances.json").read_text())
     entries[1]["vertices"] = 3
     (run / "instances.json").write_text(json.dumps(entries))
-    written = export(run, [Format.GLB, Format.USD, Format.OBJ, Format.PLY], tmp_path / "out")
+    written = export(run, [ExportFormat.GLB, ExportFormat.USD, ExportFormat.OBJ, ExportFormat.PLY], tmp_path / "out")
     assert len(written) == 16
     node = next(one for one in header((tmp_path / "out/scene.glb").read_bytes())["nodes"] if one["name"] == "cube_2")
     assert node["extras"]["id"] == 2
@@ -374,11 +378,16 @@ def test_loose_vertices_are_objects_too(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     mesh = read_mesh(run / "mesh.ply")
     write_mesh(run / "mesh.ply", replace(mesh, triangles=mesh.triangles[:0]))
-    written = export(run, [Format.GLB, Format.USD, Format.PLY, Format.OBJ], tmp_path / "out", Chosen(("cube",)))
+    written = export(
+        run,
+        [ExportFormat.GLB, ExportFormat.USD, ExportFormat.PLY, ExportFormat.OBJ],
+        tmp_path / "out",
+        Chosen(("cube",)),
+    )
     assert len(read_mesh(tmp_path / "out" / "objects" / "cube_2.ply").vertices) == (mesh.instance_ids == 2).sum()
     assert len(written) == 4
     with pytest.raises(DataError, match="nothing was mapped"):
-        export(run, [Format.GLB], tmp_path / "out")
+        export(run, [ExportFormat.GLB], tmp_path / "out")
 
 
 def test_runs_that_ended_early_or_have_no_objects_are_exported(tmp_path: Path) -> None:
@@ -386,33 +395,35 @@ def test_runs_that_ended_early_or_have_no_objects_are_exported(tmp_path: Path) -
     (run / "metrics.json").rename(run / "metrics.partial.json")
     (run / "instances.json").unlink()
     (run / "trajectory.txt").unlink()
-    [scene] = export(run, [Format.PLY])
+    [scene] = export(run, [ExportFormat.PLY])
     assert scene == run / "export" / "scene.ply"
     assert len(read_mesh(scene).vertices) == len(read_mesh(run / "mesh.ply").vertices)
     with pytest.raises(DataError, match="there is no object 'chair' in this run, which has none"):
-        export(run, [Format.PLY], chosen=Chosen(("chair",)))
+        export(run, [ExportFormat.PLY], chosen=Chosen(("chair",)))
 
 
 def test_what_is_asked_for_and_not_there_is_told(run: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="expected the directory of a run"):
-        export(tmp_path, [Format.GLB])
+        export(tmp_path, [ExportFormat.GLB])
     with pytest.raises(DataError, match="there is no object 'cub' in this run; did you mean 'cube'"):
-        export(run, [Format.GLB], tmp_path, Chosen(("cub",)))
+        export(run, [ExportFormat.GLB], tmp_path, Chosen(("cub",)))
     with pytest.raises(DataError, match=r"no 'cube' has a confidence of 0.9; the highest is 0.80"):
-        export(run, [Format.GLB], tmp_path, Chosen(("cube",), min_confidence=0.9))
-    assert export(run, [Format.GLB], tmp_path, Chosen(("2",), min_confidence=0.9)) == [tmp_path / "objects/cube_2.glb"]
-    assert export(run, [Format.GLB], tmp_path, Chosen(min_confidence=0.9)) == [tmp_path / "scene.glb"]
+        export(run, [ExportFormat.GLB], tmp_path, Chosen(("cube",), min_confidence=0.9))
+    assert export(run, [ExportFormat.GLB], tmp_path, Chosen(("2",), min_confidence=0.9)) == [
+        tmp_path / "objects/cube_2.glb"
+    ]
+    assert export(run, [ExportFormat.GLB], tmp_path, Chosen(min_confidence=0.9)) == [tmp_path / "scene.glb"]
     with pytest.raises(DataError, match="triangles must be at least 4, found 0"):
         Chosen(triangles=0)
 
 
 def test_up_may_be_told_where_the_run_does_not_know(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = TURNED.write(tmp_path / "run", figures=False)
-    export(run, [Format.PLY], tmp_path / "as_it_is")
+    export(run, [ExportFormat.PLY], tmp_path / "as_it_is")
     assert "does not tell which way is up" in caplog.text
     assert read_mesh(tmp_path / "as_it_is" / "scene.ply").vertices[:, 1].max() == pytest.approx(1.25, abs=1e-5)
     caplog.clear()
-    export(run, [Format.PLY], tmp_path / "told", up=(0, 2, 0), floor=-1.25)
+    export(run, [ExportFormat.PLY], tmp_path / "told", up=(0, 2, 0), floor=-1.25)
     assert not caplog.text
     assert read_mesh(tmp_path / "told" / "scene.ply").vertices[:, 2].min() == pytest.approx(0, abs=1e-5)
     with pytest.raises(DataError, match="up must be three numbers, a direction"):

@@ -14,13 +14,13 @@ from PIL import Image
 
 from framework.errors import DataError
 from framework.exporting import occupancy, scene_graph
-from framework.exporting.exports import Chosen, Format, export
+from framework.exporting.exports import Chosen, ExportFormat, export
 from framework.exporting.occupancy import Plan, looked_through, plan
 from framework.exporting.relations import relations
 from framework.exporting.rooms import rooms
 from framework.exporting.ros_map import FREE, OCCUPIED, UNKNOWN, levels
 from framework.exporting.surface_points import middles, surface_points
-from framework.exporting.upright_room import Room, read_room
+from framework.exporting.upright_room import UprightRoom, read_room
 from framework.rendering.viewpoint import looking
 from tests.support.scenes.exported_room import CUBE, TABLE, Y_UP, Block, ExportedRoom
 
@@ -29,7 +29,7 @@ RESOLUTION = 0.1
 OFF = 0.05  # m, by which the room is moved along x and y, so that no wall stands between two cells
 
 
-def stored(tmp_path: Path, **scene: object) -> Room:
+def stored(tmp_path: Path, **scene: object) -> UprightRoom:
     return read_room(ExportedRoom(**scene).write(tmp_path / "run"))  # type: ignore[arg-type]
 
 
@@ -39,18 +39,18 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def room(run: Path) -> Room:
+def room(run: Path) -> UprightRoom:
     return read_room(run)
 
 
 @pytest.fixture(scope="module")
-def low(room: Room) -> Plan:
+def low(room: UprightRoom) -> Plan:
     """For a robot that drives under the table."""
     return plan(room, RESOLUTION, 0.5)
 
 
 @pytest.fixture(scope="module")
-def high(room: Room) -> Plan:
+def high(room: UprightRoom) -> Plan:
     return plan(room, RESOLUTION, 1.0)
 
 
@@ -73,7 +73,7 @@ def test_pieces_of_a_triangle_are_equal(n: int) -> None:
     assert weights.min() > 0
 
 
-def test_surface_points_are_of_their_objects_and_as_near_as_asked(room: Room) -> None:
+def test_surface_points_are_of_their_objects_and_as_near_as_asked(room: UprightRoom) -> None:
     found = surface_points(room, 0.02)
     cube = found.points[found.owner == 2]
     np.testing.assert_allclose(cube.min(axis=0), (1.25, 1.25, 0.75), atol=0.01)
@@ -119,7 +119,7 @@ def test_walls_are_where_they_stand(low: Plan) -> None:
     assert low.wall.sum() == low.wall[1:-1, [1, -2]].sum() + low.wall[[1, -2], 2:-2].sum()
 
 
-def test_free_is_what_was_looked_through_above_a_floor_that_was_seen(room: Room, low: Plan) -> None:
+def test_free_is_what_was_looked_through_above_a_floor_that_was_seen(room: UprightRoom, low: Plan) -> None:
     open_floor = low.floor & ~low.occupied
     assert low.free[open_floor].mean() > 0.95
     assert not (low.free & ~open_floor).any()
@@ -128,7 +128,7 @@ def test_free_is_what_was_looked_through_above_a_floor_that_was_seen(room: Room,
     np.testing.assert_array_equal(blind.occupied, low.occupied)
 
 
-def test_places_behind_a_surface_were_not_looked_through(room: Room) -> None:
+def test_places_behind_a_surface_were_not_looked_through(room: UprightRoom) -> None:
     """From one camera before a wall of the table's height, exactly on its optical axis and beyond."""
     pose = np.eye(4)
     pose[:3, :3] = looking(np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]))
@@ -139,7 +139,7 @@ def test_places_behind_a_surface_were_not_looked_through(room: Room) -> None:
 
 
 def test_what_the_ros_map_says_is_what_map_server_reads(run: Path, low: Plan, tmp_path: Path) -> None:
-    written = export(run, [Format.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
+    written = export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION, robot_height=0.5))
     assert [path.name for path in written] == ["floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"]
     said = yaml.safe_load((tmp_path / "map.yaml").read_text())
     image = Image.open(tmp_path / said["image"])
@@ -163,7 +163,7 @@ def test_what_the_ros_map_says_is_what_map_server_reads(run: Path, low: Plan, tm
 
 
 def test_footprints_are_polygons_in_metres(run: Path, tmp_path: Path) -> None:
-    export(run, [Format.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION))
+    export(run, [ExportFormat.FLOORPLAN], tmp_path, Chosen(resolution=RESOLUTION))
     found = json.loads((tmp_path / "floor_plan.geojson").read_text())
     assert found["type"] == "FeatureCollection"
     assert "not longitude and latitude" in found["coordinates_are"]
@@ -179,8 +179,8 @@ def test_footprints_are_polygons_in_metres(run: Path, tmp_path: Path) -> None:
 
 
 def test_the_plan_is_a_picture_of_the_room(run: Path, tmp_path: Path) -> None:
-    export(run, [Format.FLOORPLAN], tmp_path / "a", Chosen(resolution=RESOLUTION))
-    export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path / "b", Chosen(resolution=RESOLUTION))
+    export(run, [ExportFormat.FLOORPLAN], tmp_path / "a", Chosen(resolution=RESOLUTION))
+    export(run, [ExportFormat.FLOORPLAN, ExportFormat.GRAPH], tmp_path / "b", Chosen(resolution=RESOLUTION))
     for name in ("floor_plan.png", "floor_plan.geojson", "map.pgm", "map.yaml"):
         assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
     image = np.asarray(Image.open(tmp_path / "a" / "floor_plan.png").convert("RGB"))
@@ -196,7 +196,7 @@ def test_any_name_can_be_written_on_a_plan(tmp_path: Path) -> None:
     for entry, name in zip(entries, names, strict=True):
         entry["class"] = name
     (run / "instances.json").write_text(json.dumps(entries))
-    export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
+    export(run, [ExportFormat.FLOORPLAN, ExportFormat.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
     found = json.loads((tmp_path / "scene_graph.json").read_text())
     jsonschema.validate(found, SCHEMA)
     assert tuple(node["class"] for node in found["nodes"][:3]) == names
@@ -205,13 +205,13 @@ def test_any_name_can_be_written_on_a_plan(tmp_path: Path) -> None:
 def test_a_room_without_objects_has_a_plan(tmp_path: Path) -> None:
     run = ExportedRoom().write(tmp_path / "run")
     (run / "instances.json").unlink()
-    assert len(export(run, [Format.FLOORPLAN, Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))) == 5
+    assert len(export(run, [ExportFormat.FLOORPLAN, ExportFormat.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))) == 5
     found = json.loads((tmp_path / "scene_graph.json").read_text())
     assert [node["kind"] for node in found["nodes"]] == ["floor", "walls", "room"]
     assert found["edges"] == []
 
 
-def test_a_cube_is_on_the_table_and_the_table_on_the_floor(room: Room, low: Plan) -> None:
+def test_a_cube_is_on_the_table_and_the_table_on_the_floor(room: UprightRoom, low: Plan) -> None:
     found = relations(room, low)
     assert told(found, 2) == [("on", 1)]
     assert told(found, 1) == [("on", "floor")]
@@ -294,7 +294,7 @@ def test_a_bag_under_a_table_is_not_in_it(tmp_path: Path) -> None:
 
 def test_the_graph_keeps_its_schema(run: Path, tmp_path: Path) -> None:
     jsonschema.Draft202012Validator.check_schema(SCHEMA)
-    [path] = export(run, [Format.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
+    [path] = export(run, [ExportFormat.GRAPH], tmp_path, Chosen(resolution=RESOLUTION))
     graph = json.loads(path.read_text())
     jsonschema.validate(graph, SCHEMA)
     names = [node["id"] for node in graph["nodes"]]
@@ -322,7 +322,7 @@ TWO_ROOMS = {
 
 def test_a_door_separates_two_rooms(tmp_path: Path) -> None:
     run = ExportedRoom(**TWO_ROOMS, blocks=divided(0.9), R_world_room=Y_UP).write(tmp_path / "run")  # type: ignore[arg-type]
-    [path] = export(run, [Format.GRAPH])
+    [path] = export(run, [ExportFormat.GRAPH])
     graph = json.loads(path.read_text())
     jsonschema.validate(graph, SCHEMA)
     assert [node["id"] for node in graph["nodes"] if node["kind"] == "room"] == ["room_1", "room_2"]
@@ -365,18 +365,18 @@ def test_furniture_and_gaps_do_not_separate_rooms() -> None:
 
 def test_what_a_plan_needs_to_know_is_asked_for(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     run = ExportedRoom().write(tmp_path / "run", figures=False)
-    for kind in (Format.FLOORPLAN, Format.GRAPH):
+    for kind in (ExportFormat.FLOORPLAN, ExportFormat.GRAPH):
         with pytest.raises(DataError, match=f"does not tell which way is up, which {kind.value} needs: --up X Y Z"):
             export(run, [kind])
     with pytest.raises(DataError, match="does not tell how high the floor is, which floorplan needs: --floor M"):
-        export(run, [Format.FLOORPLAN], up=(0, 0, 1))
-    [path] = export(run, [Format.GRAPH], up=(0, 0, 1))
+        export(run, [ExportFormat.FLOORPLAN], up=(0, 0, 1))
+    [path] = export(run, [ExportFormat.GRAPH], up=(0, 0, 1))
     assert "without floor, walls and rooms" in caplog.text
     assert {node["kind"] for node in json.loads(path.read_text())["nodes"]} == {"object"}
-    assert len(export(run, [Format.FLOORPLAN], up=(0, 0, 1), floor=0)) == 4
+    assert len(export(run, [ExportFormat.FLOORPLAN], up=(0, 0, 1), floor=0)) == 4
 
 
-def test_plans_have_bounds(room: Room, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plans_have_bounds(room: UprightRoom, monkeypatch: pytest.MonkeyPatch) -> None:
     for wrong in ({"resolution": 0.0}, {"robot_height": 9.0}, {"min_confidence": float("nan")}):
         with pytest.raises(Exception, match=f"{next(iter(wrong))}"):
             Chosen(**wrong)

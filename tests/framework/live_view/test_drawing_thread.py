@@ -13,7 +13,7 @@ import pytest
 
 from framework.data import Pose
 from framework.live_view.drawing_thread import Background
-from framework.live_view.updates import FrameNote, MapSnapshot, Picture
+from framework.live_view.updates import FrameNote, FrameUpdate, MapSnapshot
 from framework.pipeline import Pipeline
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
 
@@ -29,12 +29,12 @@ class Notebook:
     fails_to_close: bool = False
     notes: list[FrameNote] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[FrameUpdate] = field(default_factory=list)
     maps: list[MapSnapshot] = field(default_factory=list)
     threads: set[str] = field(default_factory=set)
     closed: bool = False
 
-    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: Picture | None) -> None:
+    def draw_frames(self, notes: Sequence[FrameNote], faults: Sequence[str], picture: FrameUpdate | None) -> None:
         self.threads.add(threading.current_thread().name)
         if self.fails:
             raise OSError(28, "No space left on device")

@@ -13,7 +13,7 @@ from omegaconf import OmegaConf
 
 from framework.geometry import inverse
 from framework.reporting.run_contents import RunContents
-from framework.reporting.run_source import Recording, TruePath
+from framework.reporting.run_source import RunSource, TruePath
 from framework.reporting.source_frames import BLURRED, Footage
 from framework.runs.provenance import config_hash
 from tests.support.reported_run import write_run
@@ -46,7 +46,7 @@ def change_config(directory: Path, **dataset: Any) -> None:
 def test_each_pose_gets_its_frame_also_after_one_that_was_skipped(tmp_path: Path) -> None:
     contents = RunContents.read(write_run(tmp_path / "run", unreadable=2, frames=6))
     assert contents.tracked_frames == (0, 1, 3, 4, 5)
-    recording = Recording.of(contents)
+    recording = RunSource.of(contents)
     assert recording.why_not == ""
     frames = [recording.frame(k) for k in range(5)]
     assert [frame.index for frame in frames if frame is not None] == [0, 1, 3, 4, 5]
@@ -60,7 +60,7 @@ def test_frames_without_a_pose_are_lost_ones(directory: Path) -> None:
     (directory / "trajectory.txt").write_text("\n".join(poses[:2] + poses[3:]) + "\n")
     contents = RunContents.read(directory)
     assert (contents.tracked_frames, contents.lost_frames) == ((0, 1, 3, 4, 5), (2,))
-    frame = Recording.of(contents).frame(2)
+    frame = RunSource.of(contents).frame(2)
     assert frame is not None
     assert frame.index == 3
 
@@ -76,7 +76,7 @@ def test_frames_without_a_pose_are_lost_ones(directory: Path) -> None:
 )
 def test_what_is_not_the_recording_is_none_and_it_says_why(directory: Path, dataset: dict, said: str) -> None:
     change_config(directory, **dataset)
-    recording = Recording.of(RunContents.read(directory))
+    recording = RunSource.of(RunContents.read(directory))
     assert said in recording.why_not
     assert recording.frame(0) is None
     assert recording.camera is None
@@ -87,16 +87,16 @@ def test_what_is_not_the_recording_is_none_and_it_says_why(directory: Path, data
 
 def test_another_truth_is_not_taken_for_the_one_of_the_run(directory: Path) -> None:
     contents = RunContents.read(directory)
-    assert Recording.of(contents).scene_truth()[0] is not None
+    assert RunSource.of(contents).scene_truth()[0] is not None
     metrics = json.loads((directory / "metrics.json").read_text()) | {"truth_sha256": "0" * 64}
     (directory / "metrics.json").write_text(json.dumps(metrics))
-    truth, why = Recording.of(RunContents.read(directory)).scene_truth()
+    truth, why = RunSource.of(RunContents.read(directory)).scene_truth()
     assert truth is None
     assert "no longer those" in why
 
 
 def test_footage_has_pictures_true_places_and_how_sharp_they_are(mapped: Path) -> None:
-    recording = Recording.of(RunContents.read(mapped))
+    recording = RunSource.of(RunContents.read(mapped))
     assert recording.camera is not None
     footage = Footage.of(recording, [0, 3], recording.camera)
     assert footage.frames == {0: 0, 3: 3}

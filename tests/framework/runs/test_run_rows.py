@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from framework.runs.run_rows import Mean, Row, following, rows_of
+from framework.runs.run_rows import Mean, RunRow, following, rows_of
 from framework.runs.stored_runs import Record
 
 AP = "instances.ap50"
@@ -21,8 +21,8 @@ def record(config: dict[str, Any], ap: object = 0.5, written: float = 0.0, **cho
     return Record(Path("somewhere"), metrics, config, written)
 
 
-def row(name: str, **figures: object) -> Row:
-    return Row(name, {(run.removeprefix("seed"),): record({}, figure) for run, figure in figures.items()})
+def row(name: str, **figures: object) -> RunRow:
+    return RunRow(name, {(run.removeprefix("seed"),): record({}, figure) for run, figure in figures.items()})
 
 
 def names(records: list[Record], *order: str, over: tuple[str, ...] = ("seed",)) -> dict[str, list[tuple[str, ...]]]:
@@ -178,9 +178,9 @@ def test_rows_of_other_data_are_told_apart_though_each_has_but_one() -> None:
 def test_a_row_tells_its_poses_in_words() -> None:
     given = record({}, tracker="ground_truth")
     given = Record(given.directory, {**given.metrics, "pose_source": "ground_truth"}, {}, 0.0)
-    assert Row("a", {("0",): given}).poses == "ground truth"
+    assert RunRow("a", {("0",): given}).poses == "ground truth"
     tracked = {(str(seed),): record({}, tracker=name) for seed, name in enumerate(("pnp", "icp", "icp"))}
-    assert Row("b", tracked).poses == "tracked (icp/pnp)"
+    assert RunRow("b", tracked).poses == "tracked (icp/pnp)"
 
 
 def test_rows_can_be_averaged_over_anything() -> None:

@@ -15,11 +15,11 @@ from framework.errors import ConfigError, DataError
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.furniture.groups import toilet_group
 from framework.synthetic.scene_writers import FRAMES_AT_ONCE, _choose, _Scene, write_scenes
-from framework.synthetic.scenenn_scene import GENERATION, Recording, SceneNNScene, frame_files, trajectory_file
+from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
 
 SPEC = SceneSpec("bathroom", (toilet_group,), {"toilet": 1})
 SPECS = {"007": SPEC, "008": SPEC}
-RECORDING = Recording(seed=1, frames=FRAMES_AT_ONCE + 2, width=64)
+RECORDING = BenchmarkSettings(seed=1, frames=FRAMES_AT_ONCE + 2, width=64)
 
 
 def contents(folder: Path) -> dict[str, bytes]:
@@ -77,8 +77,10 @@ def test_what_all_scenes_share(root: Path) -> None:
     assert not list(root.rglob(".*")), "nothing unfinished is left"
 
 
-@pytest.mark.parametrize("other", [Recording(seed=2, frames=10, width=64), Recording(seed=1, frames=9, width=64)])
-def test_rooms_of_other_parameters_are_not_mixed(root: Path, other: Recording) -> None:
+@pytest.mark.parametrize(
+    "other", [BenchmarkSettings(seed=2, frames=10, width=64), BenchmarkSettings(seed=1, frames=9, width=64)]
+)
+def test_rooms_of_other_parameters_are_not_mixed(root: Path, other: BenchmarkSettings) -> None:
     before = times(root)
     with pytest.raises(ConfigError, match=r"other parameters.*choose another folder"):
         write_scenes(root, SPECS, other, jobs=1)
@@ -108,7 +110,7 @@ def test_a_process_that_dies_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_process_stays_with_its_scene_then_takes_an_untouched_one_then_helps(tmp_path: Path) -> None:
-    recording = Recording(frames=3 * FRAMES_AT_ONCE, width=64)
+    recording = BenchmarkSettings(frames=3 * FRAMES_AT_ONCE, width=64)
     first, second = (_Scene(tmp_path / name, SPEC, recording) for name in ("007", "008"))
     scenes = [first, second]
     assert _choose(scenes, None) is first

@@ -27,7 +27,7 @@ from framework.synthetic.scenenn_scene import (
     ASUS,
     GENERATION,
     T_YUP_ZUP,
-    Recording,
+    BenchmarkSettings,
     SceneNNScene,
     frame_files,
     trajectory_file,
@@ -35,7 +35,7 @@ from framework.synthetic.scenenn_scene import (
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO, SPACES
 
 SPEC = SceneSpec("bathroom", (toilet_group, lambda rng: chair_row(rng, 2)), {"toilet": 1, "chair": 2})
-RECORDING = Recording(seed=3, frames=9, width=160)
+RECORDING = BenchmarkSettings(seed=3, frames=9, width=160)
 SHOWN = (0, 4, 8)
 
 
@@ -135,7 +135,7 @@ def test_depth_is_in_millimetres_and_agrees_with_the_mesh(scene: SceneNNScene, m
 
 
 def test_the_camera_is_scenenns() -> None:
-    assert Recording().camera == ASUS
+    assert BenchmarkSettings().camera == ASUS
     assert RECORDING.camera.shape == (120, 160)
     assert RECORDING.camera.fx == pytest.approx(544.47329 / 4)
     assert RECORDING.release == f"synthetic {GENERATION}, seed 3, 9 frames"
@@ -146,7 +146,7 @@ def test_the_camera_is_scenenns() -> None:
 )
 def test_impossible_recordings_are_refused(wrong: dict[str, float]) -> None:
     with pytest.raises(ConfigError, match=next(iter(wrong))):
-        Recording(**wrong)
+        BenchmarkSettings(**wrong)
 
 
 def test_at_half_the_rate_each_frame_shows_and_blurs_what_every_other_one_did(

@@ -14,7 +14,7 @@ from omegaconf import OmegaConf
 
 from framework.errors import DataError
 from framework.runs.provenance import config_hash
-from framework.synthetic.scenenn_scene import Recording
+from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
 from framework.tables.layouts import head
 
@@ -193,8 +193,9 @@ def test_published_run_times_stand_below_those_on_scenenn(sweep: Path, annotatio
 @pytest.mark.parametrize(
     ("dataset", "annotation", "only"),
     [
-        ("scenenn", Recording().release, ""),
-        ("scenenn", Recording().release, "chain"),  # one row was measured in the rooms, the others on the real data
+        ("scenenn", BenchmarkSettings().release, ""),
+        # one row was measured in the rooms, the others on the real data
+        ("scenenn", BenchmarkSettings().release, "chain"),
         ("scannet", "ScanNet v2", ""),
         ("synthetic", None, ""),
     ],

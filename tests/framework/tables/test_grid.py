@@ -6,9 +6,9 @@ import math
 
 import pytest
 
-from framework.tables.grid import Grid, decimals, figure, latex_grid, markdown_grid
+from framework.tables.grid import TextTable, decimals, figure, latex_grid, markdown_grid
 
-GRID = Grid(
+GRID = TextTable(
     heads=["scene", "a_b", "x"],
     body=[["011", "y|z", "0.5 ± 0.1"], ["", "50%", "–"]],
     label_columns=2,
@@ -29,11 +29,11 @@ def test_markdown_is_padded_and_words_stand_left() -> None:
 @pytest.mark.parametrize("name", ["*star", "[optional]"])
 def test_latex_takes_no_cell_for_an_argument(name: str) -> None:
     """A star or a bracket behind the \\\\ or the rule of the line above is an argument of that."""
-    assert f"{{}}{name} & 1 \\\\" in latex_grid(Grid(["row", "x"], [[name, "1"]]))
+    assert f"{{}}{name} & 1 \\\\" in latex_grid(TextTable(["row", "x"], [[name, "1"]]))
 
 
 def test_a_line_break_ends_no_line_of_a_table() -> None:
-    grid = Grid(["row", "x"], [["a\nb", "1"]])
+    grid = TextTable(["row", "x"], [["a\nb", "1"]])
     assert "a b & 1 \\\\" in latex_grid(grid)
     assert "| a b | 1 |" in markdown_grid(grid)
 

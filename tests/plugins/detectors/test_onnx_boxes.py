@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera, Frame
-from framework.detection.candidates import Layout
+from framework.detection.candidates import OutputLayout
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.masks.letterbox import Placement
 from framework.errors import ConfigError, DataError
@@ -42,18 +42,18 @@ def outputs_of(layout):
     boxes = np.array([BOX, BOX + 20, BOX - 10])
     scores = np.array([[0.2, 0.6, 0.0], [0.1, 0.1, 0.9], [0.01, 0.02, 0.0]])
     rows = np.array([center_size(box) for box in boxes])
-    if layout is Layout.yolo:
+    if layout is OutputLayout.yolo:
         return {"output0": np.concatenate([rows, scores], axis=1).T[None]}
-    if layout is Layout.yolo_objectness:
+    if layout is OutputLayout.yolo_objectness:
         return {"output": np.concatenate([rows, np.full((3, 1), 0.5), 2 * scores.clip(0, 0.5)], axis=1)[None]}
-    if layout is Layout.yolox:
+    if layout is OutputLayout.yolox:
         table = np.zeros((1, 7 * 10 + 3 * 5 + 1 * 2, 8))
         table[0, 14] = [*(rows[0, :2] / 8 - (4, 1)), *np.log(rows[0, 2:] / 8), 0.8, 0.25, 0.75, 0.0]  # cell (4, 1)
         return {"output": table}
     unit = boxes / [80, 60, 80, 60]
-    if layout is Layout.ssd_unit:
+    if layout is OutputLayout.ssd_unit:
         return {"boxes": unit[None], "scores": np.c_[[0.2, 0, 0.9], scores][None]}
-    if layout is Layout.ssd_tensorflow:
+    if layout is OutputLayout.ssd_tensorflow:
         return {
             "detection_boxes": unit[None][..., [1, 0, 3, 2]],
             "detection_scores": np.array([[0.6, 0.9, 0.02]]),
@@ -63,12 +63,12 @@ def outputs_of(layout):
 
 
 EXPECTED = {  # score, and distribution over chair and cup
-    Layout.yolo: (0.6, [0.25, 0.75]),
-    Layout.yolo_objectness: (0.5, [2 / 7, 5 / 7]),
-    Layout.yolox: (0.6, [0.25, 0.75]),
-    Layout.ssd_unit: (0.6, [0.25, 0.75]),
-    Layout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # 0.2 0.6 0.2, without the wall
-    Layout.ssd_torchvision: (0.6, [0.25, 0.75]),
+    OutputLayout.yolo: (0.6, [0.25, 0.75]),
+    OutputLayout.yolo_objectness: (0.5, [2 / 7, 5 / 7]),
+    OutputLayout.yolox: (0.6, [0.25, 0.75]),
+    OutputLayout.ssd_unit: (0.6, [0.25, 0.75]),
+    OutputLayout.ssd_tensorflow: (0.6, [0.25, 0.75]),  # 0.2 0.6 0.2, without the wall
+    OutputLayout.ssd_torchvision: (0.6, [0.25, 0.75]),
 }
 
 
@@ -79,7 +79,7 @@ def tiny(folder, layout, **parameters):
     return OnnxBoxes(weights=weights, sha256="", labels=str(labels), layout=layout, device="cpu", **parameters)
 
 
-@pytest.mark.parametrize("layout", Layout)
+@pytest.mark.parametrize("layout", OutputLayout)
 def test_a_known_network_finds_the_cup(tmp_path, layout):
     detector = tiny(tmp_path, layout)
     assert detector.classes == ("cup", "chair")  # COCO's order
@@ -105,7 +105,7 @@ def test_where_the_image_lies_in_the_input_is_undone(tmp_path, placement):
         weights=weights,
         sha256="",
         labels=str(labels),
-        layout=Layout.yolo,
+        layout=OutputLayout.yolo,
         placement=placement,
         device="cpu",
         min_readings=1.0,
@@ -120,7 +120,7 @@ def test_where_the_image_lies_in_the_input_is_undone(tmp_path, placement):
 
 def test_a_box_without_depth_is_dropped_counted_and_said_once(tmp_path, caplog):
     caplog.set_level("WARNING")
-    detector = tiny(tmp_path, Layout.yolo)
+    detector = tiny(tmp_path, OutputLayout.yolo)
     blind = replace(frame(7), depth=np.zeros((120, 160), np.float32))
     for dropped in (1, 2):
         assert len(detector.detect(blind)) == 0
@@ -135,7 +135,7 @@ def test_two_boxes_of_one_thing_come_back_as_the_better(tmp_path):
     labels = tmp_path / "labels.txt"
     labels.write_text("\n".join(LABELS))
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": rows[None]})
-    parameters = {"weights": weights, "sha256": "", "labels": str(labels), "layout": Layout.yolo, "device": "cpu"}
+    parameters = {"weights": weights, "sha256": "", "labels": str(labels), "layout": OutputLayout.yolo, "device": "cpu"}
     np.testing.assert_allclose(OnnxBoxes(**parameters).detect(frame()).scores, [0.6])
     np.testing.assert_allclose(OnnxBoxes(**parameters, agnostic_nms=1.0).detect(frame()).scores, [0.6, 0.5])
 
@@ -143,10 +143,10 @@ def test_two_boxes_of_one_thing_come_back_as_the_better(tmp_path):
 def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_path):
     weights = constant_network(tmp_path / "n.onnx", (1, 3, *SHAPE), {"y": np.zeros((1, 6, 9))})
     with pytest.raises(DataError, match="84 columns"):
-        OnnxBoxes(weights=weights, sha256="", layout=Layout.yolo, device="cpu")
+        OnnxBoxes(weights=weights, sha256="", layout=OutputLayout.yolo, device="cpu")
     (tmp_path / "labels.txt").write_text("chair\nflibbertigibbet")
     with pytest.raises(ConfigError, match="flibbertigibbet"):
-        OnnxBoxes(weights=weights, labels=str(tmp_path / "labels.txt"), layout=Layout.yolo, device="cpu")
+        OnnxBoxes(weights=weights, labels=str(tmp_path / "labels.txt"), layout=OutputLayout.yolo, device="cpu")
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import pytest
 
 from framework.commands.recordings import synthesize
 from framework.synthetic.benchmark import SCENES
-from framework.synthetic.scenenn_scene import Recording
+from framework.synthetic.scenenn_scene import BenchmarkSettings
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
@@ -47,7 +47,7 @@ def test_it_writes_all_scenes_unless_told_which(
     monkeypatch.setattr(synthesize, "write_scenes", lambda *arguments: asked.append(arguments))
     run(monkeypatch, str(tmp_path), "--jobs", "3")
     run(monkeypatch, str(tmp_path), "--scenes", "couches,bedroom", "--seed", "2", "--frames", "30", "--width", "320")
-    assert asked[0] == (tmp_path, SCENES, Recording(), 3)
+    assert asked[0] == (tmp_path, SCENES, BenchmarkSettings(), 3)
     assert list(asked[1][1]) == ["couches", "bedroom"]
-    assert asked[1][2] == Recording(seed=2, frames=30, width=320)
+    assert asked[1][2] == BenchmarkSettings(seed=2, frames=30, width=320)
     assert f"dataset.root={tmp_path} dataset.scene=living_chairs" in capsys.readouterr().out

@@ -10,7 +10,7 @@ import pytest
 
 from framework.data import Camera
 from framework.datasets.scenenn.intrinsics import write_intrinsics
-from framework.datasets.scenenn.scenenn import SceneNN, Sensor
+from framework.datasets.scenenn.scenenn import SceneNN, SceneNNSensor
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
 from framework.datasets.scenenn.timestamps import write_timestamps
 from framework.datasets.scenenn.trajectory_log import write_trajectory_log
@@ -217,6 +217,6 @@ def test_tables_learn_the_release_of_the_annotation(root: Path) -> None:
 
 def test_the_sensor_names_the_file_of_intrinsics(root: Path) -> None:
     with pytest.raises(DataError, match=r"kinect2\.ini"):
-        SceneNN(root, "016", sensor=Sensor.KINECT2)
+        SceneNN(root, "016", sensor=SceneNNSensor.KINECT2)
     write_intrinsics(root / "intrinsic" / "kinect2.ini", Camera(32, 24, 29.0, 28.0, 16.0, 12.0))
-    assert SceneNN(root, "016", sensor=Sensor.KINECT2).camera.fx == 29.0
+    assert SceneNN(root, "016", sensor=SceneNNSensor.KINECT2).camera.fx == 29.0

@@ -9,7 +9,7 @@ import pytest
 
 from framework.data import Detections, Pose
 from framework.mapping.labels.vertex_labels import REACH, vertex_labels
-from framework.mapping.voxels.meshing import Surface
+from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.voxel_grid import UNSEEN, find_block
 from framework.refinement.lifting import lift
 from framework.registry import assemble
@@ -89,7 +89,7 @@ def test_agrees_with_the_slow_one(fuser: BayesianTsdf, dropped: tuple[int, ...])
 def test_a_vertex_where_nothing_is_mapped_shows_nothing(fuser: BayesianTsdf) -> None:
     scene = fuser.scene
     counts = np.ones(scene.table.last_id + 1, np.bool_)
-    far = Surface(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))
+    far = UnlabeledMesh(np.full((1, 3), 1e3, np.float32), np.zeros((0, 3), np.int32), np.zeros(1, np.int32))
     _, instances, classes = vertex_labels(scene.volume.voxels.grid, scene.labels.evidence, counts, far)
     assert instances.tolist() == [0]
     assert classes.tolist() == [-1]

@@ -10,7 +10,7 @@ from scipy.spatial import KDTree
 
 from framework.data import Detections, Frame, InstanceMesh, Pose
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.voxels.meshing import MAX_JUMP, Surface, SurfaceNets
+from framework.mapping.voxels.meshing import MAX_JUMP, SurfaceNets, UnlabeledMesh
 from framework.mapping.voxels.voxel_grid import UNSEEN, VoxelGrid
 from framework.refinement.lifting import lift
 from framework.registry import assemble
@@ -125,8 +125,8 @@ def test_a_sphere_is_closed_and_faces_outwards(sphere: VoxelGrid) -> None:
     assert error.max() < 0.06 * VOXEL
 
 
-def copied(surface: Surface) -> Surface:
-    return Surface(*(array.copy() for array in surface))
+def copied(surface: UnlabeledMesh) -> UnlabeledMesh:
+    return UnlabeledMesh(*(array.copy() for array in surface))
 
 
 def test_only_changed_blocks_are_read_again(sphere: VoxelGrid) -> None:
