@@ -10,9 +10,7 @@ from framework.interfaces import MapFuser
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
-from plugins.fusers.label_count import LabelCount
-from plugins.fusers.last_write import LastWrite
-from plugins.fusers.max_confidence import MaxConfidence
+from plugins.fusers.label_vote import LabelVote, Vote
 from plugins.fusers.open3d_vbg import Open3DVoxelBlockGrid
 from tests.support.scenes.analytic_scene import CAMERA, room, walk
 
@@ -26,17 +24,19 @@ def product() -> np.ndarray:
 
 
 @pytest.mark.parametrize(
-    ("fuser_class", "expected"),
+    ("fuser_class", "parameters", "expected"),
     [
-        (BayesianTsdf, product()),
-        (LabelCount, [2 / 3, 0, 1 / 3]),
-        (LastWrite, [1, 0, 0]),
-        (MaxConfidence, [0.5 / 1.4, 0, 0.9 / 1.4]),  # the best score of each class
-        (Open3DVoxelBlockGrid, product()),
+        (BayesianTsdf, {}, product()),
+        (LabelVote, {"vote": Vote.COUNT}, [2 / 3, 0, 1 / 3]),
+        (LabelVote, {"vote": Vote.LAST}, [1, 0, 0]),
+        (LabelVote, {"vote": Vote.MAX_SCORE}, [0.5 / 1.4, 0, 0.9 / 1.4]),  # the best score of each class
+        (Open3DVoxelBlockGrid, {}, product()),
     ],
 )
-def test_each_rule_has_its_own_opinion(fuser_class: type[MapFuser], expected: np.ndarray) -> None:
-    fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0)
+def test_fuser_class_probabilities_follow_its_label_rule(
+    fuser_class: type[MapFuser], parameters: dict[str, object], expected: np.ndarray
+) -> None:
+    fuser = assemble(fuser_class, voxel_size=0.02, max_depth=4.0, **parameters)
     for k, (T, (score, probabilities)) in enumerate(zip(walk(3), SEEN, strict=True)):
         frame = room().frame(T, k)
         assert frame.truth is not None

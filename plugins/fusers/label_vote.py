@@ -1,8 +1,9 @@
-"""Voxblox++'s label rule: a voxel counts how often it was seen as each instance and as each class."""
+"""Label rules without a distribution: each detection votes for its instance and its best class."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 
@@ -14,24 +15,35 @@ from framework.mapping.labels.label_evidence import Combine
 from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
 
-RULE = LabelRule(Combine.SUM, logarithmic=False, units=1)
+
+class Vote(Enum):
+    """How a voxel combines the votes for its labels."""
+
+    COUNT = "count"  # number of detections (Voxblox++, Grinvald et al. 2019)
+    LAST = "last"  # the last detection only; where masks overlap, the later one
+    MAX_SCORE = "max_score"  # the detection with the highest score
+
+
+RULES = {
+    Vote.COUNT: LabelRule(Combine.SUM, logarithmic=False, units=1),
+    Vote.LAST: LabelRule(Combine.LATEST, logarithmic=False),
+    Vote.MAX_SCORE: LabelRule(Combine.LARGEST, logarithmic=False, units=1 << 14),  # scores are at most 1
+}
 
 
 @dataclass
-class LabelCount(MapFuser):
-    """Every detection counts as one for its instance and its best class, whatever its score (Grinvald et al. 2019).
-
-    The label with the highest count wins; nothing counts against one.
-    """
+class LabelVote(MapFuser):
+    """The label with the most votes wins. There is no evidence against a label."""
 
     voxels: LabeledVoxels = field(default_factory=LabeledVoxels)
     association: Association = field(default_factory=Association)
+    vote: Vote = Vote.COUNT
 
     def __post_init__(self) -> None:
-        self.scene: InstanceMap = self.voxels.new_map(RULE)
+        self.scene: InstanceMap = self.voxels.new_map(RULES[self.vote])
 
     def go_on(self, scene: SceneMap) -> None:
-        self.scene = self.voxels.continued(scene, RULE)
+        self.scene = self.voxels.continued(scene, RULES[self.vote])
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
         self.scene.begin(clusters.classes)
@@ -39,8 +51,11 @@ class LabelCount(MapFuser):
         overlaps = self.association.look_up(self.scene, frame, pose, points)
         matches = self.association.associate(self.scene.table, overlaps, clusters, points, frame.index)
         seen = self.scene.volume.integrate(frame, pose.T_world_camera, self.voxels.hashing.near)
-        evidence = vote_for_best(clusters, np.ones(len(clusters), np.float32))
-        measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULE)
+        weights = np.ones(len(clusters), np.float32)
+        if self.vote is Vote.MAX_SCORE:
+            weights = np.maximum(clusters.scores, np.finfo(np.float32).tiny)  # 0 is no evidence
+        evidence = vote_for_best(clusters, weights)
+        measurement = self.voxels.measurement(self.scene.table, points, matches, evidence, RULES[self.vote])
         self.scene.labels.update(seen, measurement)
         self.association.observe(self.scene.table, matches, evidence.classes)
         self.association.merge(self.scene, matches)
