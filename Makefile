@@ -24,7 +24,7 @@ help: ## this list
 
 .PHONY: demo
 demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
-	@$(BIN)/python -m framework dataset=desk hydra.run.dir=$(DEMO)
+	@$(BIN)/python -m framework hydra.run.dir=$(DEMO)
 	@page="$$($(BIN)/python -m framework report $(DEMO))"; echo "report: $$page"
 
 .PHONY: test

@@ -71,6 +71,10 @@ def test_a_dataset_of_another_package_needs_to_do_nothing(tmp_path: Path) -> Non
     assert chosen(path, "dataset=their_rooms", "detector=none")["detector"] == "none"
 
 
+def test_default_dataset_is_the_desk() -> None:
+    assert chosen() == {"dataset": "desk", "detector": "maskrcnn2go"}
+
+
 def test_without_a_dataset_as_from_python_it_is_the_one_of_photographs() -> None:
     assert composed("~dataset").detector == registered.composed("detector", "maskrcnn2go").detector
 

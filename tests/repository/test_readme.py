@@ -140,7 +140,7 @@ OWN = [
 DEFAULTS = "python -m framework"
 RUNNABLE = {  # what to append, by a command that then takes seconds
     # twice as large: of what is left of a noisy room in a quarter of 160x120, tracking is not to be had
-    DEFAULTS: [*SMALL, "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
+    DEFAULTS: [*SMALL, "dataset=synthetic", "dataset.width=320", "dataset.height=240", "hydra.run.dir=defaults"],
     "python -m framework dataset=synthetic detector=simulated": [*SMALL, "hydra.run.dir=outputs/demo"],
     "python -m framework tracker=ground_truth fuser.voxel_size=0.02": [*OWN, "hydra.run.dir=coarse"],
     "python -m framework -m refiner=identity,kmeans,gmm_em": [*OWN, "hydra.sweep.dir=outputs/table3_map"],
