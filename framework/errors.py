@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 LONGEST_WORD = 200  # characters of what was given, such as a name, that a message repeats
 LONGEST_MESSAGE = 1000  # characters; a list of all options or of many labels has some 500
@@ -59,3 +63,21 @@ def _shortened(text: str, most: int) -> str:
 def in_one_line(said: object) -> str:
     """What a library says of a fault, for a message of ours; the kind of the fault where it says nothing."""
     return " ".join(str(said).split()) or type(said).__name__
+
+
+@contextmanager
+def errors_of(where: object) -> Iterator[None]:
+    """Put the file, or the place in it, before the message of a DataError that is raised within."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(f"{where}: {error}") from error
+
+
+def import_optional(module: str, purpose: str, extra: str) -> Any:
+    """Import a module of an optional package. Raises ConfigError, naming the extra to install, without it."""
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        name = module.partition(".")[0]
+        raise ConfigError(f"{name}, which {purpose}, is not there: pip install instancemap[{extra}]") from error

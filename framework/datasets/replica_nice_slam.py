@@ -16,8 +16,8 @@ from pathlib import Path
 
 from framework.data import Camera
 from framework.datasets.calibration.camera_json import camera_of, read_json_object
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording, numbered_images
-from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording, numbered_images, paired_images
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
 from framework.errors import DataError
 from framework.files.matrix_file import PrintedMatrix, read_matrix_lines
 
@@ -31,25 +31,18 @@ class ReplicaNiceSlam(Recording):
     def open(self) -> Contents:
         path = self.folder.absolute().parent / "cam_params.json"  # not resolved: a scene may be a link
         camera, depth_scale = _read_camera(path)
-        color = numbered_images(self.folder / "results", (".jpg",))
-        depth = numbered_images(self.folder / "results", (".png",))
-        poses = read_matrix_lines(self.folder / "traj.txt")
-        # a frame of which one image is missing is there: reading it says which
-        frames = [
-            _recorded(
-                ImageFiles(
-                    color.get(k, self.folder / "results" / f"frame{k:06d}.jpg"),
-                    depth.get(k, self.folder / "results" / f"depth{k:06d}.png"),
-                ),
-                k,
-                poses,
-            )
-            for k in sorted(color.keys() | depth.keys())
-        ]
+        results, poses = self.folder / "results", read_matrix_lines(self.folder / "traj.txt")
+        images = paired_images(
+            numbered_images(results, (".jpg",)),
+            numbered_images(results, (".png",)),
+            lambda k: results / f"frame{k:06d}.jpg",
+            lambda k: results / f"depth{k:06d}.png",
+        )
+        frames = [_recorded(pair, k, poses) for k, pair in images.items()]
         return Contents(camera, path, depth_scale, frames)
 
 
-def _recorded(images: ImageFiles, k: int, poses: Sequence[PrintedMatrix]) -> RecordedFrame:
+def _recorded(images: StoredImages, k: int, poses: Sequence[PrintedMatrix]) -> RecordedFrame:
     if k < len(poses):
         return RecordedFrame.posed(images, k / FRAME_RATE, poses[k].pose)
     why = f"{images.color_name}: traj.txt has {len(poses)} poses and none for it"

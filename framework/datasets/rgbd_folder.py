@@ -26,16 +26,9 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64, FrameTruth, Int32, SceneTruth
-from framework.datasets.calibration.camera_json import (
-    CAMERA_KEYS,
-    DISTORTION,
-    camera_of,
-    check_keys,
-    distortion_of,
-    read_json_object,
-)
+from framework.datasets.calibration.camera_json import read_camera, read_json_object
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording, numbered_images
-from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import is_there
@@ -63,9 +56,8 @@ class RgbdFolder(Recording):
 
     def open(self) -> Contents:
         path = self.folder / "camera.json"
-        content = _read_json(path)
-        check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
-        camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
+        _check_file(path)
+        camera, depth_scale, distortion = read_camera(path)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
@@ -74,10 +66,10 @@ class RgbdFolder(Recording):
         self._has_poses = lines is not None
         ups = _read_gravity(self.folder / "gravity.txt", len(color))
         frames = [
-            _recorded(ImageFiles(color[number], depth[number]), k, lines[k] if lines else None, ups[k])
+            _recorded(StoredImages.of_files(color[number], depth[number]), k, lines[k] if lines else None, ups[k])
             for k, number in enumerate(color)
         ]
-        return Contents(camera, path, depth_scale, frames, distortion_of(path, content))
+        return Contents(camera, path, depth_scale, frames, distortion)
 
     def truth_in(self, index: int) -> FrameTruth | None:
         if not self._instances:
@@ -124,18 +116,17 @@ class RgbdFolder(Recording):
         return class_names, list(images.values())
 
 
-def _recorded(images: ImageFiles, index: int, line: TumLine | None, up: Float64 | None) -> RecordedFrame:
+def _recorded(images: StoredImages, index: int, line: TumLine | None, up: Float64 | None) -> RecordedFrame:
     if line is None:
         return RecordedFrame(images, index / FRAME_RATE, up=up)
     return replace(RecordedFrame.posed(images, line.timestamp, line.pose), up=up)
 
 
-def _read_json(path: Path) -> dict[str, Any]:
+def _check_file(path: Path) -> None:
     if not path.is_file():
         raise DataError(
             f"{path} is missing; an RGB-D folder needs camera.json, color/ and depth/ (see docs/tutorials/own_data.md)"
         )
-    return read_json_object(path)
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
@@ -157,10 +148,7 @@ def _read_poses(path: Path, frames: int) -> list[TumLine] | None:
     if not is_there(path):
         return None
     poses = read_tum_lines(path)
-    if len(poses) != frames:
-        raise DataError(
-            f"{path} holds {len(poses)} poses, but color/ holds {frames} frames: one line a frame is needed"
-        )
+    _check_count(path, len(poses), "poses", frames)
     return poses
 
 
@@ -169,16 +157,19 @@ def _read_gravity(path: Path, frames: int) -> list[Float64 | None]:
     if not is_there(path):
         return [None] * frames
     ups = read_gravity(path)
-    if len(ups) != frames:
-        raise DataError(
-            f"{path} holds {len(ups)} directions, but color/ holds {frames} frames: one line a frame is needed"
-        )
+    _check_count(path, len(ups), "directions", frames)
     return ups
+
+
+def _check_count(path: Path, count: int, what: str, frames: int) -> None:
+    if count != frames:
+        raise DataError(f"{path} holds {count} {what}, but color/ holds {frames} frames: one line a frame is needed")
 
 
 def _read_class_names(path: Path) -> dict[int, str | None]:
     class_names: dict[int, str | None] = {}
-    for key, entry in _read_json(path).items():
+    _check_file(path)
+    for key, entry in read_json_object(path).items():
         if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= LARGEST_ID):
             raise DataError(f"{path}: an instance id is a whole number from 1 to {LARGEST_ID}, found {key!r:.60}")
         if int(key) in class_names:

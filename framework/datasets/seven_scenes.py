@@ -11,18 +11,17 @@ camera's intrinsics are given. Without registration, masks miss their objects by
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numba import njit
 
-from framework.data import Camera, Float64, UInt8, UInt16
+from framework.data import Camera, Float64, UInt16
 from framework.datasets.calibration.raw_images import NO_READING
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording
-from framework.datasets.frames.stored_frames import RecordedFrame
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
 from framework.errors import DataError
-from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import read_matrix
 
 DEPTH_SCALE = 1000.0  # units a metre
@@ -33,22 +32,6 @@ COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
 BASELINE = 0.025  # m; the colour camera stands this far along the depth camera's x axis
 
 _IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
-
-
-@dataclass(frozen=True)
-class KinectFiles:
-    """A colour and a depth image, the latter moved into the colour camera when it is read."""
-
-    color_name: Path
-    depth_name: Path
-
-    def color(self) -> UInt8:
-        return read_color(self.color_name)
-
-    def depth(self) -> UInt16:
-        raw = read_uint16(self.depth_name)
-        # one of another size is left as it is: the reader names its size and refuses it
-        return register(raw) if raw.shape == DEPTH_CAMERA.shape else raw
 
 
 @dataclass
@@ -71,7 +54,8 @@ class SevenScenes(Recording):
 
 def _recorded(folder: Path, number: int) -> RecordedFrame:
     stem = f"frame-{number:06d}"
-    images = KinectFiles(folder / f"{stem}.color.png", folder / f"{stem}.depth.png")
+    files = StoredImages.of_files(folder / f"{stem}.color.png", folder / f"{stem}.depth.png")
+    images = replace(files, depth=lambda: _color_camera_depth(files.depth()))
     return RecordedFrame.posed(images, number / FRAME_RATE, lambda: _color_pose(folder / f"{stem}.pose.txt"))
 
 
@@ -80,6 +64,11 @@ def _color_pose(path: Path) -> Float64:
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera
+
+
+def _color_camera_depth(raw: UInt16) -> UInt16:
+    """The registered image; one of another size unchanged, so that the reader rejects it by its size."""
+    return register(raw) if raw.shape == DEPTH_CAMERA.shape else raw
 
 
 def register(raw: UInt16) -> UInt16:

@@ -27,17 +27,10 @@ import numpy as np
 
 from framework.config.validation import require
 from framework.data import Camera, Float64
-from framework.datasets.calibration.camera_json import (
-    CAMERA_KEYS,
-    DISTORTION,
-    camera_of,
-    check_keys,
-    distortion_of,
-    read_json_object,
-)
+from framework.datasets.calibration.camera_json import CAMERA_KEYS, StoredCamera, read_camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.sequence_reader import Contents, Recording
-from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import is_there
 from framework.files.number_lines import SHOWN, read_lines
@@ -93,7 +86,7 @@ class TumRgbd(Recording):
         super().__post_init__()
 
     def open(self) -> Contents:
-        calibration = self._calibration()
+        (camera, depth_scale, distortion), source = self._stored_camera()
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
         pairs = associate(_times(color), _times(depth), self.max_difference)
         if not pairs:
@@ -105,48 +98,26 @@ class TumRgbd(Recording):
             log.info("%s: %d of %d colour images have no depth image", self.name, len(color) - len(pairs), len(color))
         truth = Trajectory.read(self.folder / "groundtruth.txt", self.max_difference)
         frames = [_recorded(color[i], depth[j], truth) for i, j in pairs]
-        return Contents(
-            calibration.camera,
-            calibration.source,
-            calibration.depth_scale,
-            frames,
-            calibration.distortion if self.undistort else None,
-        )
+        return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
-    def _calibration(self) -> TumCalibration:
+    def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
+        """The camera, and the file or parameter that gives it."""
         if self.intrinsics is not Intrinsics.AUTO:
             return _published(self.intrinsics)
         named, own = re.search(r"freiburg[123]", self.name), self.folder / "camera.json"
         if named:
             return _published(Intrinsics(named[0]))
         if is_there(own):
-            return _read_calibration(own)
+            return read_camera(own), own
         raise ConfigError(
             f"dataset.intrinsics: the folder's name {self.name} has no freiburg1, freiburg2 or freiburg3 in it; choose "
             f"FREIBURG1, FREIBURG2, FREIBURG3 or ROS_DEFAULT, or write {own} with {', '.join(CAMERA_KEYS)}"
         )
 
 
-@dataclass(frozen=True)
-class TumCalibration:
-    """What is known of the camera."""
-
-    camera: Camera
-    source: Path | str  # what says so, for messages
-    depth_scale: float  # units a metre
-    distortion: Distortion | None  # None = a pinhole
-
-
-def _published(intrinsics: Intrinsics) -> TumCalibration:
-    source = f"dataset.intrinsics={intrinsics.name}"
-    return TumCalibration(CAMERAS[intrinsics], source, DEPTH_SCALE, DISTORTIONS[intrinsics])
-
-
-def _read_calibration(path: Path) -> TumCalibration:
-    content = read_json_object(path)
-    check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
-    camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
-    return TumCalibration(camera, path, depth_scale, distortion_of(path, content))
+def _published(intrinsics: Intrinsics) -> tuple[StoredCamera, str]:
+    camera = StoredCamera(CAMERAS[intrinsics], DEPTH_SCALE, DISTORTIONS[intrinsics])
+    return camera, f"dataset.intrinsics={intrinsics.name}"
 
 
 @dataclass(frozen=True)
@@ -217,7 +188,7 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
 
 
 def _recorded(color: ListedImage, depth: ListedImage, truth: Trajectory) -> RecordedFrame:
-    images = ImageFiles(color.path, depth.path)
+    images = StoredImages.of_files(color.path, depth.path)
     return RecordedFrame.posed(images, color.timestamp, lambda: truth.at(color.timestamp))
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float64
-from framework.errors import DataError
+from framework.errors import DataError, errors_of
 from framework.files.number_lines import numbers, read_lines
 from framework.geometry import nearest_rigid
 
@@ -22,20 +22,16 @@ class PrintedMatrix:
 
     def pose(self) -> Float64:
         """The rigid (4, 4) motion that it means. Raises DataError, naming the place, when it is none."""
-        try:
+        with errors_of(self.where):
             return nearest_rigid(self.values)
-        except DataError as error:
-            raise DataError(f"{self.where}: {error}") from error
 
     def camera(self, width: int, height: int) -> Camera:
         """The pinhole camera that it means, for images of this size. Raises DataError, naming the place."""
         (fx, _, cx, _), (_, fy, cy, _) = self.values[:2].tolist()
         if not np.allclose(self.values, [[fx, 0, cx, 0], [0, fy, cy, 0], [0, 0, 1, 0], [0, 0, 0, 1]]):
             raise DataError(f"{self.where}: expected intrinsics, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1")
-        try:
+        with errors_of(self.where):
             return Camera(width, height, fx, fy, cx, cy)
-        except DataError as error:
-            raise DataError(f"{self.where}: {error}") from error
 
 
 def read_matrix(path: Path) -> PrintedMatrix:

@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, UInt8
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import CameraAxes, PoseReading
-from framework.errors import DataError, FrameError
+from framework.errors import FrameError, errors_of
 from framework.geometry import nearest_rigid
 
 SMALLEST_SIDE = 2  # px, of a depth image that can be brought to another size
@@ -63,10 +63,8 @@ class Source:
 
 def arkit_pose(where: Path | str, T_world_arkit: Float64) -> Float64:
     """T_world_camera (4, 4) of a pose of ARKit's camera, with y up and z backward. Raises DataError, naming `where`."""
-    try:
+    with errors_of(where):
         return _ARKIT.pose(nearest_rigid(T_world_arkit))
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
 
 
 def arkit_up(T_world_camera: Float64) -> Float64:

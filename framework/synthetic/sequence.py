@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.data import Camera, Float32, Float64, Frame, FrameTruth, Int32, SceneTruth
-from framework.datasets.frames.frame_selection import TO_THE_END, check_selection, choose_frames
+from framework.datasets.frames.sequence_reader import TO_THE_END, check_selection, choose_frames
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import ConfigError

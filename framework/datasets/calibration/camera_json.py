@@ -1,4 +1,4 @@
-"""The camera of a recording as a JSON object, whose keys each format names in its own way."""
+"""Numbers and cameras in JSON files, whose keys each format names in its own way."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
-from framework.errors import DataError
+from framework.errors import DataError, errors_of
 from framework.files.atomic_write import MOST_TEXT
 from framework.files.json_file import read_json
 
@@ -21,6 +21,14 @@ CAMERA_KEYS = ("width", "height", "fx", "fy", "cx", "cy", "depth_scale")  # of c
 DISTORTION = "distortion"  # the key of the lens distortion
 
 log = logging.getLogger(__name__)
+
+
+class StoredCamera(NamedTuple):
+    """The camera of a recording, as its file gives it."""
+
+    camera: Camera
+    depth_scale: float  # units per meter
+    distortion: Distortion | None  # of the lens, in color and depth alike; None = a pinhole
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
@@ -31,26 +39,34 @@ def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
     return found
 
 
+def read_camera(path: Path) -> StoredCamera:
+    """The camera of a camera.json. Raises DataError, naming the file and the key."""
+    content = read_json_object(path)
+    check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
+    return StoredCamera(*camera_of(path, content, CAMERA_KEYS), distortion_of(path, content))
+
+
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
-    """The camera and the depth scale (units per metre) that `content` of the file `path` gives.
+    """The camera and the depth scale (units per meter) that `content` of the file `path` gives.
 
     `keys` are the names of width, height, fx, fy, cx, cy and of the depth scale. Raises DataError, naming the file and
-    the key, when a value is missing or cannot be.
+    the key.
     """
-    values = [_number(path, content, key) for key in keys]
-    for key, value in zip(keys[:2], values[:2], strict=True):
-        if value != int(value):
-            raise DataError(f"{path}: {key} must be a whole number of pixels, found {value}")
-    width, height, fx, fy, cx, cy, depth_scale = values
+    *camera, depth_scale = numbers_of(path, content, *keys)
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         raise DataError(
             f"{path}: {keys[-1]} must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], as metres = value / {keys[-1]} "
             f"(1000 for millimetres), found {depth_scale:g}"
         )
-    try:
-        return Camera(int(width), int(height), fx, fy, cx, cy), depth_scale
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from error
+    return pinhole(path, *camera), depth_scale
+
+
+def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
+    """The camera with these numbers. Raises DataError, naming `where`, if there is no such camera."""
+    if width != int(width) or height != int(height):
+        raise DataError(f"{where}: width and height must be whole numbers of pixels, found {width}x{height}")
+    with errors_of(where):
+        return Camera(int(width), int(height), fx, fy, cx, cy)
 
 
 def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> None:
@@ -67,6 +83,23 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
         log.warning("%s: not read: %s; its keys are %s", path, ", ".join(unread), ", ".join(known))
 
 
+def number_list(where: Path | str, values: Any, count: int) -> list[float]:
+    """A list of so many finite numbers. Raises DataError, naming `where`, if `values` is none."""
+    if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
+        raise DataError(f"{where} must be a list of {count} numbers, found {str(values)[:60]}")
+    return [float(value) for value in values]
+
+
+def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
+    """The finite numbers under some keys. Raises DataError, naming `where` and the key."""
+    for key in keys:
+        if key not in content:
+            raise DataError(f"{where}: the key {key!r} is missing")
+        if not _is_number(content[key]):
+            raise DataError(f"{where}: {key} must be a number, found {str(content[key])[:40]}")
+    return [float(content[key]) for key in keys]
+
+
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
     """The lens distortion that `content` of the file `path` gives, None without one. Raises DataError."""
     if DISTORTION not in content:
@@ -74,14 +107,9 @@ def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
     values = content[DISTORTION]
     if not isinstance(values, list) or len(values) != len(fields(Distortion)):
         raise DataError(f"{path}: distortion must be [k1, k2, p1, p2, k3], found {str(values)[:60]}")
-    named = {f"distortion[{k}]": value for k, value in enumerate(values)}
-    return Distortion(*(_number(path, named, key) for key in named))
+    named = {f"{DISTORTION}[{k}]": value for k, value in enumerate(values)}
+    return Distortion(*numbers_of(path, named, *named))
 
 
-def _number(path: Path, content: Mapping[str, Any], key: str) -> float:
-    if key not in content:
-        raise DataError(f"{path}: the key {key!r} is missing")
-    value = content[key]
-    if not isinstance(value, bool) and isinstance(value, int | float) and math.isfinite(value):
-        return float(value)
-    raise DataError(f"{path}: {key} must be a number, found {str(value)[:40]!r}")
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from dataclasses import dataclass, replace
+from functools import partial
 
 import cv2
 import numpy as np
 
-from framework.data import MOST_PIXELS, Camera, UInt8, UInt16
+from framework.data import MOST_PIXELS, Camera, UInt8
 from framework.datasets.frames.stored_frames import StoredImages
 from framework.errors import DataError, FrameError
 
@@ -57,32 +57,19 @@ class ColorRegistration:
         return np.asarray(cv2.resize(resampled, size, interpolation=cv2.INTER_AREA), np.uint8)
 
 
-@dataclass(frozen=True)
-class RegisteredImages:
-    """A frame's images, colour moved into the depth camera when it is read."""
+def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
+    """A frame's images, color moved into the depth camera when it is read."""
+    return replace(images, color=partial(_registered_color, images, registration))
 
-    images: StoredImages  # colour in the colour camera
-    registration: ColorRegistration
 
-    @property
-    def color_name(self) -> Path | str:
-        return self.images.color_name
-
-    @property
-    def depth_name(self) -> Path | str:
-        return self.images.depth_name
-
-    def color(self) -> UInt8:
-        image, camera = self.images.color(), self.registration.color
-        if image.shape[:2] != camera.shape:
-            raise FrameError(
-                f"{self.color_name} is {image.shape[1]}x{image.shape[0]}, but the colour camera's images are "
-                f"{camera.width}x{camera.height}"
-            )
-        return self.registration.apply(image)
-
-    def depth(self) -> UInt16:
-        return self.images.depth()
+def _registered_color(images: StoredImages, registration: ColorRegistration) -> UInt8:
+    image, camera = images.color(), registration.color
+    if image.shape[:2] != camera.shape:
+        raise FrameError(
+            f"{images.color_name} is {image.shape[1]}x{image.shape[0]}, but the colour camera's images are "
+            f"{camera.width}x{camera.height}"
+        )
+    return registration.apply(image)
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:

@@ -22,17 +22,10 @@ from pathlib import Path
 
 from framework.config.validation import check_bounds
 from framework.data import Frame
-from framework.datasets.calibration.camera_json import (
-    CAMERA_KEYS,
-    DISTORTION,
-    camera_of,
-    check_keys,
-    distortion_of,
-    read_json_object,
-)
+from framework.datasets.calibration.camera_json import read_camera, read_json_object
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.frames.sequence_reader import check_one_number, number_of
-from framework.datasets.frames.stored_frames import ImageFiles
+from framework.datasets.frames.stored_frames import StoredImages
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import read_bytes
 from framework.files.image_files import LARGEST_FILE, check_image
@@ -88,16 +81,15 @@ class FolderWatch(LiveVideo):
         path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
         while True:
             try:
-                content = read_json_object(path)
+                read_json_object(path)
                 break
             except DataError as error:
                 if time.monotonic() > deadline:
                     raise DataError(f"{error}; waited {self.camera_timeout:g} s for it") from error
             yield None
             time.sleep(self.poll_interval)
-        check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
-        camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
-        return Calibration(camera, path, depth_scale, self.max_depth, distortion_of(path, content))
+        camera, depth_scale, distortion = read_camera(path)
+        return Calibration(camera, path, depth_scale, self.max_depth, distortion)
 
 
 @dataclass(frozen=True)
@@ -105,7 +97,7 @@ class Arrival:
     """A frame that has come, or that is passed over."""
 
     number: int
-    images: ImageFiles | None
+    images: StoredImages | None
     fault: str = ""  # why it cannot be used
 
     def read(self, timestamp: float, calibration: Calibration) -> Frame:
@@ -150,7 +142,7 @@ class Arrivals:
         if color is None or depth is None:
             until = f"when frame {newest} was" if newest > number else "in the end"
             return Arrival(number, None, f"{color or depth}: the other image of this frame was not there {until}")
-        return Arrival(number, ImageFiles(color, depth))
+        return Arrival(number, StoredImages.of_files(color, depth))
 
 
 @dataclass

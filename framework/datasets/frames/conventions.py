@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum
-from pathlib import Path
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from framework.config.validation import require
-from framework.data import Float64, UInt8, UInt16
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.data import Float64
+from framework.datasets.frames.stored_frames import RecordedFrame
 from framework.geometry import inverse
 
 COARSEST_DEPTH, FINEST_DEPTH = 1.0, 1e6  # units a metre that stored depth may have; most sensors' have 1000
@@ -109,39 +108,18 @@ class DepthReading:
 
     def frames(self, stored: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
         """The frames, each with the depth image that belongs to it; one that has none has a fault."""
-        return (
-            [self._delayed(*pair) for pair in with_partners(stored, self.depth_delay)] if self.depth_delay else stored
-        )
+        if not self.depth_delay:
+            return stored
+        return [self._delayed(*pair) for pair in with_partners(stored, self.depth_delay)]
 
     def _delayed(self, frame: RecordedFrame, deep: RecordedFrame | None) -> RecordedFrame:
         if deep is None:
             return replace(frame, fault=frame.fault or f"no depth image is {self.depth_delay} frames away")
-        return replace(frame, images=ColorAndDepth(frame.images, deep.images))
+        images = replace(frame.images, depth_name=deep.images.depth_name, depth=deep.images.depth)
+        return replace(frame, images=images)
 
 
 def with_partners(stored: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
     """Each frame with the one that is so many frames later, None where there is none."""
     for k, frame in enumerate(stored):
         yield frame, stored[k + delay] if 0 <= k + delay < len(stored) else None
-
-
-@dataclass(frozen=True)
-class ColorAndDepth:
-    """The colour of one stored frame and the depth of another."""
-
-    of_color: StoredImages
-    of_depth: StoredImages
-
-    @property
-    def color_name(self) -> Path | str:
-        return self.of_color.color_name
-
-    @property
-    def depth_name(self) -> Path | str:
-        return self.of_depth.depth_name
-
-    def color(self) -> UInt8:
-        return self.of_color.color()
-
-    def depth(self) -> UInt16:
-        return self.of_depth.depth()

@@ -5,24 +5,29 @@ from __future__ import annotations
 import logging
 import math
 import re
+import zlib
 from abc import abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
-from framework.data import Camera, Float32, Frame, FrameTruth
+import numpy as np
+
+from framework.data import Array, Camera, Float32, Frame, FrameTruth
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import DepthReading, PoseReading
-from framework.datasets.frames.frame_selection import TO_THE_END, check_selection, choose_frames
-from framework.datasets.frames.stored_frames import RecordedFrame
-from framework.errors import DataError, FrameError
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.errors import ConfigError, DataError, FrameError
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
 FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
 FRAME_RATE = 30.0  # Hz, of recordings without timestamps, or with some that cannot be
+
+TO_THE_END = -1  # value of `stop`
+_STREAM = zlib.crc32(b"share")  # a random stream of its own, beside all that a dataset draws from the same seed
 
 log = logging.getLogger(__name__)
 
@@ -152,6 +157,37 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
     return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
+def check_selection(start: int, stop: int, stride: int, share: float = 1.0) -> None:
+    """Raises ConfigError unless the parameters can choose frames at all."""
+    if start < 0:
+        raise ConfigError(f"dataset.start must be 0 or positive, found {start}")
+    if stop != TO_THE_END and stop <= start:
+        raise ConfigError(
+            f"dataset.stop must be above dataset.start ({start}), or {TO_THE_END} for the end; found {stop}"
+        )
+    if stride < 1:
+        raise ConfigError(f"dataset.stride must be at least 1, found {stride}")
+    if not 0 < share <= 1:  # NaN is neither
+        raise ConfigError(f"dataset.share must be in (0, 1], found {share}")
+
+
+def choose_frames(count: int, start: int, stop: int, stride: int, share: float = 1.0, seed: int = 0) -> Sequence[int]:
+    """The frame numbers chosen of `count` frames, ascending: as a Python slice chooses, and of those a random share.
+
+    The same `seed` takes the same share, of at least one frame. Raises ConfigError when no frame is left.
+    """
+    check_selection(start, stop, stride, share)
+    if start >= count:
+        raise ConfigError(f"dataset.start is {start}, but the sequence has only {count} frames (0 to {count - 1})")
+    if seed < 0:
+        raise ConfigError(f"seed must be 0 or positive, found {seed}")
+    chosen = range(start, count if stop == TO_THE_END else min(stop, count), stride)
+    if share == 1:
+        return chosen
+    kept = np.random.default_rng([seed, _STREAM]).permutation(len(chosen))[: max(1, round(share * len(chosen)))]
+    return tuple(chosen[k] for k in np.sort(kept).tolist())
+
+
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """The folder's images by the number in which their names end, in the order of these numbers.
 
@@ -172,6 +208,32 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     if not files:
         raise DataError(f"{folder} holds no image ({', '.join(suffixes)})")
     return dict(sorted(files.items()))
+
+
+def paired_images(
+    colors: Mapping[int, Path],
+    depths: Mapping[int, Path],
+    color_name: Callable[[int], Path],
+    depth_name: Callable[[int], Path],
+) -> dict[int, StoredImages]:
+    """The images of each frame by its number; reading one that is missing raises FrameError, with the expected name."""
+    return {
+        k: StoredImages.of_files(colors.get(k) or color_name(k), depths.get(k) or depth_name(k))
+        for k in sorted(colors.keys() | depths.keys())
+    }
+
+
+def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
+    """(width, height) px of the first image that can be read. Raises DataError if none can."""
+    faults = []
+    for path in paths:
+        try:
+            height, width = read(path).shape[:2]
+        except FrameError as error:
+            faults.append(str(error))
+            continue
+        return width, height
+    raise DataError(f"no image can be read: {faults[0]}")
 
 
 def _images(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:

@@ -4,44 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Protocol
 
 from framework.data import Float64, UInt8, UInt16
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint16
 
 
-class StoredImages(Protocol):
+@dataclass(frozen=True)
+class StoredImages:
     """The two images of a frame, registered to each other and not read yet. Reading raises FrameError."""
 
-    @property
-    def color_name(self) -> Path | str:
-        """For messages: the file, and where in it."""
+    color_name: Path | str  # the file, and the place in it, for messages
+    depth_name: Path | str
+    color: Callable[[], UInt8]  # (H, W, 3) RGB
+    depth: Callable[[], UInt16]  # (H, W) in units of the recording; 0 or 65535 = no reading
 
-    @property
-    def depth_name(self) -> Path | str:
-        """Likewise."""
-
-    def color(self) -> UInt8:
-        """(H, W, 3) RGB."""
-
-    def depth(self) -> UInt16:
-        """(H, W) in the recording's units; 0 or 65535 = no reading."""
-
-
-@dataclass(frozen=True)
-class ImageFiles:
-    """Images in files of their own, JPEG or PNG."""
-
-    color_name: Path
-    depth_name: Path
-
-    def color(self) -> UInt8:
-        return read_color(self.color_name)
-
-    def depth(self) -> UInt16:
-        return read_uint16(self.depth_name)
+    @classmethod
+    def of_files(cls, color: Path, depth: Path) -> StoredImages:
+        """Images in files of their own, JPEG or PNG."""
+        return cls(color, depth, partial(read_color, color), partial(read_uint16, depth))
 
 
 @dataclass(frozen=True)

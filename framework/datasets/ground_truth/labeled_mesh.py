@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import logging
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
+from framework.datasets.frames.sequence_reader import Recording
+from framework.files.atomic_write import is_there
 from framework.files.hashing import add_array, path_hash
 from framework.rendering import rasterizer
 from framework.rendering.rasterizer import Rasterizer
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -56,3 +61,34 @@ class LabeledMesh:
         for source in (__file__, rasterizer.__file__):
             digest.update(path_hash(Path(source)).encode())
         return digest.hexdigest()
+
+
+@dataclass
+class LabeledRecording(Recording):
+    """A recording of a scene that may have a labelled mesh, which the subclass's `open` sets.
+
+    Truth is all of the mesh, whatever frames are chosen.
+    """
+
+    frame_truth: bool = False  # whether frames have the true instances: the mesh is rendered for detectors that ask
+
+    def __post_init__(self) -> None:
+        self.mesh: LabeledMesh | None = None
+        super().__post_init__()
+
+    def truth_in(self, index: int) -> FrameTruth | None:
+        T_world_camera = self.contents.frames[index].T_world_camera
+        if self.mesh is None or not self.frame_truth or T_world_camera is None:
+            return None
+        return self.mesh.seen_by(self.camera, T_world_camera)
+
+    def scene_truth(self) -> SceneTruth | None:
+        return self.mesh.scene_truth() if self.mesh else None
+
+
+def mesh_of(files: Sequence[Path], read: Callable[..., LabeledMesh]) -> LabeledMesh | None:
+    """What `read` makes of the files; None, with a word in the log where only some are missing, without all of them."""
+    missing = [path for path in files if not is_there(path)]
+    if 0 < len(missing) < len(files):
+        log.warning("no true instances: %s is missing", missing[0])
+    return None if missing else read(*files)

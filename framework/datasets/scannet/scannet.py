@@ -17,18 +17,17 @@ Colour (1296x968) is moved into the depth camera (640x480), which is that of the
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from framework.data import Array, Camera
-from framework.datasets.calibration.color_registration import ColorRegistration, RegisteredImages
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, numbered_images
-from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
-from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
-from framework.datasets.ground_truth.labeled_recording import LabeledRecording, mesh_of
+from framework.data import Camera
+from framework.datasets.calibration.color_registration import ColorRegistration, registered_images
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, first_size, numbered_images, paired_images
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording, mesh_of
 from framework.datasets.scannet.scannet_annotation import (
     FIRST_LABEL_TABLE,
     LABEL_TABLE,
@@ -36,7 +35,7 @@ from framework.datasets.scannet.scannet_annotation import (
     read_labeled_mesh,
 )
 from framework.datasets.scannet.sens_file import SensFile, open_sens
-from framework.errors import DataError, FrameError
+from framework.errors import DataError, errors_of
 from framework.files.atomic_write import is_there
 from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import PrintedMatrix, read_matrix
@@ -99,10 +98,11 @@ def _sens_contents(path: Path) -> Contents:
         if not _fits(camera):
             raise DataError(f"{path}: {name} intrinsics do not belong to images of {camera.width}x{camera.height} px")
     _warn_of_parallax(path, header.color_extrinsics, header.depth_extrinsics, header.depth_camera)
-    registration = _registration(path, header.color_camera, header.depth_camera)
+    with errors_of(path):
+        registration = ColorRegistration(header.color_camera, header.depth_camera)
     frames = [
         RecordedFrame.posed(
-            RegisteredImages(frame, registration), frame.depth_time / MICROSECONDS, frame.camera_to_world.pose
+            registered_images(frame.images, registration), frame.depth_time / MICROSECONDS, frame.camera_to_world.pose
         )
         for frame in file.frames
     ]
@@ -121,41 +121,25 @@ def _exported_contents(folder: Path) -> Contents:
     colors = numbered_images(folder / "color", (".jpg", ".jpeg", ".png"))
     depths = numbered_images(folder / "depth", (".png",))
     intrinsic = folder / "intrinsic"
-    depth_camera = _camera(intrinsic / "intrinsic_depth.txt", *_first_size(depths.values(), read_uint16))
-    color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *_first_size(colors.values(), read_color))
+    depth_camera = _camera(intrinsic / "intrinsic_depth.txt", *first_size(depths.values(), read_uint16))
+    color_camera = _color_camera(intrinsic / "intrinsic_color.txt", *first_size(colors.values(), read_color))
     extrinsics = [intrinsic / f"extrinsic_{name}.txt" for name in ("color", "depth")]
     if all(map(is_there, extrinsics)):
         _warn_of_parallax(intrinsic, read_matrix(extrinsics[0]), read_matrix(extrinsics[1]), depth_camera)
-    registration = _registration(intrinsic, color_camera, depth_camera)
-    # a frame of which one image is missing is there: reading it says which
-    frames = []
-    for k in sorted(colors.keys() | depths.keys()):
-        files = ImageFiles(
-            colors.get(k, folder / "color" / f"{k}.jpg"),
-            depths.get(k, folder / "depth" / f"{k}.png"),
-        )
-        pose = folder / "pose" / f"{files.depth_name.stem}.txt"
-        frames.append(_exported_frame(RegisteredImages(files, registration), pose, k))
+    with errors_of(intrinsic):
+        registration = ColorRegistration(color_camera, depth_camera)
+    images = paired_images(
+        colors, depths, lambda k: folder / "color" / f"{k}.jpg", lambda k: folder / "depth" / f"{k}.png"
+    )
+    frames = [_exported_frame(folder, k, registered_images(pair, registration)) for k, pair in images.items()]
     return Contents(depth_camera, intrinsic / "intrinsic_depth.txt", DEPTH_SCALE, frames)
 
 
-def _exported_frame(images: RegisteredImages, pose: Path, k: int) -> RecordedFrame:
-    if not pose.parent.is_dir():
+def _exported_frame(folder: Path, k: int, images: StoredImages) -> RecordedFrame:
+    if not (folder / "pose").is_dir():
         return RecordedFrame(images, k / FRAME_RATE)
+    pose = folder / "pose" / f"{Path(images.depth_name).stem}.txt"
     return RecordedFrame.posed(images, k / FRAME_RATE, lambda: read_matrix(pose).pose())
-
-
-def _first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
-    """(width, height) px of the first image that can be read."""
-    faults = []
-    for path in paths:
-        try:
-            height, width = read(path).shape[:2]
-        except FrameError as error:
-            faults.append(str(error))
-            continue
-        return width, height
-    raise DataError(f"no image can be read: {faults[0]}")
 
 
 def _camera(path: Path, width: int, height: int) -> Camera:
@@ -173,13 +157,6 @@ def _color_camera(path: Path, width: int, height: int) -> Camera:
     u, v = width / camera.width, height / camera.height
     # pixel centres are at integers
     return Camera(width, height, u * camera.fx, v * camera.fy, u * (camera.cx + 0.5) - 0.5, v * (camera.cy + 0.5) - 0.5)
-
-
-def _registration(source: Path, color: Camera, depth: Camera) -> ColorRegistration:
-    try:
-        return ColorRegistration(color, depth)
-    except DataError as error:
-        raise DataError(f"{source}: {error}") from error
 
 
 def _fits(camera: Camera) -> bool:

@@ -27,6 +27,7 @@ import numpy as np
 
 from framework.data import MOST_PIXELS, Camera, Float64, UInt8, UInt16
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
+from framework.datasets.frames.stored_frames import StoredImages
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import check_regular
 from framework.files.image_files import decode_color
@@ -89,6 +90,11 @@ class SensFrame:
     @property
     def depth_name(self) -> str:
         return f"{self.path}, depth of frame {self.number} at byte {self.byte + self.color_bytes}"
+
+    @property
+    def images(self) -> StoredImages:
+        """The two images, each in its own camera."""
+        return StoredImages(self.color_name, self.depth_name, self.color, self.depth)
 
     def color(self) -> UInt8:
         """(H, W, 3) RGB in the colour camera. Raises FrameError."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from framework.data import UInt8, UInt16
 from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
 from framework.datasets.scenenn.openni import OniImage, play
-from framework.errors import DataError, InstanceMapError
+from framework.errors import DataError, InstanceMapError, errors_of
 
 LARGEST_TIME_DIFFERENCE = 33_000  # us; SceneNN's play-back takes what is further apart for different moments
 WAITING = 30  # images of one stream that wait for one of the other, 1 s: the rest of the file may lack it
@@ -36,11 +36,12 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
     Raises ConfigError where OpenNI 2 is not installed, DataError when it does not play the recording to its end, or the
     images are of a kind that a frame cannot be made of.
     """
-    try:
-        with playable(contents, scratch) as path, closing(play_apart(path, contents.streams)) as images:
-            yield from pair(images)
-    except DataError as error:
-        raise DataError(f"{contents.path}: {error}") from error
+    with (
+        errors_of(contents.path),
+        playable(contents, scratch) as path,
+        closing(play_apart(path, contents.streams)) as images,
+    ):
+        yield from pair(images)
 
 
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:

@@ -15,7 +15,7 @@ The images are those that the official play-back, or `python -m framework conver
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -23,17 +23,16 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, numbered_images
-from framework.datasets.frames.stored_frames import ImageFiles, RecordedFrame
-from framework.datasets.ground_truth.labeled_mesh import LabeledMesh
-from framework.datasets.ground_truth.labeled_recording import LabeledRecording, mesh_of
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, first_size, numbered_images, paired_images
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording, mesh_of
 from framework.datasets.scenenn.intrinsics import read_intrinsics
 from framework.datasets.scenenn.scenenn_annotation import Annotated, read_annotation
-from framework.datasets.scenenn.timestamps import read_timestamps
-from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_trajectory_log
+from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_timestamps, read_trajectory_log
 from framework.detection.domain import RENDERED_ROOMS
-from framework.errors import DataError, FrameError
+from framework.errors import DataError
 from framework.files.atomic_write import is_there, read_text
+from framework.files.image_files import read_color
 from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
@@ -67,57 +66,34 @@ class SceneNN(LabeledRecording):
         if (self.root / MADE_BY).is_file():
             self.domain = RENDERED_ROOMS
         number = self.folder.resolve().name
-        images = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
-        depths = numbered_images(self.folder / "depth", (".png",))
-        poses = _optional_poses(self.folder / "trajectory.log")
-        numbers = sorted(images.keys() | depths.keys())
-        times = _optional_times(self.folder / "timestamp.txt", numbers)
+        colors = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
+        images = paired_images(
+            colors,
+            numbered_images(self.folder / "depth", (".png",)),
+            lambda k: self.folder / "image" / f"image{k:05d}.png",
+            lambda k: self.folder / "depth" / f"depth{k:05d}.png",
+        )
+        log_file = self.folder / "trajectory.log"
+        poses = read_trajectory_log(log_file) if is_there(log_file) else None
+        times = _optional_times(self.folder / "timestamp.txt", list(images))
         self.mesh = mesh_of([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         if self.mesh is None and self.frame_truth:
             raise DataError(f"dataset.frame_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
-        # a frame of which one image is missing is there: reading it says which
-        frames = [
-            _recorded(
-                ImageFiles(
-                    images.get(k, self.folder / "image" / f"image{k:05d}.png"),
-                    depths.get(k, self.folder / "depth" / f"depth{k:05d}.png"),
-                ),
-                k - 1,
-                poses,
-                times.get(k, (k - 1) / FRAME_RATE),
-            )
-            for k in numbers
-        ]
+        frames = [_recorded(pair, k - 1, poses, times.get(k, (k - 1) / FRAME_RATE)) for k, pair in images.items()]
         ini = self.root / "intrinsic" / f"{self.sensor}.ini"
-        return Contents(_camera(ini, images.values()), "the first colour image", DEPTH_SCALE, frames)
+        fx, fy, cx, cy = read_intrinsics(ini)
+        camera = Camera(*first_size(colors.values(), read_color), fx, fy, cx, cy)
+        return Contents(camera, "the first colour image", DEPTH_SCALE, frames)
 
 
-def _recorded(images: ImageFiles, pose_id: int, poses: TrajectoryLog | None, timestamp: float) -> RecordedFrame:
+def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, timestamp: float) -> RecordedFrame:
     if poses is None:
         return RecordedFrame(images, timestamp)
     if pose_id in poses.poses:
         return RecordedFrame(images, timestamp, poses.poses[pose_id])
     why = poses.unusable.get(pose_id, "trajectory.log has no pose for it")
     return RecordedFrame(images, timestamp, fault=f"{images.color_name}: {why}")
-
-
-def _camera(ini: Path, images: Iterable[Path]) -> Camera:
-    """The intrinsics of the file with the size of the first image that can be read."""
-    fx, fy, cx, cy = read_intrinsics(ini)
-    faults = []
-    for path in images:
-        try:
-            height, width = ImageFiles(path, path).color().shape[:2]
-        except FrameError as error:
-            faults.append(str(error))
-            continue
-        return Camera(width, height, fx, fy, cx, cy)
-    raise DataError(f"no colour image can be read: {faults[0]}")
-
-
-def _optional_poses(path: Path) -> TrajectoryLog | None:
-    return read_trajectory_log(path) if is_there(path) else None
 
 
 def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:

@@ -1,7 +1,12 @@
-"""SceneNN's trajectory.log: of each frame a header of three integers and the four rows of T_world_camera, metres."""
+"""SceneNN's files with poses and times.
+
+trajectory.log      each frame: a header of three integers, four rows of T_world_camera in meters
+timestamp.txt       each frame: its number (from 1), the times of color and depth in microseconds
+"""
 
 from __future__ import annotations
 
+import math
 from codecs import BOM_UTF8
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,13 +17,14 @@ import numpy as np
 from framework.data import Float64, check_rigid
 from framework.errors import DataError
 from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
-from framework.files.number_lines import number
+from framework.files.number_lines import SHOWN, number, read_lines
 from framework.geometry import nearest_rigid
 
 LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
 BLOCK = 5  # lines of a frame
 HEADER = "frame frame frame+1"
 LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as the published files have it
+MICROSECONDS = 1e6  # a second, of timestamp.txt
 CUT_OFF = "the file ends before the pose does"
 
 
@@ -135,3 +141,37 @@ def _are_digits(words: list[str]) -> bool:
     return all(
         word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1 for word in words
     )
+
+
+def read_timestamps(path: Path) -> Mapping[int, float]:
+    """When each image was taken, s, by its number: the time of its depth, which is what is mapped.
+
+    Raises DataError, naming file and line, when a line does not hold a number and two times, or has an earlier number.
+    """
+    times: dict[int, float] = {}
+    for n, line in enumerate(read_lines(path), start=1):
+        words = line.split()
+        if not words:
+            continue
+        try:
+            image, _color, depth = int(words[0]), *map(float, words[1:])
+        except ValueError as error:
+            expected = f"expected `number colour_us depth_us`, found {line[:SHOWN]!r}"
+            raise DataError(f"{path}, line {n}: {expected}") from error
+        if not math.isfinite(depth):
+            raise DataError(f"{path}, line {n}: the time is not finite")
+        if image in times:
+            raise DataError(f"{path}, line {n}: image {image} is there twice")
+        times[image] = depth / MICROSECONDS
+    return times
+
+
+def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
+    """Writes the time in s of each image, by its number, whole or not at all.
+
+    `times` are those of depth, and of colour as well where it has none of its own.
+    """
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
+        for number, time in times.items():
+            color_time = time if color_times is None else color_times[number]
+            file.write(f"{number} {round(color_time * MICROSECONDS)} {round(time * MICROSECONDS)}\n")

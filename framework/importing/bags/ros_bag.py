@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Camera, Float64
+from framework.datasets.calibration.camera_json import pinhole
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import CameraAxes, PoseReading
 from framework.datasets.tum_rgbd import Trajectory, associate
@@ -34,7 +35,6 @@ from framework.importing.bags.ros_messages import NANOSECONDS, ODOMETRY, Message
 from framework.importing.bags.ros_topics import Topics, camera_info_of, found_topics
 from framework.importing.bags.ros_transforms import REALSENSE, stream_motion
 from framework.importing.depth.depth_registration import DepthRegistration
-from framework.importing.phones import json_numbers
 from framework.importing.source import DeviceFrame, Source, StoredFrame
 
 APART = 0.02  # s, at most, of a colour image and its depth
@@ -279,7 +279,7 @@ def _numbers(info: Any, name: str) -> list[float]:
 
 def _camera(where: str, info: Any) -> Camera:
     fx, _, cx, _, fy, cy, _, _, _ = _numbers(info, "k")
-    return json_numbers.camera(where, info.width, info.height, fx, fy, cx, cy)
+    return pinhole(where, info.width, info.height, fx, fy, cx, cy)
 
 
 def _distortion(topics: Topics, info: Any) -> Distortion | None:

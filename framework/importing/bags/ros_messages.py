@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from framework.data import Array, Float32, UInt8
-from framework.errors import ConfigError, DataError, FrameError, in_one_line
+from framework.errors import DataError, FrameError, import_optional, in_one_line
 from framework.files.image_files import decode_color, decode_uint16
 from framework.files.number_lines import SHOWN
 from framework.importing.source import readings
@@ -58,7 +58,9 @@ class RosBag:
     def __init__(self, path: Path) -> None:
         """Raises DataError, naming the bag, when it cannot be read."""
         self.path = path
-        rosbag1, rosbag2, typesys = _load_rosbags()
+        import_optional("rosbags", "reads ROS bags", "ros")
+        from rosbags import rosbag1, rosbag2, typesys
+
         self._is_ros1 = path.suffix.lower() == ".bag"
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
         if TRANSFORMS not in self._types.types:  # rosbags does not know it in ROS 1
@@ -173,11 +175,3 @@ def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Ar
         )
     rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)
-
-
-def _load_rosbags() -> tuple[Any, Any, Any]:
-    try:
-        from rosbags import rosbag1, rosbag2, typesys
-    except ImportError as error:
-        raise ConfigError("rosbags, which reads ROS bags, is not there: pip install instancemap[ros]") from error
-    return rosbag1, rosbag2, typesys

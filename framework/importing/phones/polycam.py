@@ -21,10 +21,9 @@ from typing import Any
 import numpy as np
 
 from framework.data import Float64
-from framework.datasets.calibration.camera_json import read_json_object
+from framework.datasets.calibration.camera_json import numbers_of, pinhole, read_json_object
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
-from framework.importing.phones import json_numbers
 from framework.importing.source import (
     FAIRLY_SURE,
     SURE,
@@ -77,7 +76,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
     return DeviceFrame(
         name=depth,
         timestamp=int(stem) / MICROSECONDS,
-        camera=json_numbers.camera(seen_by, width, height, *json_numbers.named(seen_by, content, *INTRINSICS)),
+        camera=pinhole(seen_by, width, height, *numbers_of(seen_by, content, *INTRINSICS)),
         color=color,
         depth=metres(read_uint16(depth)),
         confidence=_levels(read_uint8(confidence)) if confidence.exists() else None,
@@ -88,7 +87,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
     """T_world_camera (4, 4). Raises DataError, naming the file."""
-    rows = np.reshape(json_numbers.named(path, content, *ROWS), (3, 4))
+    rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 
 

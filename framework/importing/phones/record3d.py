@@ -27,14 +27,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from framework.data import MOST_PIXELS, Camera, Float32, Float64, UInt8
-from framework.datasets.calibration.camera_json import read_json_object
-from framework.errors import ConfigError, DataError, FrameError, in_one_line
+from framework.datasets.calibration.camera_json import number_list, numbers_of, pinhole, read_json_object
+from framework.errors import DataError, FrameError, import_optional, in_one_line
 from framework.files.atomic_write import MOST_TEXT, read_bytes
 from framework.files.image_files import LARGEST_FILE, decode_color, read_color
 from framework.files.json_file import parse_json
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
-from framework.importing.phones import json_numbers
 from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, readings
 
 CHANNEL = "R"  # of the EXR files
@@ -42,8 +41,6 @@ LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
 BYTES_A_BLOCK = 20_000  # of an image, at least; the compressor ends a block after 40,000 bytes without repetitions
 UNTURNED = 1e-3  # sine of half the angle: nobody holds a phone so exactly along the axes of the world
 MOST_BLOCKS = 8  # beside these: each may unpack to 27 MB, whatever it says
-
-_MISSING = "{} is not there: pip install instancemap[phone]"
 
 
 class Record3DFiles(Protocol):
@@ -170,8 +167,8 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
     poses = content.get("poses")
     if not isinstance(poses, list) or not poses:
         raise DataError(f"{where}: poses must be a list of poses, found {str(poses)[:60]}")
-    size = json_numbers.named(where, content, "w", "h")
-    cameras = [json_numbers.camera(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
+    size = numbers_of(where, content, "w", "h")
+    cameras = [pinhole(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])
     times = _times(where, content, len(poses))
     tells_up = not _is_unturned(poses[0])
@@ -206,7 +203,7 @@ def _read(
 
 
 def _pose(where: str, values: Any) -> Float64:
-    quat_xyzw, position = np.split(np.array(json_numbers.finite(where, values, 7)), [4])
+    quat_xyzw, position = np.split(np.array(number_list(where, values, 7)), [4])
     length = float(np.linalg.norm(quat_xyzw))
     if abs(length - 1) > QUATERNION_TOLERANCE:
         raise DataError(f"{where}: the quaternion qx qy qz qw has length {length:.4g}, expected 1")
@@ -219,7 +216,7 @@ def _pose(where: str, values: Any) -> Float64:
 def _is_unturned(pose: Any) -> bool:
     """Whether a stored pose has the rotation of the identity, or is none."""
     try:
-        quat_xyzw = json_numbers.finite("pose", pose, 7)[:4]
+        quat_xyzw = number_list("pose", pose, 7)[:4]
     except DataError:
         return True
     return bool(np.linalg.norm(quat_xyzw[:3]) < UNTURNED)
@@ -229,16 +226,16 @@ def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> li
     """fx, fy, cx, cy of each frame's colour image."""
     own = content.get("perFrameIntrinsicCoeffs")
     if isinstance(own, list) and len(own) == count:
-        return [tuple(json_numbers.finite(f"{where}: perFrameIntrinsicCoeffs", values, 4)) for values in own]
-    fx, _, _, _, fy, _, cx, cy, _ = json_numbers.listed(where, content, "K", 9)
+        return [tuple(number_list(f"{where}: perFrameIntrinsicCoeffs", values, 4)) for values in own]
+    fx, _, _, _, fy, _, cx, cy, _ = number_list(f"{where}: K", content.get("K"), 9)
     return [(fx, fy, cx, cy)] * count
 
 
 def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
     """s, of each frame; by the frame rate in recordings of before the app stored them."""
     if "frameTimestamps" in content:
-        return json_numbers.listed(where, content, "frameTimestamps", count)
-    [rate] = json_numbers.named(where, content, "fps")
+        return number_list(f"{where}: frameTimestamps", content.get("frameTimestamps"), count)
+    [rate] = numbers_of(where, content, "fps")
     if not rate > 0:
         raise DataError(f"{where}: fps must be positive, found {rate:g}")
     return [k / rate for k in range(count)]
@@ -248,8 +245,8 @@ def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) 
     """(h, w) px of depth. Before the app stored it, depth came from the camera at the front, in colour's size."""
     if "dw" not in content:
         return camera.shape
-    width, height = json_numbers.named(where, content, "dw", "dh")
-    of_depth = json_numbers.camera(where, width, height, camera.fx, camera.fy, 0, 0)
+    width, height = numbers_of(where, content, "dw", "dh")
+    of_depth = pinhole(where, width, height, camera.fx, camera.fy, 0, 0)
     return of_depth.shape
 
 
@@ -278,16 +275,8 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
 
 
 def _load_openexr() -> Any:
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise ConfigError(_MISSING.format("OpenEXR, which reads Record3D's depth,")) from error
-    return OpenEXR
+    return import_optional("OpenEXR", "reads Record3D's depth", "phone")
 
 
 def _load_lzfse() -> Any:
-    try:
-        import lzfse
-    except ImportError as error:
-        raise ConfigError(_MISSING.format("lzfse, which unpacks Record3D's .r3d files,")) from error
-    return lzfse
+    return import_optional("lzfse", "unpacks Record3D's .r3d files", "phone")

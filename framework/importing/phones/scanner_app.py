@@ -15,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
-from framework.datasets.calibration.camera_json import read_json_object
+from framework.datasets.calibration.camera_json import number_list, numbers_of, pinhole, read_json_object
 from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
-from framework.importing.phones import json_numbers
 from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, metres
 
 _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
@@ -49,14 +48,14 @@ def _read(folder: Path, number: str) -> DeviceFrame:
     content = read_json_object(path)
     color = read_color(folder / f"frame_{number}.jpg")
     confidence = folder / f"conf_{number}.png"
-    fx, _, cx, _, fy, cy, _, _, _ = json_numbers.listed(path, content, "intrinsics", 9)
-    pose = np.reshape(json_numbers.listed(path, content, "cameraPoseARFrame", 16), (4, 4))
+    fx, _, cx, _, fy, cy, _, _, _ = number_list(f"{path}: intrinsics", content.get("intrinsics"), 9)
+    pose = np.reshape(number_list(f"{path}: cameraPoseARFrame", content.get("cameraPoseARFrame"), 16), (4, 4))
     T_world_camera = arkit_pose(path, pose)
     height, width = color.shape[:2]
     return DeviceFrame(
         name=path,
-        timestamp=json_numbers.named(path, content, "time")[0] if "time" in content else int(number) / FRAME_RATE,
-        camera=json_numbers.camera(path, width, height, fx, fy, cx, cy),
+        timestamp=numbers_of(path, content, "time")[0] if "time" in content else int(number) / FRAME_RATE,
+        camera=pinhole(path, width, height, fx, fy, cx, cy),
         color=color,
         depth=metres(read_uint16(folder / f"depth_{number}.png")),
         confidence=read_uint8(confidence) if confidence.exists() else None,

@@ -13,21 +13,27 @@ poses say 0.24; in ARKit's axes they would say -0.24.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from framework.data import Camera
-from framework.errors import DataError
+import cv2
+import numpy as np
+
+from framework.data import MOST_PIXELS, Camera, UInt8
+from framework.datasets.calibration.camera_json import pinhole
+from framework.errors import DataError, FrameError
+from framework.files.atomic_write import check_regular
 from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
-from framework.importing.phones.video import Video
 from framework.importing.source import DeviceFrame, Source, arkit_up, metres
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
 INTRINSICS = ("fx", "fy", "cx", "cy")  # the next ones, of newer versions
+KIND_AT, KIND = 4, b"ftyp"  # of an MP4 or QuickTime file; other kinds may name files that FFmpeg would open
+QUIET = "-8"  # FFmpeg's AV_LOG_QUIET: our own messages report the damage
 LAST_FRAME = 10**6 - 1  # six digits
 
 
@@ -91,7 +97,7 @@ def _row_or_fault(path: Path, number: int, words: list[str], camera: Camera) -> 
         own = [word for word in words[len(POSE) : len(POSE) + len(INTRINSICS)] if word.strip()]
         if own:
             values = numbers(where, own, len(INTRINSICS), ", ".join(INTRINSICS))
-            camera = _camera(where, camera.width, camera.height, values)
+            camera = pinhole(where, camera.width, camera.height, *values)
     except DataError as error:
         return error
     return OdometryRow(TumLine(path, number, timestamp, tuple(pose[:3]), tuple(pose[3:])), int(frame), camera)
@@ -104,11 +110,41 @@ def _read_camera(path: Path, video: Video) -> Camera:
     (fx, _, cx), (_, fy, cy), _ = (
         numbers(f"{path}, line {n}", line.split(","), 3) for n, line in enumerate(lines, start=1)
     )
-    return _camera(str(path), video.width, video.height, (fx, fy, cx, cy))
+    return pinhole(path, video.width, video.height, fx, fy, cx, cy)
 
 
-def _camera(where: str, width: int, height: int, intrinsics: Sequence[float]) -> Camera:
-    try:
-        return Camera(width, height, *intrinsics)
-    except DataError as error:
-        raise DataError(f"{where}: {error}") from error
+class Video:
+    """Reads frames as they are stored: a phone's note to turn them is not followed, as depth has none."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises DataError, naming the file, when it is no video that can be decoded."""
+        check_regular(path)
+        with path.open("rb") as file:
+            if not file.read(KIND_AT + len(KIND)).endswith(KIND):
+                raise DataError(f"{path} is no MP4 or QuickTime file")
+        os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", QUIET)
+        self.path = path
+        before = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        try:
+            self._capture = cv2.VideoCapture(str(path.absolute()), cv2.CAP_FFMPEG)
+        finally:
+            cv2.utils.logging.setLogLevel(before)
+        self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 0)
+        self.width = int(self._capture.get(cv2.CAP_PROP_FRAME_WIDTH))  # px
+        self.height = int(self._capture.get(cv2.CAP_PROP_FRAME_HEIGHT))  # px
+        if not self._capture.isOpened() or not 0 < self.width * self.height <= MOST_PIXELS:
+            raise DataError(f"{path} could not be decoded: it is damaged, or of a kind that OpenCV does not know")
+        self._next = 0
+
+    def frame(self, number: int) -> UInt8:
+        """(H, W, 3) RGB of a frame, counted from 0 and asked for in order. Raises FrameError when there is none."""
+        if number < self._next - 1:
+            raise FrameError(f"{self.path}: frame {number} comes after frame {self._next - 1}")
+        while self._next <= number:
+            if not self._capture.grab():
+                raise FrameError(f"{self.path} ends, or is damaged, before frame {number}")
+            self._next += 1
+        decoded, image = self._capture.retrieve()
+        if not decoded:
+            raise FrameError(f"{self.path}: frame {number} could not be decoded")
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)

@@ -16,8 +16,7 @@ from framework.datasets.scannet.scannet_annotation import read_label_table
 from framework.datasets.scannet.sens_file import open_sens
 from framework.datasets.scenenn.intrinsics import read_intrinsics
 from framework.datasets.scenenn.scenenn_annotation import read_annotation
-from framework.datasets.scenenn.timestamps import read_timestamps
-from framework.datasets.scenenn.trajectory_log import read_trajectory_log
+from framework.datasets.scenenn.trajectory_log import read_timestamps, read_trajectory_log
 from framework.detection.mask_rcnn.checkpoint import read_network
 from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
 from framework.detection.stored.coco_results import CategoryIds, read_results

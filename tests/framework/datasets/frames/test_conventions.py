@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from framework.data import Float64, UInt8, UInt16
+from framework.data import Float64
 from framework.datasets.frames.conventions import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
-from framework.datasets.frames.stored_frames import RecordedFrame
+from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
 from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, FrameError
 from framework.geometry import inverse
@@ -73,23 +73,15 @@ def test_impossible_readings_are_refused(wrong: dict[str, float], said: str) -> 
         PoseReading(pose_delay=-1001)
 
 
-class Image:
-    """One that says which it is."""
-
-    def __init__(self, k: int) -> None:
-        self.color_name, self.depth_name = f"color {k}", f"depth {k}"
-        self.k = k
-
-    def color(self) -> UInt8:
-        return np.full((2, 2, 3), self.k, np.uint8)
-
-    def depth(self) -> UInt16:
-        return np.full((2, 2), self.k, np.uint16)
+def images(k: int) -> StoredImages:
+    """Images that contain their number."""
+    color, depth = np.full((2, 2, 3), k, np.uint8), np.full((2, 2), k, np.uint16)
+    return StoredImages(f"color {k}", f"depth {k}", lambda: color, lambda: depth)
 
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
 def test_a_delay_pairs_colour_with_the_depth_that_belongs_to_it(delay: int) -> None:
-    frames = DepthReading(depth_delay=delay).frames([RecordedFrame(Image(k), k / 30) for k in range(5)])
+    frames = DepthReading(depth_delay=delay).frames([RecordedFrame(images(k), k / 30) for k in range(5)])
     for k, frame in enumerate(frames):
         if 0 <= k + delay < 5:
             assert not frame.fault
@@ -102,8 +94,8 @@ def test_a_delay_pairs_colour_with_the_depth_that_belongs_to_it(delay: int) -> N
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
 def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
-    stored = [RecordedFrame(Image(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
-    stored[3] = RecordedFrame(Image(3), 3 / 30, fault="line 3 is no pose")
+    stored = [RecordedFrame(images(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
+    stored[3] = RecordedFrame(images(3), 3 / 30, fault="line 3 is no pose")
     for k, frame in enumerate(PoseReading(pose_delay=delay).frames(stored)):
         assert (frame.images.color()[0, 0, 0], frame.timestamp) == (k, k / 30)
         if not 0 <= k + delay < 5:

@@ -182,7 +182,7 @@ def test_colour_that_was_exported_smaller_has_the_intrinsics_of_the_published_si
     published = np.array([[1170.188, 0, 647.75, 0], [0, 1170.188, 483.75, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     np.savetxt(tmp_path / SCENE / "intrinsic/intrinsic_color.txt", published, fmt="%f")
     frame = ScanNet(tmp_path, SCENE).contents.frames[0]
-    camera = frame.images.registration.color  # type: ignore[attr-defined]
+    camera = frame.images.color.args[1].color  # type: ignore[attr-defined]
     view = (camera.width / camera.fx, camera.height / camera.fy)
     assert view == pytest.approx((1296 / 1170.188, 968 / 1170.188))
     to_the_left_and_up = ((camera.cx + 0.5) / camera.fx, (camera.cy + 0.5) / camera.fy)

@@ -112,7 +112,7 @@ SPOILT_CAMERAS = {
         (lambda c: c.update(time="now"), "time must be a number, found now"),
     ],
     "Polycam": [
-        (lambda c: c.pop("fx"), "fx must be a number, found None"),
+        (lambda c: c.pop("fx"), "the key 'fx' is missing"),
         (lambda c: c.update(t_00=3), "the pose is not rigid"),
         (lambda c: c.update(t_23=None), "t_23 must be a number, found None"),
         (lambda c: c.update(fx=-1), "fx, fy must be positive"),

@@ -111,7 +111,7 @@ def test_a_damaged_pose_is_one_frame(export: Path, tmp_path: Path, change, said:
         (lambda m: (m.pop("perFrameIntrinsicCoeffs"), m.pop("K")), "K must be a list of 9 numbers"),
         (lambda m: m.update(w="640"), "w must be a number, found 640"),
         (lambda m: m.update(w=10**9), "an image has at most"),
-        (lambda m: m.update(dw=0.5), "an image has whole numbers of pixels"),
+        (lambda m: m.update(dw=0.5), "width and height must be whole numbers of pixels"),
         (lambda m: m.update(dw=10**9), "an image has at most"),
         (lambda m: m.update(frameTimestamps=[1, 2]), "frameTimestamps must be a list of 4 numbers"),
         (lambda m: (m.pop("frameTimestamps"), m.update(fps=0)), "fps must be positive"),

@@ -1,6 +1,6 @@
 import pytest
 
-from framework.datasets.frames.frame_selection import check_selection, choose_frames
+from framework.datasets.frames.sequence_reader import check_selection, choose_frames
 from framework.errors import ConfigError
 
 
