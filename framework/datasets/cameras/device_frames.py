@@ -22,7 +22,7 @@ LONGEST_SILENCE = 5.0  # s; a camera that runs and sends nothing for so long is 
 Images = TypeVar("Images")
 
 
-class Device(Protocol):
+class CameraDevice(Protocol):
     """A camera of one vendor. The methods raise one of `errors` where the library does."""
 
     errors: tuple[type[Exception], ...]
@@ -60,7 +60,7 @@ class DepthCamera(LiveVideo):
         self.name = "_".join(filter(None, (self.brand.lower(), self.serial)))
 
     @abstractmethod
-    def device(self) -> Device:
+    def device(self) -> CameraDevice:
         """The camera, not started yet. Raises ConfigError without the library."""
 
     def frames(self) -> Generator[FrameReader | None]:
@@ -76,7 +76,7 @@ class DepthCamera(LiveVideo):
         finally:
             device.stop()
 
-    def _sent(self, device: Device) -> Generator[FrameReader | None]:
+    def _sent(self, device: CameraDevice) -> Generator[FrameReader | None]:
         number = count()
         calibration: Calibration | None = None
         for images in images_of(self.brand, partial(_wait, self.brand, device)):
@@ -100,14 +100,14 @@ def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images 
         yield images
 
 
-def _wait(brand: str, device: Device) -> Any:
+def _wait(brand: str, device: CameraDevice) -> Any:
     try:
         return device.wait()
     except device.errors as error:
         raise DataError(f"{brand}: {in_one_line(error)}") from error
 
 
-def _read(device: Device, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
+def _read(device: CameraDevice, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
     """Raises FrameError if one of the two images is missing, or they cannot be registered."""
     try:
         color, depth = device.read(images)

@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
 from framework.datasets.calibration.undistortion import Distortion
-from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera, Device
+from framework.datasets.cameras.device_frames import WAIT_MS, CameraDevice, DepthCamera
 from framework.errors import import_optional
 
 MILLIMETRES = 1000.0  # a metre: the unit of the library's depth scale
@@ -25,7 +25,7 @@ class Orbbec(DepthCamera):
 
     brand = "Orbbec"
 
-    def device(self) -> Device:
+    def device(self) -> CameraDevice:
         return OrbbecDevice(import_optional("pyorbbecsdk", "reads Orbbec cameras", "orbbec"), self)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
 from framework.datasets.calibration.undistortion import Distortion
-from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera, Device
+from framework.datasets.cameras.device_frames import WAIT_MS, CameraDevice, DepthCamera
 from framework.errors import import_optional
 
 log = logging.getLogger(__name__)
@@ -23,7 +23,7 @@ class RealSense(DepthCamera):
 
     brand = "RealSense"
 
-    def device(self) -> Device:
+    def device(self) -> CameraDevice:
         return RealSenseDevice(import_optional("pyrealsense2", "reads RealSense cameras", "realsense"), self)
 
 
