@@ -1,8 +1,8 @@
-"""The page of rerun's viewer, sealed: this machine alone gets it, and what it shows there may talk to nobody else.
+"""rerun's web viewer on 127.0.0.1, with a Content-Security-Policy that blocks requests to other hosts.
 
-As rerun serves it, the page sends statistics of its use to its makers, and asks several servers for news, examples and
-fonts (0.41, seen in a browser). A Content-Security-Policy forbids that; rerun's own server cannot be told to send one.
-So that one is asked for the page's files, once, and ended.
+In rerun-sdk 0.41, `rr.serve_web_viewer` has no bind address and listens on 0.0.0.0. `rerun --serve-web --bind` listens
+on 127.0.0.1, but sends no policy: its page sends usage statistics and requests news, examples and fonts. This module
+downloads the page's files once from that server, stops it, and serves them with a policy.
 """
 
 from __future__ import annotations
