@@ -111,7 +111,7 @@ def to_coco(labels: Sequence[str]) -> LabelMapping:
     if unknown:
         raise ConfigError(
             f"{len(unknown)} of {len(labels)} labels are in no label space: {', '.join(map(repr, unknown))};"
-            f" framework/{Path(__file__).stem}.yaml says what a name means: add them there"
+            f" framework/vocabulary/{Path(__file__).stem}.yaml says what a name means: add them there"
         )
     meanings = [MEANINGS[key] for key in keys]
     classes = tuple(name for name in COCO if name in meanings)

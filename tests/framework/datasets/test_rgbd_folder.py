@@ -452,7 +452,7 @@ def test_an_instance_without_name(folder):
 @pytest.mark.parametrize(
     ("scene", "frames", "shape", "labeled"),
     [
-        ("redkitchen", 300, (480, 640), False),
+        ("redkitchen", 300, (480, 640), True),
         ("replica_floor2", 123, (512, 512), True),
         ("mit76", 5, (480, 640), False),
         ("redwood5", 5, (480, 640), False),

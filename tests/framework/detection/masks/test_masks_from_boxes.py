@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from framework.data import Camera
-from framework.detection.masks.binary_masks import masks_from_boxes
+from framework.detection.masks import masks_from_boxes
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)

@@ -165,7 +165,7 @@ def test_a_detector_is_identified_by_what_it_says_or_by_what_it_is(tmp_path: Pat
     assert CachedDetector(silent, tmp_path).reads == FRAME_FIELDS
     assert identity_of(Named()) == f"{fingerprint(Named())} main"
     assert CachedDetector(Named(), tmp_path).reads == ("color",)
-    with pytest.raises(ConfigError, match=r"'super' .*; call framework\.detection\.fingerprint's"):
+    with pytest.raises(ConfigError, match=r"NamedAsOnce.* call framework\.detection\.stored\.fingerprint"):
         CachedDetector(NamedAsOnce(), tmp_path)
 
 

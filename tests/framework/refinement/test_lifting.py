@@ -1,0 +1,51 @@
+"""Masks lifted to point clusters, in a room whose every pixel is known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from framework.data import Detections, Frame, Pose
+from framework.errors import DataError
+from framework.geometry import inverse, project, transform
+from framework.refinement.lifting import lift
+from tests.support.scenes.corner_room import CornerRoom, pose_at
+
+
+def test_lift_places_readings_in_the_world(room: CornerRoom) -> None:
+    frame = room[3]
+    assert frame.truth is not None
+    masks = np.stack([frame.truth.instance_ids == 1, frame.truth.instance_ids > 0])  # the second covers the first
+    half = np.full((2, 2), 0.5, np.float32)
+    detections = Detections(masks, np.zeros((2, 4), np.float32), np.ones(2, np.float32), half, ("a", "b"))
+    clusters = lift(detections, frame, Pose(pose_at(3)))
+    assert np.bincount(clusters.cluster).tolist() == masks.sum(axis=(1, 2)).tolist()
+    for (u, v), point in zip(clusters.pixels[::97], clusters.points_world[::97], strict=True):
+        camera_point = transform(inverse(pose_at(3)), point.astype(np.float64))
+        assert camera_point[2] == pytest.approx(frame.depth[v, u], abs=1e-5)
+        np.testing.assert_allclose(project(frame.camera, camera_point), [u, v], atol=1e-3)
+    spheres = np.linalg.norm(clusters.points_world[clusters.cluster == 0] - [-0.5, 0.7, 2.2], axis=1)
+    np.testing.assert_allclose(spheres, 0.35, atol=1e-5)
+
+
+def test_lift_skips_pixels_without_depth(room: CornerRoom) -> None:
+    frame = room[0]
+    blind = Frame(0, 0.0, frame.color, np.zeros_like(frame.depth), frame.camera)
+    detections = Detections(
+        np.ones((1, *frame.camera.shape), np.bool_),
+        np.zeros((1, 4), np.float32),
+        np.ones(1, np.float32),
+        np.ones((1, 1), np.float32),
+        ("a",),
+    )
+    clusters = lift(detections, blind, Pose(np.eye(4)))
+    assert (len(clusters), len(clusters.points_world)) == (1, 0)
+    assert len(lift(Detections.none(frame.camera.shape, ("a",)), frame, Pose(np.eye(4)))) == 0
+
+
+def test_lift_rejects_masks_of_another_size(room: CornerRoom) -> None:
+    frame, shape = room[0], (1, 1)  # numpy would broadcast it over the image
+    masks = np.ones((1, *shape), np.bool_)
+    one = np.ones((1, 1), np.float32)
+    with pytest.raises(DataError, match=r"frame 0: masks must be \(72, 96\), found \(1, 1\)"):
+        lift(Detections(masks, np.zeros((1, 4), np.float32), one[0], one, ("a",)), frame, Pose(np.eye(4)))
