@@ -22,18 +22,8 @@ class Format:
     name: str  # for the command line
     needs: str  # what is there where it is recognised, for the person
     recognised: Callable[[Path], bool]
-    open: Callable[[Path, Topics], Source]
-
-
-def _without_topics(open_phone: Callable[[Path], Source]) -> Callable[[Path, Topics], Source]:
-    """A format that has none refuses those that are given."""
-
-    def open_source(path: Path, topics: Topics) -> Source:
-        if topics.given:
-            raise ConfigError(f"{path} has no topics: {', '.join(topics.given)} are for ROS bags")
-        return open_phone(path)
-
-    return open_source
+    open: Callable[..., Source]  # of the path, and of the topics if it has some
+    has_topics: bool = False
 
 
 FORMATS = (
@@ -41,37 +31,28 @@ FORMATS = (
         "stray_scanner",
         "a folder with odometry.csv, camera_matrix.csv, rgb.mp4 and depth/",
         stray_scanner.recognised,
-        _without_topics(stray_scanner.open_source),
+        stray_scanner.open_source,
     ),
-    Format(
-        "record3d",
-        "an .r3d file of Record3D",
-        record3d.file_recognised,
-        _without_topics(record3d.open_file),
-    ),
+    Format("record3d", "an .r3d file of Record3D", record3d.file_recognised, record3d.open_file),
     Format(
         "record3d_exr",
         "a folder with metadata.json, rgb/ and depth/, Record3D's EXR + RGB export",
         record3d.folder_recognised,
-        _without_topics(record3d.open_folder),
+        record3d.open_folder,
     ),
-    Format(
-        "polycam",
-        "a folder with keyframes/, Polycam's raw data",
-        polycam.recognised,
-        _without_topics(polycam.open_source),
-    ),
+    Format("polycam", "a folder with keyframes/, Polycam's raw data", polycam.recognised, polycam.open_source),
     Format(
         "scanner_app",
         'a folder with frame_00000.json, "All Data" of 3D Scanner App',
         scanner_app.recognised,
-        _without_topics(scanner_app.open_source),
+        scanner_app.open_source,
     ),
     Format(
         "ros_bag",
         "a .bag, .mcap or .db3 file or a folder with metadata.yaml, of ROS or RealSense",
         ros_bag.recognised,
         ros_bag.open_source,
+        has_topics=True,
     ),
 )
 
@@ -87,8 +68,13 @@ def open_source(path: Path, topics: Topics | None = None) -> Source:
         raise DataError(f"{path} must be unpacked first; then name the folder")
     for place in (path, *_only_folder(path)):  # what was zipped often has a folder around it
         for kind in FORMATS:
-            if kind.recognised(place):
+            if not kind.recognised(place):
+                continue
+            if kind.has_topics:
                 return kind.open(place, topics or Topics())
+            if topics and topics.given:
+                raise ConfigError(f"{path} has no topics: {', '.join(topics.given)} are for ROS bags")
+            return kind.open(place)
     known = "; ".join(f"{kind.name}: {kind.needs}" for kind in FORMATS)
     raise DataError(f"{path} is of no format that can be imported. These are: {known}")
 

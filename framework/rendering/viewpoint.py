@@ -132,11 +132,7 @@ def _level(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float
 
 @njit(cache=True, nogil=True)
 def _draw_fronts(
-    points: Float32,
-    normals: Float32,
-    T: Float64,
-    intrinsics: tuple[float, float, float, float],
-    nearest: Int32,
+    points: Float32, normals: Float32, T: Float64, intrinsics: tuple[float, float, float, float], nearest: Int32
 ) -> None:
     """Writes which point (P, 3) is the nearest (H, W) of those that turn their front to the camera, T_world_camera."""
     fx, fy, cx, cy = intrinsics

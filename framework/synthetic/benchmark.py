@@ -27,13 +27,7 @@ from framework.synthetic.furniture.cluttered_groups import (
     laid_table_group,
     strew_on,
 )
-from framework.synthetic.furniture.groups import (
-    Group,
-    kitchen_group,
-    single,
-    toilet_group,
-    tv_group,
-)
+from framework.synthetic.furniture.groups import Group, kitchen_group, single, toilet_group, tv_group
 from framework.synthetic.furniture.piece import Rng
 from framework.synthetic.ray_caster import RayCaster
 from framework.synthetic.renderer import ids_met

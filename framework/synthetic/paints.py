@@ -57,20 +57,22 @@ def wood(rng: np.random.Generator) -> Material:
     first, second = WOODS[int(rng.integers(len(WOODS)))]
     tone = rng.uniform(0.9, 1.08)
     light, veins = shade(first, tone), shade(second, tone)
-    return Material(Texture.WOOD, light, veins, rng.uniform(0.03, 0.06), seed=_seed(rng), dark=swallowed(light))
+    return Material(Texture.WOOD, light, veins, rng.uniform(0.03, 0.06), seed=new_seed(rng), dark=swallowed(light))
 
 
 def cloth(rng: np.random.Generator, color: Color | None = None) -> Material:
     """Upholstery of one colour."""
     base = pick(rng, CLOTHS) if color is None else color
     scale = rng.uniform(0.10, 0.2)
-    return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=_seed(rng), dark=swallowed(base))
+    return Material(Texture.FABRIC, base, shade(base, 0.72), scale, seed=new_seed(rng), dark=swallowed(base))
 
 
 def leather(rng: np.random.Generator) -> Material:
     """Black, and polished by use."""
     color = shade((0.17, 0.16, 0.15), rng.uniform(0.7, 1.3))
-    return Material(Texture.PAINT, color, shade(color, 0.6), 0.03, seed=_seed(rng), dark=swallowed(color), shiny=GLAZED)
+    return Material(
+        Texture.PAINT, color, shade(color, 0.6), 0.03, seed=new_seed(rng), dark=swallowed(color), shiny=GLAZED
+    )
 
 
 def patterned_cloth(rng: np.random.Generator) -> Material:
@@ -79,11 +81,11 @@ def patterned_cloth(rng: np.random.Generator) -> Material:
     texture = (Texture.STRIPES, Texture.CHECKS, Texture.FABRIC)[int(rng.integers(3))]
     second = shade(base, 0.75) if texture is Texture.FABRIC else base
     first = base if texture is Texture.FABRIC else other
-    return Material(texture, first, second, rng.uniform(0.10, 0.2), seed=_seed(rng))
+    return Material(texture, first, second, rng.uniform(0.10, 0.2), seed=new_seed(rng))
 
 
 def paint(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
-    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=_seed(rng), dark=swallowed(color))
+    return Material(Texture.PAINT, color, shade(color, contrast), scale, seed=new_seed(rng), dark=swallowed(color))
 
 
 def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale: float = 0.1) -> Material:
@@ -93,15 +95,16 @@ def glaze(rng: np.random.Generator, color: Color, contrast: float = 0.90, scale:
 
 def metal(rng: np.random.Generator, color: Color = (0.62, 0.63, 0.65)) -> Material:
     dark = swallowed(color)
-    return Material(Texture.METAL, color, shade(color, 0.91), seed=_seed(rng), dark=dark, shiny=POLISHED)
+    return Material(Texture.METAL, color, shade(color, 0.91), seed=new_seed(rng), dark=dark, shiny=POLISHED)
 
 
 def picture(rng: np.random.Generator, texture: Texture, width: float, height: float, emission: float = 0.0) -> Material:
     """A painting or a screen of this size (m). No depth camera reads a glossy screen; every other screen is matte."""
-    first, second, seed = vivid(rng), vivid(rng), _seed(rng)
+    first, second, seed = vivid(rng), vivid(rng), new_seed(rng)
     dark = (1.0, MATTE_SCREEN)[seed % 2] if texture is Texture.SCREEN else 0.0
     return Material(texture, first, second, 0.1, (width, height), seed, emission, dark)
 
 
-def _seed(rng: np.random.Generator) -> int:
+def new_seed(rng: np.random.Generator) -> int:
+    """A random seed of a texture."""
     return int(rng.integers(4096))

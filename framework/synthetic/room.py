@@ -14,9 +14,8 @@ from framework.synthetic.furniture import clutter, fixtures, groups, seating
 from framework.synthetic.furniture.groups import Group, single
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import panel, rounded_box
-from framework.synthetic.layout import Layout, arrange, place_on_wall
+from framework.synthetic.layout import Layout, arrange, place_on_wall, strew
 from framework.synthetic.lights import Lamp, globe, rectangle
-from framework.synthetic.strewing import strew
 from framework.synthetic.surfaces import Surfaces, assemble
 from framework.synthetic.textures import Material, Texture
 
@@ -107,7 +106,7 @@ def _shell(width: float, depth: float, rng: Rng) -> Furniture:
     ceiling = panel(width, depth).turned("x", -np.pi / 2).moved(y=-depth / 2, z=HEIGHT)
     shell.add(ceiling, paints.paint(rng, (0.93, 0.92, 0.89), 0.93, 0.12))
     color = paints.pick(rng, paints.WALLS)
-    plain, pattern = paints.paint(rng, color, 0.88), int(rng.integers(4096))
+    plain, pattern = paints.paint(rng, color, 0.88), paints.new_seed(rng)
     paper = Material(Texture.WALLPAPER, color, paints.shade(color, 0.78), rng.uniform(0.13, 0.2), seed=pattern)
     papered, skirting = int(rng.integers(4)), paints.wood(rng)
     for wall in range(4):
@@ -123,15 +122,11 @@ def _floor(rng: Rng) -> Material:
     style = rng.uniform()
     if style < 0.65:
         first, second = paints.WOODS[int(rng.integers(len(paints.WOODS)))]
-        return Material(Texture.PLANKS, first, second, rng.uniform(0.11, 0.17), seed=int(rng.integers(4096)))
+        return Material(Texture.PLANKS, first, second, rng.uniform(0.11, 0.17), seed=paints.new_seed(rng))
     if style < 0.85:
         tone = paints.pick(rng, ((0.72, 0.66, 0.58), (0.60, 0.61, 0.62), (0.76, 0.52, 0.38)))
         return Material(
-            Texture.TILES,
-            tone,
-            paints.shade(tone, 0.6),
-            rng.uniform(0.28, 0.42),
-            seed=int(rng.integers(4096)),
+            Texture.TILES, tone, paints.shade(tone, 0.6), rng.uniform(0.28, 0.42), seed=paints.new_seed(rng)
         )
     return paints.cloth(rng, paints.pick(rng, paints.CLOTHS))
 

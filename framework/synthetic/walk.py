@@ -63,12 +63,7 @@ class LabelView(Protocol):
 
 
 def plan_path(
-    layout: Layout,
-    frames: int,
-    labels: LabelView,
-    wanted: set[int],
-    rng: np.random.Generator,
-    stride: float = 1.0,
+    layout: Layout, frames: int, labels: LabelView, wanted: set[int], rng: np.random.Generator, stride: float = 1.0
 ) -> CameraPath:
     """The walk whose `frames` frames see most of the `wanted` instances, with only every `stride`-th frame.
 

@@ -85,12 +85,7 @@ def _anchor_losses(
 
 
 def _proposal_losses(
-    network: MaskRCNN,
-    pyramid: Sequence[Tensor],
-    boxes: Tensor,
-    true: Objects,
-    number: int,
-    generator: torch.Generator,
+    network: MaskRCNN, pyramid: Sequence[Tensor], boxes: Tensor, true: Objects, number: int, generator: torch.Generator
 ) -> dict[str, Tensor]:
     own = match(box_iou(boxes, true.boxes), 0.5, 0.5, each_object=False)
     positive, negative = sample(own, number, PROPOSALS_POSITIVE, generator)

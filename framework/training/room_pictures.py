@@ -90,22 +90,16 @@ def render_room(folder: Path, views: int, number: int) -> None:
 def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:
     """(color (H, W, 3), instance ids (H, W) uint16, their COCO classes) of random views of room `number`."""
     rng = np.random.default_rng([STREAM, number])
-    room, names = random_room(rng)
+    kinds = list(RoomKind)
+    room = furnish(RoomKind.STUDIO if rng.uniform() < STUDIOS else kinds[int(rng.integers(len(kinds)))], rng)
+    names = {i: name for i, name in room.surfaces.class_names.items() if name is not None}
     renderer = Renderer(room.surfaces, list(room.lamps))
-    for camera, T_world_camera in random_views(room, renderer, names, views, rng):
+    for camera, T_world_camera in _random_views(room, renderer, names, views, rng):
         picture = renderer.render(camera, T_world_camera, _tinted(room.surfaces.material_table, rng))
         yield noisy_color(picture.color, rng.uniform(0, 2), rng), picture.instance_ids.astype(np.uint16), names
 
 
-def random_room(rng: np.random.Generator) -> tuple[Room, dict[int, str]]:
-    """A room of a random kind, and the COCO classes of its objects that have one."""
-    kinds = list(RoomKind)
-    kind = RoomKind.STUDIO if rng.uniform() < STUDIOS else kinds[int(rng.integers(len(kinds)))]
-    room = furnish(kind, rng)
-    return room, {i: name for i, name in room.surfaces.class_names.items() if name is not None}
-
-
-def random_views(
+def _random_views(
     room: Room, renderer: Renderer, names: Mapping[int, str], views: int, rng: np.random.Generator
 ) -> Iterator[tuple[Camera, Float64]]:
     """(camera, T_world_camera (4, 4)) of so many views in which objects with a class are to be seen."""

@@ -19,7 +19,6 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
-from enum import IntEnum
 from pathlib import Path
 from typing import BinaryIO
 
@@ -34,6 +33,8 @@ from framework.files.image_files import decode_color
 from framework.files.matrix_file import PrintedMatrix
 
 VERSION = 4
+RAW, PNG, JPEG = 0, 1, 2  # compression of color; of depth: RAW, or
+ZLIB, OCCIPITAL = 1, 2
 LONGEST_NAME = 1024  # bytes, of the sensor: "StructureSensor" has 15
 MOST_FRAMES = 2**18  # two and a half hours at 30 Hz; ScanNet's longest has some 6,000
 START = struct.Struct("<IQ")
@@ -41,18 +42,6 @@ MATRIX_BYTES = 64
 IMAGES = struct.Struct("<iiIIIIfQ")
 FRAME = struct.Struct("<64s4Q")
 OVERHEAD = 2**16  # bytes by which a compressed image may be larger than twice the raw one
-
-
-class ColorCompression(IntEnum):
-    RAW = 0
-    PNG = 1
-    JPEG = 2
-
-
-class DepthCompression(IntEnum):
-    RAW = 0
-    ZLIB = 1
-    OCCIPITAL = 2
 
 
 @dataclass(frozen=True)
@@ -63,8 +52,8 @@ class SensHeader:
     depth_camera: Camera
     color_extrinsics: PrintedMatrix  # identity in all that was published, so which way it maps is not known
     depth_extrinsics: PrintedMatrix  # likewise
-    color_compression: ColorCompression
-    depth_compression: DepthCompression
+    color_compression: int  # RAW, PNG or JPEG
+    depth_compression: int  # RAW or ZLIB
     depth_scale: float  # units a metre
     frames: int  # number of frames that the file should hold
 
@@ -99,7 +88,7 @@ class SensFrame:
     def color(self) -> UInt8:
         """(H, W, 3) RGB in the colour camera. Raises FrameError."""
         data = self._read(self.color_name, self.byte, self.color_bytes)
-        if self.header.color_compression != ColorCompression.RAW:
+        if self.header.color_compression != RAW:
             return decode_color(self.color_name, data)
         shape = (*self.header.color_camera.shape, 3)
         _check_length(self.color_name, len(data), shape[0] * shape[1] * 3)
@@ -110,7 +99,7 @@ class SensFrame:
         data = self._read(self.depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
         length = shape[0] * shape[1] * 2
-        if self.header.depth_compression == DepthCompression.ZLIB:
+        if self.header.depth_compression == ZLIB:
             data = _inflate(self.depth_name, data, length)
         _check_length(self.depth_name, len(data), length)
         return np.frombuffer(data, "<u2").reshape(shape).astype(np.uint16, copy=False)
@@ -171,14 +160,15 @@ def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
         )
     if frames > MOST_FRAMES or frames * FRAME.size > length:
         raise DataError(f"{path}, byte {at + 28}: {frames} frames cannot be in a file of {length} bytes")
+    _check_compressions(path, at, color_code, depth_code)
     color_intrinsics, color_extrinsics, depth_intrinsics, depth_extrinsics = matrices
     return SensHeader(
         color_camera=color_intrinsics.camera(*sizes[:2]),
         depth_camera=depth_intrinsics.camera(*sizes[2:]),
         color_extrinsics=color_extrinsics,
         depth_extrinsics=depth_extrinsics,
-        color_compression=_color_compression(f"{path}, byte {at}", color_code),
-        depth_compression=_depth_compression(f"{path}, byte {at + 4}", depth_code),
+        color_compression=color_code,
+        depth_compression=depth_code,
         depth_scale=depth_scale,
         frames=frames,
     )
@@ -202,22 +192,16 @@ def _matrix(where: str, data: bytes) -> PrintedMatrix:
     return PrintedMatrix(where, values)
 
 
-def _color_compression(where: str, code: int) -> ColorCompression:
-    try:
-        return ColorCompression(code)
-    except ValueError:
-        raise DataError(f"{where}: expected a compression of colour: 0, 1 or 2, found {code}") from None
-
-
-def _depth_compression(where: str, code: int) -> DepthCompression:
-    if code == DepthCompression.OCCIPITAL:
+def _check_compressions(path: Path, at: int, color: int, depth: int) -> None:
+    if color not in (RAW, PNG, JPEG):
+        raise DataError(f"{path}, byte {at}: expected a compression of colour: 0, 1 or 2, found {color}")
+    if depth == OCCIPITAL:
         raise DataError(
-            f"{where}: depth is compressed by Occipital's own method, which only their library reads; export the "
-            "frames with ScanNet's SensReader"
+            f"{path}, byte {at + 4}: depth is compressed by Occipital's own method, which only their library reads; "
+            "export the frames with ScanNet's SensReader"
         )
-    if code not in (DepthCompression.RAW, DepthCompression.ZLIB):
-        raise DataError(f"{where}: expected a compression of depth: 0 or 1, found {code}")
-    return DepthCompression(code)
+    if depth not in (RAW, ZLIB):
+        raise DataError(f"{path}, byte {at + 4}: expected a compression of depth: 0 or 1, found {depth}")
 
 
 def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) -> tuple[list[SensFrame], str]:

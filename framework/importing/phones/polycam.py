@@ -24,16 +24,7 @@ from framework.data import Float64
 from framework.datasets.calibration.camera_json import numbers_of, pinhole, read_json_object
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
-from framework.importing.source import (
-    FAIRLY_SURE,
-    SURE,
-    UNSURE,
-    DeviceFrame,
-    Source,
-    arkit_pose,
-    arkit_up,
-    metres,
-)
+from framework.importing.source import FAIRLY_SURE, SURE, UNSURE, DeviceFrame, Source, arkit_pose, arkit_up, metres
 
 MICROSECONDS = 1e6  # in a second
 HIGH = 255  # in the images of confidence

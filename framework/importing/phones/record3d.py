@@ -172,34 +172,21 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
     shape = _depth_shape(where, content, cameras[0])
     times = _times(where, content, len(poses))
     tells_up = not _is_unturned(poses[0])
-    frames = [
-        partial(_read, files, k, times[k], camera, shape, f"{where}: pose {k}", poses[k], tells_up)
-        for k, camera in enumerate(cameras)
-    ]
-    return Source("Record3D", frames, len(frames), posed=True)
 
+    def read(k: int) -> DeviceFrame:
+        T_world_camera = _pose(f"{where}: pose {k}", poses[k])
+        return DeviceFrame(
+            name=files.name(k),
+            timestamp=times[k],
+            camera=cameras[k],
+            color=files.color(k),
+            depth=files.depth(k, shape),
+            confidence=files.confidence(k, shape),
+            T_world_camera=T_world_camera,
+            up=arkit_up(T_world_camera) if tells_up else None,
+        )
 
-def _read(
-    files: Record3DFiles,
-    number: int,
-    timestamp: float,
-    camera: Camera,
-    shape: tuple[int, int],
-    where: str,
-    pose: Any,
-    tells_up: bool,
-) -> DeviceFrame:
-    T_world_camera = _pose(where, pose)
-    return DeviceFrame(
-        name=files.name(number),
-        timestamp=timestamp,
-        camera=camera,
-        color=files.color(number),
-        depth=files.depth(number, shape),
-        confidence=files.confidence(number, shape),
-        T_world_camera=T_world_camera,
-        up=arkit_up(T_world_camera) if tells_up else None,
-    )
+    return Source("Record3D", [partial(read, k) for k in range(len(poses))], len(poses), posed=True)
 
 
 def _pose(where: str, values: Any) -> Float64:

@@ -7,9 +7,10 @@ import numpy as np
 from framework.data import Float64
 from framework.synthetic import paints
 from framework.synthetic.furniture.piece import Furniture, Rng, corners
-from framework.synthetic.furniture.solids import Section, Solid, cushion, cylinder, leg, loft, panel, rounded_box, tube
+from framework.synthetic.furniture.solids import Solid, cushion, cylinder, lathe, leg, panel, rounded_box, tube
 from framework.synthetic.textures import Material, Texture
 
+WEAVE = 0.04  # m, between the vertices of cloth: what a crease can follow
 LAMP_GLOW = 2.2  # emission of a lit lampshade, relative to a white wall in the room's mean light
 
 
@@ -27,7 +28,7 @@ def cupboard(rng: Rng) -> Furniture:
         for low, high in ((0.14, 0.48), (0.54, 0.93)):
             field = rounded_box(width / 2 - 0.16, 0.016, (high - low) * height, 0.007, 1)
             piece.add(field.moved(x * width / 4, depth / 2 - 0.002, (low + high) / 2 * height), body)
-        ball = loft([Section(0.0, 0.006, 0.006), Section(0.012, 0.015, 0.015), Section(0.025, 0.008, 0.008)], 14)
+        ball = lathe([(0.0, 0.006), (0.012, 0.015), (0.025, 0.008)], 14)
         piece.add(ball.turned("x", -np.pi / 2).moved(x * 0.035, depth / 2 - 0.003, 0.52 * height), knob)
     return piece
 
@@ -68,7 +69,7 @@ def counter(rng: Rng) -> Furniture:
     piece = Furniture("kitchen counter", None)
     width, depth = rng.uniform(1.3, 1.6), 0.60
     front = paints.paint(rng, paints.pick(rng, ((0.86, 0.86, 0.84), (0.42, 0.53, 0.56), (0.60, 0.25, 0.20))))
-    stone = Material(Texture.PAINT, (0.36, 0.35, 0.34), (0.62, 0.60, 0.58), 0.012, seed=int(rng.integers(4096)))
+    stone = Material(Texture.PAINT, (0.36, 0.35, 0.34), (0.62, 0.60, 0.58), 0.012, seed=paints.new_seed(rng))
     steel, dark = paints.metal(rng), paints.paint(rng, (0.15, 0.15, 0.15))
     piece.add(rounded_box(width - 0.01, depth - 0.10, 0.10, 0.003).moved(y=-0.04, z=0.05), dark)
     piece.add(rounded_box(width, depth - 0.04, 0.76, 0.004).moved(y=-0.02, z=0.48), front)
@@ -84,13 +85,8 @@ def counter(rng: Rng) -> Furniture:
     piece.add(rounded_box(0.38, 0.32, 0.004, 0.001).moved(x, 0.0, 0.909), dark)
     tap = [(x, -0.22, 0.90), (x, -0.22, 1.12), (x, -0.15, 1.18), (x, -0.06, 1.12), (x, -0.05, 1.08)]
     piece.add(tube(tap, 0.012), steel)
-    pot = [
-        Section(0.0, 0.10, 0.10),
-        Section(0.12, 0.105, 0.105),
-        Section(0.13, 0.108, 0.108),
-        Section(0.145, 0.03, 0.03),
-    ]
-    piece.add(loft(pot, 24).moved(-0.28 * width, -0.05, 0.90), paints.metal(rng, paints.vivid(rng)))
+    pot = [(0.0, 0.10), (0.12, 0.105), (0.13, 0.108), (0.145, 0.03)]
+    piece.add(lathe(pot, 24).moved(-0.28 * width, -0.05, 0.90), paints.metal(rng, paints.vivid(rng)))
     return piece
 
 
@@ -100,31 +96,22 @@ def floor_lamp(rng: Rng) -> Furniture:
     height = rng.uniform(1.5, 1.7)
     piece.add(cylinder(0.15, 0.02, 0.14, 28), stem)
     piece.add(cylinder(0.012, height - 0.15).moved(z=0.02), stem)
-    piece.add(_shade(0.20, 0.14, 0.26).moved(z=height - 0.22), _glowing(rng))
+    piece.add(lathe([(0.0, 0.20), (0.26, 0.14)], 26).moved(z=height - 0.22), _glowing(rng))
     return piece
 
 
 def table_lamp(rng: Rng) -> Furniture:
     piece = Furniture("table lamp", None)
-    foot = [
-        Section(0.0, 0.06, 0.06),
-        Section(0.02, 0.065, 0.065),
-        Section(0.10, 0.05, 0.05),
-        Section(0.16, 0.015, 0.015),
-    ]
-    piece.add(loft(foot, 20, 0.03), paints.paint(rng, paints.vivid(rng)))
+    foot = [(0.0, 0.06), (0.02, 0.065), (0.10, 0.05), (0.16, 0.015)]
+    piece.add(lathe(foot, 20, 0.03), paints.paint(rng, paints.vivid(rng)))
     piece.add(cylinder(0.008, 0.10).moved(z=0.15), paints.metal(rng))
-    piece.add(_shade(0.095, 0.07, 0.15).moved(z=0.22), _glowing(rng))
+    piece.add(lathe([(0.0, 0.095), (0.15, 0.07)], 26).moved(z=0.22), _glowing(rng))
     return piece
-
-
-def _shade(low: float, high: float, height: float) -> Solid:
-    return loft([Section(0.0, low, low), Section(height, high, high)], 26)
 
 
 def _glowing(rng: Rng) -> Material:
     return Material(
-        Texture.FABRIC, (0.96, 0.88, 0.70), (0.90, 0.78, 0.56), 0.1, seed=int(rng.integers(4096)), emission=LAMP_GLOW
+        Texture.FABRIC, (0.96, 0.88, 0.70), (0.90, 0.78, 0.56), 0.1, seed=paints.new_seed(rng), emission=LAMP_GLOW
     )
 
 
@@ -132,10 +119,10 @@ def plant(rng: Rng) -> Furniture:
     """Broad leaves in a pot."""
     piece = Furniture("plant", None)
     pot = paints.paint(rng, paints.pick(rng, ((0.70, 0.38, 0.26), (0.85, 0.84, 0.80), (0.30, 0.36, 0.42))))
-    green = Material(Texture.LEAF, (0.16, 0.36, 0.14), (0.36, 0.55, 0.22), seed=int(rng.integers(4096)))
+    green = Material(Texture.LEAF, (0.16, 0.36, 0.14), (0.36, 0.55, 0.22), seed=paints.new_seed(rng))
     soil = paints.paint(rng, (0.20, 0.14, 0.10), 0.6, 0.01)
-    piece.add(loft([Section(0.0, 0.12, 0.12), Section(0.28, 0.17, 0.17), Section(0.30, 0.175, 0.175)], 26), pot)
-    piece.add(loft([Section(0.0, 0.155, 0.155), Section(0.004, 0.15, 0.15)], 26).moved(z=0.30), soil)
+    piece.add(lathe([(0.0, 0.12), (0.28, 0.17), (0.30, 0.175)], 26), pot)
+    piece.add(lathe([(0.0, 0.155), (0.004, 0.15)], 26).moved(z=0.30), soil)
     for k in range(13):
         angle, tilt, reach = 2.4 * k + rng.uniform(-0.2, 0.2), rng.uniform(0.15, 0.95), rng.uniform(0.45, 0.75)
         width = rng.uniform(0.05, 0.075)
@@ -158,7 +145,7 @@ def plant(rng: Rng) -> Furniture:
 def carton(rng: Rng) -> Furniture:
     piece = Furniture("cardboard box", None)
     x, y, z = rng.uniform(0.32, 0.5), rng.uniform(0.28, 0.4), rng.uniform(0.25, 0.4)
-    board = Material(Texture.FABRIC, (0.72, 0.56, 0.38), (0.64, 0.48, 0.31), 0.15, seed=int(rng.integers(4096)))
+    board = Material(Texture.FABRIC, (0.72, 0.56, 0.38), (0.64, 0.48, 0.31), 0.15, seed=paints.new_seed(rng))
     tape = paints.paint(rng, (0.82, 0.74, 0.58))
     piece.add(rounded_box(x, y, z, 0.004).moved(z=z / 2), board)
     piece.add(rounded_box(x + 0.002, 0.06, z + 0.003, 0.001).moved(z=z / 2), tape)
@@ -168,20 +155,16 @@ def carton(rng: Rng) -> Furniture:
 def pouf(rng: Rng) -> Furniture:
     piece = Furniture("pouf", None)
     radius, height = rng.uniform(0.22, 0.27), rng.uniform(0.34, 0.4)
-    sides = [
-        Section(0.0, 0.9 * radius, 0.9 * radius),
-        Section(0.06, radius, radius),
-        Section(height - 0.07, radius, radius),
-    ]
-    top = [Section(height - 0.02, 0.92 * radius, 0.92 * radius), Section(height, 0.6 * radius, 0.6 * radius)]
-    piece.add(loft([*sides, *top], 32), paints.patterned_cloth(rng))
+    sides = [(0.0, 0.9 * radius), (0.06, radius), (height - 0.07, radius)]
+    top = [(height - 0.02, 0.92 * radius), (height, 0.6 * radius)]
+    piece.add(lathe([*sides, *top], 32), paints.patterned_cloth(rng))
     return piece
 
 
 def mug(rng: Rng) -> Furniture:
     piece = Furniture("mug", None)
     glaze = paints.glaze(rng, paints.vivid(rng))
-    piece.add(loft([Section(0.0, 0.034, 0.034), Section(0.008, 0.04, 0.04), Section(0.095, 0.042, 0.042)], 22), glaze)
+    piece.add(lathe([(0.0, 0.034), (0.008, 0.04), (0.095, 0.042)], 22), glaze)
     piece.add(tube([(0.038, 0.0, 0.02), (0.066, 0.0, 0.03), (0.066, 0.0, 0.065), (0.04, 0.0, 0.078)], 0.006, 8), glaze)
     return piece
 
@@ -189,10 +172,7 @@ def mug(rng: Rng) -> Furniture:
 def vase(rng: Rng) -> Furniture:
     piece = Furniture("vase", None)
     profile = ((0.0, 0.05), (0.02, 0.06), (0.12, 0.085), (0.20, 0.05), (0.26, 0.032), (0.29, 0.045))
-    piece.add(
-        loft([Section(z, r, r) for z, r in profile], 26, 0.03),
-        paints.glaze(rng, paints.vivid(rng), 0.7, 0.03),
-    )
+    piece.add(lathe(profile, 26, 0.03), paints.glaze(rng, paints.vivid(rng), 0.7, 0.03))
     for k in range(5):
         x, y = 0.06 * np.cos(1.26 * k), 0.06 * np.sin(1.26 * k)
         green = Material(Texture.LEAF, (0.16, 0.36, 0.14), (0.36, 0.55, 0.22), seed=k)
@@ -205,20 +185,14 @@ def vase(rng: Rng) -> Furniture:
 def bowl(rng: Rng) -> Furniture:
     """A bowl with fruit."""
     piece = Furniture("bowl", None)
-    profile = [
-        Section(0.0, 0.06, 0.06),
-        Section(0.015, 0.07, 0.07),
-        Section(0.05, 0.12, 0.12),
-        Section(0.08, 0.14, 0.14),
-    ]
-    piece.add(loft(profile, 30, 0.03), paints.glaze(rng, (0.86, 0.84, 0.80)))
+    profile = [(0.0, 0.06), (0.015, 0.07), (0.05, 0.12), (0.08, 0.14)]
+    piece.add(lathe(profile, 30, 0.03), paints.glaze(rng, (0.86, 0.84, 0.80)))
     fruit = ((0.80, 0.20, 0.15), (0.85, 0.60, 0.15), (0.45, 0.62, 0.20))
     for k in range(5):
         r, angle = 0.036, 1.256 * k
         ball = rounded_box(2 * r, 2 * r, 2 * r, r, 4)
         piece.add(
-            ball.moved(0.07 * np.cos(angle), 0.07 * np.sin(angle), 0.095),
-            paints.paint(rng, fruit[k % 3], 0.8, 0.02),
+            ball.moved(0.07 * np.cos(angle), 0.07 * np.sin(angle), 0.095), paints.paint(rng, fruit[k % 3], 0.8, 0.02)
         )
     return piece
 
@@ -243,7 +217,7 @@ def window(rng: Rng) -> Furniture:
     width, height = rng.uniform(1.2, 1.5), rng.uniform(1.15, 1.3)
     white = paints.paint(rng, (0.92, 0.92, 0.90))
     glass = Material(
-        Texture.SKY, (0.6, 0.8, 1.0), (0.2, 0.4, 0.1), 0.1, (width, height), int(rng.integers(4096)), 1.5, dark=1
+        Texture.SKY, (0.6, 0.8, 1.0), (0.2, 0.4, 0.1), 0.1, (width, height), paints.new_seed(rng), 1.5, dark=1
     )
     piece.add(panel(width, height).moved(y=0.012), glass)
     for x in (-width / 2, 0.0, width / 2):
@@ -283,7 +257,7 @@ def rug(rng: Rng, width: float, depth: float) -> Furniture:
     piece = Furniture("rug", None)
     base = paints.pick(rng, paints.CLOTHS)
     other = paints.shade(paints.pick(rng, paints.CLOTHS), 1.2)
-    woven = Material(Texture.RUG, base, other, rng.uniform(0.22, 0.34), (width, depth), int(rng.integers(4096)))
+    woven = Material(Texture.RUG, base, other, rng.uniform(0.22, 0.34), (width, depth), paints.new_seed(rng))
     piece.add(rounded_box(width, depth, 0.012, 0.004).flat(0, 1).moved(z=0.0065), woven)
     return piece
 
@@ -291,7 +265,7 @@ def rug(rng: Rng, width: float, depth: float) -> Furniture:
 def partition(rng: Rng) -> Furniture:
     """A tiled half-height wall that screens a toilet."""
     piece = Furniture("partition", None)
-    tile = Material(Texture.TILES, (0.72, 0.82, 0.84), (0.55, 0.56, 0.56), 0.15, seed=int(rng.integers(4096)))
+    tile = Material(Texture.TILES, (0.72, 0.82, 0.84), (0.55, 0.56, 0.56), 0.15, seed=paints.new_seed(rng))
     block = rounded_box(0.09, 0.62, 0.95, 0.004).flat(1, 2)
     piece.add(block.moved(z=0.475), tile)
     piece.add(rounded_box(0.12, 0.65, 0.03, 0.006).moved(z=0.965), paints.wood(rng))
@@ -301,14 +275,48 @@ def partition(rng: Rng) -> Furniture:
 def ceiling_lamp(rng: Rng) -> Furniture:
     """A hanging globe; its top is at z = 0, where the ceiling is."""
     piece = Furniture("ceiling lamp", None)
-    globe = [
-        Section(-0.34, 0.06, 0.06),
-        Section(-0.30, 0.15, 0.15),
-        Section(-0.22, 0.19, 0.19),
-        Section(-0.14, 0.13, 0.13),
-        Section(-0.10, 0.03, 0.03),
-    ]
-    piece.add(loft(globe, 28, 0.05), _glowing(rng))
+    globe = [(-0.34, 0.06), (-0.30, 0.15), (-0.22, 0.19), (-0.14, 0.13), (-0.10, 0.03)]
+    piece.add(lathe(globe, 28, 0.05), _glowing(rng))
     piece.add(cylinder(0.006, 0.11).moved(z=-0.11), paints.metal(rng))
     piece.add(cylinder(0.05, 0.02).moved(z=-0.021), paints.metal(rng))
     return piece
+
+
+def throw_cushion(rng: Rng) -> Furniture:
+    piece = Furniture("cushion", None)
+    side = rng.uniform(0.38, 0.5)
+    piece.add(cushion(side, rng.uniform(0.8, 1.0) * side, rng.uniform(0.13, 0.18)), paints.patterned_cloth(rng))
+    return piece.placed(0.0, 0.0, -float(piece.bounds()[0][2]))
+
+
+def blanket(rng: Rng, width: float, depth: float) -> Furniture:
+    """A thrown-down blanket, with creases up to 3 cm high."""
+    piece = Furniture("blanket", None)
+    sheet = rounded_box(width, depth, 0.03, 0.012, 2, WEAVE)
+    piece.add(_crumpled(sheet, rng, 0.03, 0.05).moved(z=0.015), paints.patterned_cloth(rng))
+    return piece
+
+
+def clothes(rng: Rng) -> Furniture:
+    """Two garments in a heap."""
+    piece = Furniture("clothes", None)
+    for k in range(2):
+        sheet = rounded_box(rng.uniform(0.42, 0.55), rng.uniform(0.34, 0.42), 0.035, 0.016, 2, WEAVE)
+        heap = _crumpled(sheet, rng, 0.05, 0.08).turned("z", rng.uniform(-0.7, 0.7))
+        piece.add(heap.moved(rng.uniform(-0.06, 0.06), rng.uniform(-0.06, 0.06), 0.018 + 0.04 * k), paints.cloth(rng))
+    return piece
+
+
+def _crumpled(sheet: Solid, rng: Rng, height: float, fringe: float) -> Solid:
+    """With creases that rise up to `height` m, and a border that wanders by up to `fringe` m."""
+    a, b, c, d = rng.uniform(0, 2 * np.pi, 4)
+
+    def crumple(p: Float64) -> Float64:
+        x, y = p[:, 0].copy(), p[:, 1].copy()
+        wave = np.sin(9 * x + 2.5 * np.sin(6 * y + a) + b) + np.sin(8 * y + 3 * np.sin(5 * x + c) + d)
+        p[:, 2] += height * (0.5 + 0.25 * wave)
+        p[:, 0] += fringe / 2 * (np.sin(5 * y + b) + np.sin(11 * y + c))
+        p[:, 1] += fringe / 2 * (np.sin(6 * x + d) + np.sin(10 * x + a))
+        return p
+
+    return sheet.deformed(crumple)

@@ -6,7 +6,7 @@ import numpy as np
 
 from framework.data import Float64
 from framework.synthetic import paints
-from framework.synthetic.furniture import clutter, fixtures, seating, small_things, soft_things, tabletops
+from framework.synthetic.furniture import clutter, fixtures, seating, small_things, tabletops
 from framework.synthetic.furniture.groups import Group, against_wall, bed_group, beside, on_top, single, size
 from framework.synthetic.furniture.piece import Furniture, Rng
 from framework.synthetic.furniture.solids import SPACING
@@ -35,13 +35,13 @@ def cluttered_bed_group(rng: Rng) -> Group:
     group.add(bag, beside(bag, bed, -side, _touch(rng)), float(bed.bounds()[1][1]) - rng.uniform(0.3, 0.9))
     low, high = bed.bounds()
     things = [
-        soft_things.blanket(rng, rng.uniform(0.75, 0.95) * min(size(bed)[0], 1.2), rng.uniform(0.55, 0.7)),
+        clutter.blanket(rng, rng.uniform(0.75, 0.95) * min(size(bed)[0], 1.2), rng.uniform(0.55, 0.7)),
         fixtures.backpack(rng).tilted(np.pi / 2),
-        soft_things.throw_cushion(rng),
+        clutter.throw_cushion(rng),
         tabletops.book_pile(rng),
-        soft_things.clothes(rng),
+        clutter.clothes(rng),
         tabletops.book(rng),
-        soft_things.throw_cushion(rng),
+        clutter.throw_cushion(rng),
     ]
     _scatter(group, [bed], low[:2] + np.array([BORDER, PILLOWS]), high[:2] - BORDER, rng, things)
     return group
@@ -83,16 +83,16 @@ def _clutter_couch(group: Group, rng: Rng) -> None:
     low_free, high_free = low[:2] + np.array([ARM, BACKREST]), high[:2] - np.array([ARM, BORDER])
     side = 1 if rng.uniform() < 0.5 else -1
     seat = _height([couch], low_free, high_free) - SINK
-    leaning = soft_things.throw_cushion(rng).tilted(np.pi / 2 + 0.35)
+    leaning = clutter.throw_cushion(rng).tilted(np.pi / 2 + 0.35)
     x = (high_free[0] if side > 0 else low_free[0]) - side * size(leaning)[0] / 2
     leaning = group.add(leaning, x, low_free[1] + 0.04, seat, rng.uniform(-0.1, 0.1))
     things = [
-        soft_things.blanket(rng, rng.uniform(0.45, 0.65), rng.uniform(0.34, 0.40)),
+        clutter.blanket(rng, rng.uniform(0.45, 0.65), rng.uniform(0.34, 0.40)),
         fixtures.backpack(rng).tilted(np.pi / 2),
         tabletops.book_pile(rng),
-        soft_things.throw_cushion(rng),
+        clutter.throw_cushion(rng),
         tabletops.book(rng),
-        soft_things.clothes(rng),
+        clutter.clothes(rng),
     ]
     _scatter(group, [couch, leaning], low_free, high_free, rng, things)
 
@@ -150,7 +150,7 @@ def chair_row(rng: Rng, count: int) -> Group:
         group.add(chair, (k - (count - 1) / 2) * pitch, against_wall(chair))
     for placed in group.pieces[: count - 1]:
         if rng.uniform() < LADEN_CHAIRS:
-            things = [soft_things.throw_cushion(rng), tabletops.book_pile(rng), soft_things.clothes(rng)]
+            things = [clutter.throw_cushion(rng), tabletops.book_pile(rng), clutter.clothes(rng)]
             _lay_on_seat(group, placed, things[int(rng.integers(len(things)))])
     return group
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from framework.synthetic import paints
 from framework.synthetic.furniture.piece import Furniture, Rng
-from framework.synthetic.furniture.solids import Section, Solid, cylinder, loft, rounded_box, tube
+from framework.synthetic.furniture.solids import Section, Solid, cylinder, grid_triangles, loft, rounded_box, tube
 from framework.synthetic.textures import Texture
 
 
@@ -91,12 +91,9 @@ def toilet(rng: Rng) -> Furniture:
         raised = loft(lid, 40, 0.05).moved(y=0.20).turned("x", np.pi / 2)
         piece.add(raised.moved(y=-0.16, z=rim + 0.02), seat_color)
     else:
-        piece.add(
-            loft([Section(s.z * 0.7, s.a, s.b, 0, 0.03, s.n, 1.32) for s in lid], 40, 0.05).moved(z=rim + 0.001), white
-        )
-        piece.add(
-            loft([Section(s.z, s.a, s.b, 0, 0.03, s.n, 1.32) for s in lid], 40, 0.05).moved(z=rim + 0.020), seat_color
-        )
+        for flatter, height, material in ((0.7, 0.001, white), (1.0, 0.020, seat_color)):
+            closed = [Section(s.z * flatter, s.a, s.b, 0, 0.03, s.n, 1.32) for s in lid]
+            piece.add(loft(closed, 40, 0.05).moved(z=rim + height), material)
     tank = rng.uniform(0.36, 0.42)
     piece.add(rounded_box(tank, 0.17, 0.36, 0.035, 4, 0.06).moved(y=-0.285, z=rim + 0.16), white)
     piece.add(rounded_box(tank + 0.02, 0.19, 0.035, 0.014, 3).moved(y=-0.285, z=rim + 0.352), white)
@@ -114,10 +111,7 @@ def _ring(a: float, b: float, inner_a: float, inner_b: float, height: float, fro
     y = 0.03 + (blend * b + (1 - blend) * inner_b) * np.sin(around) * stretch
     z = height * (0.5 + 0.5 * np.sign(np.sin(across)) * np.abs(np.sin(across)) ** 0.7)
     vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3)
-    index = np.arange((n + 1) * (m + 1), dtype=np.int32).reshape(n + 1, m + 1)
-    p, q, r, s = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]
-    triangles = np.stack([np.stack([p, q, r], -1), np.stack([p, r, s], -1)]).reshape(-1, 3)
-    flat = Solid(vertices, vertices, triangles, vertices)
+    flat = Solid(vertices, vertices, grid_triangles(n + 1, m + 1, flip=False), vertices)
     return flat.deformed(lambda points: points)
 
 

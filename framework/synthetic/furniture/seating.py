@@ -15,11 +15,7 @@ def bed(rng: Rng) -> Furniture:
     wide = rng.uniform() < 0.7
     width, length = (rng.uniform(1.4, 1.7) if wide else rng.uniform(0.9, 1.05)), rng.uniform(1.95, 2.08)
     frame, sheet = paints.wood(rng), paints.cloth(rng, (0.90, 0.89, 0.86))
-    cover, throw, pillow = (
-        paints.patterned_cloth(rng),
-        paints.cloth(rng),
-        paints.cloth(rng, (0.93, 0.91, 0.88)),
-    )
+    cover, throw, pillow = (paints.patterned_cloth(rng), paints.cloth(rng), paints.cloth(rng, (0.93, 0.91, 0.88)))
     for x, y in corners(width / 2 - 0.06, length / 2 - 0.08):
         piece.add(leg(0.07, 0.16, 0.8).moved(x, y), frame)
     for side in (-1.0, 1.0):
@@ -146,10 +142,7 @@ def couch(rng: Rng) -> Furniture:
     for x in (-1, 1):
         if rng.uniform() < 0.7:
             pillow = cushion(0.42, 0.42, 0.16).turned("x", np.pi / 2 + 0.35).turned("z", -0.45 * x)
-            piece.add(
-                pillow.moved(x * (width / 2 - arm - 0.24), -depth / 2 + 0.50, 0.64),
-                paints.patterned_cloth(rng),
-            )
+            piece.add(pillow.moved(x * (width / 2 - arm - 0.24), -depth / 2 + 0.50, 0.64), paints.patterned_cloth(rng))
     return piece
 
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 
 from framework.synthetic import paints
-from framework.synthetic.furniture import clutter, soft_things, tabletops
+from framework.synthetic.furniture import clutter, tabletops
 from framework.synthetic.furniture.piece import Furniture, Rng
-from framework.synthetic.furniture.solids import Section, cylinder, loft, rounded_box
+from framework.synthetic.furniture.solids import Section, cylinder, lathe, loft, rounded_box
 from framework.synthetic.textures import Material, Texture
 
 MakeThing = Callable[[Rng], Furniture]
@@ -23,7 +23,7 @@ def papers(rng: Rng) -> Furniture:
     for _ in range(int(rng.integers(2, 5))):
         thickness = rng.uniform(0.004, 0.014)
         sheet = rounded_box(0.21, 0.297, thickness, 0.001).flat(0, 1).turned("z", rng.uniform(-0.3, 0.3))
-        ink = Material(Texture.BOOK, (0.92, 0.91, 0.88), (0.30, 0.30, 0.33), 0.1, (0.21, 0.297), _seed(rng))
+        ink = Material(Texture.BOOK, (0.92, 0.91, 0.88), (0.30, 0.30, 0.33), 0.1, (0.21, 0.297), paints.new_seed(rng))
         piece.add(sheet.moved(rng.uniform(-0.02, 0.02), rng.uniform(-0.02, 0.02), z + thickness / 2), ink)
         z += thickness
     return piece
@@ -34,7 +34,7 @@ def bottle(rng: Rng) -> Furniture:
     r, height = rng.uniform(0.033, 0.042), rng.uniform(0.26, 0.32)
     profile = ((0.0, 0.95 * r), (0.01, r), (0.6 * height, r), (0.75 * height, 0.4 * r), (height, 0.38 * r))
     glass = replace(paints.glaze(rng, paints.vivid(rng)), shiny=paints.POLISHED)
-    piece.add(loft([Section(z, a, a) for z, a in profile], 20, 0.04), glass)
+    piece.add(lathe(profile, 20, 0.04), glass)
     return piece
 
 
@@ -53,9 +53,9 @@ def basket(rng: Rng) -> Furniture:
     """A basket of laundry."""
     piece = Furniture("basket", None)
     a, b, height = rng.uniform(0.20, 0.26), rng.uniform(0.16, 0.20), rng.uniform(0.26, 0.36)
-    wicker = Material(Texture.CHECKS, (0.66, 0.50, 0.32), (0.50, 0.36, 0.22), 0.03, seed=_seed(rng))
+    wicker = Material(Texture.CHECKS, (0.66, 0.50, 0.32), (0.50, 0.36, 0.22), 0.03, seed=paints.new_seed(rng))
     piece.add(loft([Section(0.0, 0.85 * a, 0.85 * b, n=3), Section(height, a, b, n=3)], 28), wicker)
-    heap = soft_things.clothes(rng)
+    heap = clutter.clothes(rng)
     low, high = heap.bounds()
     fit = min(1.7 * a / (high - low)[0], 1.7 * b / (high - low)[1])
     for solid, material in heap.parts:
@@ -137,15 +137,11 @@ def _fill(piece: Furniture, rng: Rng, start: float, end: float, z: float, height
         x += w + (rng.uniform(0.03, 0.15) if rng.uniform() < 0.2 else 0.0)
 
 
-def _seed(rng: Rng) -> int:
-    return int(rng.integers(4096))
-
-
 ON_FLOORS: tuple[MakeThing, ...] = (
-    clutter.carton, carton_stack, waste_bin, basket, shoes, clutter.plant, soft_things.throw_cushion, clutter.pouf
+    clutter.carton, carton_stack, waste_bin, basket, shoes, clutter.plant, clutter.throw_cushion, clutter.pouf
 )  # fmt: skip
 ON_TABLES: tuple[MakeThing, ...] = (papers, bottle, clutter.mug, papers, clutter.bowl)
-ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, soft_things.throw_cushion, basket, papers)
+ON_TOPS: tuple[MakeThing, ...] = (clutter.carton, clutter.throw_cushion, basket, papers)
 
 
 def some(rng: Rng, makers: tuple[MakeThing, ...], count: int) -> list[Furniture]:

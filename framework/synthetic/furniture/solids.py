@@ -97,7 +97,7 @@ def rounded_box(
         for sign in (-1.0, 1.0):
             face = np.empty((*s.shape, 3))
             face[..., axis], face[..., j], face[..., k] = sign * half[axis], s, t
-            triangles.append(_grid_triangles(s.shape[0], s.shape[1], flip=sign < 0) + count)
+            triangles.append(grid_triangles(s.shape[0], s.shape[1], flip=sign < 0) + count)
             pieces.append(face.reshape(-1, 3))
             count += s.size
     cube = np.concatenate(pieces)
@@ -160,7 +160,7 @@ def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACI
         rings[i, :, 2] = cut.z
     rings[:, -1] = rings[:, 0]
     side = rings.reshape(-1, 3)
-    triangles = [_grid_triangles(len(cuts), segments + 1, flip=True)]
+    triangles = [grid_triangles(len(cuts), segments + 1, flip=True)]
     vertices, normals, count = [side], [smooth_normals(side, triangles[0])], len(side)
     for ring, up in ((rings[0], -1.0), (rings[-1], 1.0)):
         center = ring[:-1].mean(axis=0)
@@ -184,10 +184,15 @@ def loft(sections: Sequence[Section], segments: int = 24, spacing: float = SPACI
     )
 
 
+def lathe(profile: Sequence[tuple[float, float]], segments: int = 24, spacing: float = SPACING) -> Solid:
+    """The body of revolution about z through these (height, radius) pairs, m."""
+    return loft([Section(z, r, r) for z, r in profile], segments, spacing)
+
+
 def cylinder(radius: float, height: float, top_radius: float | None = None, segments: int = 20) -> Solid:
     """A cylinder or cone frustum standing on z = 0."""
     top = radius if top_radius is None else top_radius
-    return loft([Section(0.0, radius, radius), Section(height, top, top)], segments)
+    return lathe([(0.0, radius), (height, top)], segments)
 
 
 def leg(thickness: float, height: float, taper: float = 0.7) -> Solid:
@@ -207,7 +212,7 @@ def tube(points: Sequence[tuple[float, float, float]], radius: float, segments: 
     angle = np.linspace(0, 2 * np.pi, segments + 1)
     radial = np.cos(angle)[None, :, None] * aside[:, None] + np.sin(angle)[None, :, None] * other[:, None]
     vertices = (path[:, None] + radius * radial).reshape(-1, 3)
-    triangles = _grid_triangles(len(path), segments + 1, flip=True)
+    triangles = grid_triangles(len(path), segments + 1, flip=True)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     texture = np.stack(np.broadcast_arrays(length[:, None], radius * angle[None], 0.0), axis=-1).reshape(-1, 3)
     return Solid(vertices, radial.reshape(-1, 3), triangles, texture)
@@ -240,10 +245,10 @@ def panel(width: float, height: float, spacing: float = 0.1) -> Solid:
     vertices = np.stack([width / 2 - S, zero, T], axis=-1).reshape(-1, 3)
     normals = np.tile([0.0, 1.0, 0.0], (len(vertices), 1))
     texture = np.stack([S, T, zero], axis=-1).reshape(-1, 3)
-    return Solid(vertices, normals, _grid_triangles(len(s), len(t), flip=False), texture)
+    return Solid(vertices, normals, grid_triangles(len(s), len(t), flip=False), texture)
 
 
-def _grid_triangles(rows: int, columns: int, flip: bool) -> Int32:
+def grid_triangles(rows: int, columns: int, flip: bool) -> Int32:
     """Two triangles for each cell of a (rows, columns) grid of vertices."""
     index = np.arange(rows * columns, dtype=np.int32).reshape(rows, columns)
     a, b, c, d = index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from framework.synthetic import paints
 from framework.synthetic.furniture.piece import Furniture, Rng, corners
-from framework.synthetic.furniture.solids import Section, leg, loft, rounded_box
+from framework.synthetic.furniture.solids import lathe, leg, rounded_box
 from framework.synthetic.textures import Material, Texture
 
 
@@ -24,10 +24,10 @@ def dining_table(rng: Rng) -> Furniture:
             (height - 0.08, 0.06),
             (height - 0.035, 0.16),
         )
-        piece.add(loft([Section(z, r, r) for z, r in profile], 28), top_material)
-        rim = [Section(height - 0.034, radius - 0.01, radius - 0.01), Section(height - 0.024, radius, radius)]
-        rim += [Section(height - 0.008, radius, radius), Section(height, radius - 0.008, radius - 0.008)]
-        piece.add(loft(rim, 44), top_material)
+        piece.add(lathe(profile, 28), top_material)
+        rim = [(height - 0.034, radius - 0.01), (height - 0.024, radius)]
+        rim += [(height - 0.008, radius), (height, radius - 0.008)]
+        piece.add(lathe(rim, 44), top_material)
         return piece
     return _table(
         "table", rng.uniform(1.25, 1.6), rng.uniform(0.78, 0.90), rng.uniform(0.73, 0.76), top_material, 0.065
@@ -46,12 +46,7 @@ def desk(rng: Rng) -> Furniture:
 def coffee_table(rng: Rng) -> Furniture:
     """Low; COCO's annotators call it a dining table too."""
     return _table(
-        "coffee table",
-        rng.uniform(0.85, 1.1),
-        rng.uniform(0.48, 0.58),
-        rng.uniform(0.38, 0.44),
-        paints.wood(rng),
-        0.05,
+        "coffee table", rng.uniform(0.85, 1.1), rng.uniform(0.48, 0.58), rng.uniform(0.38, 0.44), paints.wood(rng), 0.05
     )
 
 
@@ -102,8 +97,8 @@ def book_pile(rng: Rng) -> Furniture:
 def _add_book(piece: Furniture, rng: Rng, width: float, height: float, thickness: float, at: Offset) -> None:
     color = paints.vivid(rng)
     ink = (0.95, 0.92, 0.82) if sum(color) < 1.6 else (0.12, 0.10, 0.10)
-    cover = Material(Texture.BOOK, color, ink, 0.1, (width, height), int(rng.integers(4096)))
-    pages = Material(Texture.PAGES, (0.93, 0.90, 0.82), (0.78, 0.74, 0.66), seed=int(rng.integers(4096)))
+    cover = Material(Texture.BOOK, color, ink, 0.1, (width, height), paints.new_seed(rng))
+    pages = Material(Texture.PAGES, (0.93, 0.90, 0.82), (0.78, 0.74, 0.66), seed=paints.new_seed(rng))
     board = 0.003
     parts = (
         (rounded_box(width, height, board, 0.001).flat(0, 1).moved(z=thickness - board / 2), cover),
