@@ -13,7 +13,8 @@
         print(instance.id, mapper.name(instance), instance.obb.center, "m", instance.confidence)
     mapper.save("map.npz")
 
-`Mapper("map=outputs/demo")` goes on with the map of a run. What else a map does, also one that a run left behind:
+`Mapper("resume_from=outputs/demo")` goes on with the map of a run. What else a map does, also one that a run left
+behind:
 
     scene = load_map("outputs/demo/map.npz")
     chairs = scene.instances("chair")

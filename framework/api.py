@@ -91,7 +91,7 @@ def pipeline_of(config: DictConfig) -> Pipeline:
     tracker = build(PoseTracker, config.get("tracker"))
     viewer = build(Viewer, config.get("viewer"))
     detector = with_cache(build(Detector, config.get("detector")), config)  # last, as loading a network takes its time
-    return Pipeline(detector, tracker, refiner, fuser, config.ahead, viewer)
+    return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer)
 
 
 def go_on(pipeline: Pipeline, run: Path) -> None:
@@ -100,7 +100,7 @@ def go_on(pipeline: Pipeline, run: Path) -> None:
     The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
     that can be read, ConfigError where the stages cannot go on with it.
     """
-    scene = scene_of("map", run)
+    scene = scene_of("resume_from", run)
     pipeline.fuser.go_on(scene)
     pipeline.tracker.recall(read_places(run / PLACES), scene)
 
@@ -110,19 +110,19 @@ def begin_in(pipeline: Pipeline, run: Path) -> None:
 
     Raises likewise.
     """
-    pipeline.tracker.recall(read_places(run / PLACES), scene_of("world", run))
+    pipeline.tracker.recall(read_places(run / PLACES), scene_of("localize_in", run))
 
 
 def begin(config: DictConfig) -> Pipeline:
     """The stages that a config names, with the map or the world that it asks for and their kernels compiled."""
     pipeline = pipeline_of(config)
-    map_, world = config.get("map"), config.get("world")
+    map_, world = config.get("resume_from"), config.get("localize_in")
     if map_ is not None and world is not None:
-        raise ConfigError("map and world exclude each other: one goes on with a map, the other begins one in its world")
+        raise ConfigError("resume_from and localize_in: expected at most one of them, got both")
     if map_ is not None:
-        go_on(pipeline, checked_path("map", map_))
+        go_on(pipeline, checked_path("resume_from", map_))
     if world is not None:
-        begin_in(pipeline, checked_path("world", world))
+        begin_in(pipeline, checked_path("localize_in", world))
     compile_for_run()
     gc.collect()  # of itself, it would stop one of the first hundreds of frames for longer than they take
     return pipeline
@@ -147,9 +147,10 @@ class Mapper(Map):
     """Maps frames as they come: `Mapper("fuser.voxel_size=0.02", detector="mask_rcnn")`.
 
     The arguments are those of a run on the command line, as words or by name, with its defaults for what is recorded;
-    `dataset` is left out, since the frames are yours, and `ahead` and `resume` mean nothing here. `map=DIR` goes on
-    with the map of the run in DIR, `viewer="rerun"` shows it, in `recording.rrd` in the working directory or as
-    `viewer.mode` says, until the mapper is gone. Raises ConfigError for a name or a value that there is not.
+    `dataset` is left out, since the frames are yours, and `prefetch` and `skip_completed` mean nothing here.
+    `resume_from=DIR` goes on with the map of the run in DIR, `viewer="rerun"` shows it, in `recording.rrd` in the
+    working directory or as `viewer.mode` says, until the mapper is gone. Raises ConfigError for a name or a value that
+    there is not.
 
     Several threads may share one: they wait for each other. Whoever reads `scene` itself while another thread may be in
     `add` holds `lock` meanwhile, `with mapper.lock: mesh = mapper.scene.mesh()`: half a frame may be in it.

@@ -58,7 +58,8 @@ class RGBDVideo(ABC):
 class RGBDSequence(RGBDVideo):
     """A recorded or rendered RGB-D video, read frame by frame.
 
-    Every one has the parameters `start`, `stop`, `stride` and `share`, which choose from the frames that there are.
+    Every one has the parameters `start`, `stop`, `stride` and `frame_fraction`, which choose from the frames that
+    there are.
     """
 
     camera: Camera

@@ -46,12 +46,12 @@ class Pipeline:
     tracker: PoseTracker
     refiner: ClusterRefiner
     fuser: MapFuser
-    ahead: int = 2  # frames that other threads read and detect meanwhile, 1 of a live video; 0 = no such thread
+    prefetch: int = 2  # frames that other threads read and detect meanwhile, 1 of a live video; 0 = no such thread
     viewer: Viewer = field(default_factory=Viewer)
 
     def __post_init__(self) -> None:
-        if self.ahead < 0:
-            raise ConfigError(f"Pipeline: ahead must be 0 or more frames, found {self.ahead}")
+        if self.prefetch < 0:
+            raise ConfigError(f"Pipeline.prefetch: must be 0 or more frames, found {self.prefetch}")
         self.viewer = GuardedViewer(self.viewer)
 
     def run(self, video: RGBDVideo) -> RunResult:
@@ -135,7 +135,7 @@ class Pipeline:
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""
-        sharing = CoreSharing(with_a_thread_ahead=self.ahead > 0)
+        sharing = CoreSharing(with_a_thread_ahead=self.prefetch > 0)
         with closing(self.detect_ahead(video, journal, interruption, sharing)) as detected:
             for frame, detections in detected:
                 with sharing.mapping():
@@ -161,13 +161,13 @@ class Pipeline:
     ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
-        Frame k + 1 is read and detected while frame k is tracked and fused, and those after it, too, up to `ahead`
+        Frame k + 1 is read and detected while frame k is tracked and fused, and those after it, too, up to `prefetch`
         frames at once by a detector that can; the results of a recording do not depend on it. What comes of a live
         video meanwhile is dropped, but for the newest frame.
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
-        ahead = self.ahead if stream.most_ahead is None else min(self.ahead, stream.most_ahead)
-        workers = max(1, min(ahead, sharing.cores)) if self.detector.concurrent else 1
+        prefetch = self.prefetch if stream.most_ahead is None else min(self.prefetch, stream.most_ahead)
+        workers = max(1, min(prefetch, sharing.cores)) if self.detector.concurrent else 1
         turns = Turns()
 
         def work(number: int) -> tuple[Frame, Detections, list[StageTime]] | FrameError | None:
@@ -175,7 +175,7 @@ class Pipeline:
                 return self.read_and_detect(stream, turns.turn(number))
 
         # the stream ends first: a worker may be waiting for its next frame
-        with closing(map_ahead(work, count(), ahead, workers)) as outcomes, stream:
+        with closing(map_ahead(work, count(), prefetch, workers)) as outcomes, stream:
             for outcome in outcomes:
                 interruption.check()  # waiting for a frame may have taken long
                 journal.frames_dropped = stream.dropped

@@ -24,6 +24,7 @@ from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.config.composition import config_directory
+from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError, InstanceMapError
 from framework.files.search_paths import CONF, PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
@@ -245,7 +246,9 @@ def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig
         if key == "_target_" or OmegaConf.is_missing(node, key):
             continue
         if key not in names:
-            raise ConfigError(f"{where}: there is no parameter {str(key)!r}{_did_you_mean(str(key), names, 'it has')}")
+            hint = rename_hint(f"{where.split()[0]}.{key!s}")
+            suggestion = f"; {hint}" if hint else _did_you_mean(str(key), names, "it has")
+            raise ConfigError(f"{where}: there is no parameter {str(key)!r}{suggestion}")
         if key in stages:
             given = _plugin if holds_one(plugin_class, str(key)) else _plugins
             plugins[str(key)] = given(f"{where}: {key}", stages[str(key)], node[key])

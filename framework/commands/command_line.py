@@ -141,8 +141,8 @@ class Jobs:
 
 
 def check_switches(config: DictConfig) -> None:
-    """Raises ConfigError for a switch that is neither on nor off: words, such as `resume=flase`, count as true."""
-    for name in ("resume", "debug"):
+    """Raise ConfigError for a switch that is neither true nor false, such as `skip_completed=flase`."""
+    for name in ("skip_completed", "debug"):
         if not isinstance(config.get(name, False), bool):
             raise ConfigError(f"{name} must be true or false, found {config[name]!r}")
 

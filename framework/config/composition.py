@@ -19,6 +19,7 @@ from hydra.plugins.config_source import ConfigResult
 from omegaconf import DictConfig, ListConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
+from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError, DataError, printable
 from framework.files.atomic_write import read_text
 from framework.files.search_paths import CONF
@@ -134,6 +135,8 @@ def _known_keys(error: OmegaConfBaseException) -> str:
     keys = [str(key) for key in error.parent_node] if isinstance(error.parent_node, DictConfig) else []
     close = get_close_matches(str(error.key), keys, n=1)
     path = str(error.full_key or error.key)
+    if hint := rename_hint(path):
+        return hint
     if close:
         return f"There is no {path}; did you mean {path[: -len(str(error.key))]}{close[0]}?"
     return f"There is no {path}; beside it there are: {', '.join(keys) or 'none'}"

@@ -48,10 +48,10 @@ log = logging.getLogger(__name__)
 class RgbdFolder(Recording):
     """An RGB-D video in a folder of images, with poses and instance ground truth where there are files for them."""
 
-    truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
+    ground_truth_spacing: float = 0.02  # m, spacing of the ground-truth surface points
 
     def __post_init__(self) -> None:
-        check_truth_voxel(self.truth_voxel)
+        check_truth_voxel(self.ground_truth_spacing)
         super().__post_init__()
 
     def open(self) -> Contents:
@@ -88,7 +88,7 @@ class RgbdFolder(Recording):
         """
         if not self._instances or not self._has_poses:
             return None
-        return fuse_scene_truth(self._labeled_depth(), self._class_names, self.truth_voxel)
+        return fuse_scene_truth(self._labeled_depth(), self._class_names, self.ground_truth_spacing)
 
     def _labeled_depth(self) -> Iterator[LabeledDepth]:
         for index in self.chosen:

@@ -78,25 +78,27 @@ class TumRgbd(Recording):
     """
 
     intrinsics: Intrinsics = Intrinsics.AUTO
-    max_difference: float = 0.02  # s, in (0, 1], between colour and its depth, and colour and the nearest pose
+    max_time_difference: float = 0.02  # s, in (0, 1], between colour and its depth, and colour and the nearest pose
     undistort: bool = True  # False: leave the images as they are, as for a camera without distortion
 
     def __post_init__(self) -> None:
-        require(0 < self.max_difference <= 1, "dataset.max_difference", self.max_difference, "in (0, 1] s")
+        require(
+            0 < self.max_time_difference <= 1, "dataset.max_time_difference", self.max_time_difference, "in (0, 1] s"
+        )
         super().__post_init__()
 
     def open(self) -> Contents:
         (camera, depth_scale, distortion), source = self._stored_camera()
         color, depth = _read_list(self.folder / "rgb.txt"), _read_list(self.folder / "depth.txt")
-        pairs = associate(_times(color), _times(depth), self.max_difference)
+        pairs = associate(_times(color), _times(depth), self.max_time_difference)
         if not pairs:
             raise DataError(
-                f"{self.folder}: no image of rgb.txt has one of depth.txt within dataset.max_difference "
-                f"({self.max_difference:g} s)"
+                f"{self.folder}: no image of rgb.txt has one of depth.txt within dataset.max_time_difference "
+                f"({self.max_time_difference:g} s)"
             )
         if len(pairs) < len(color):
             log.info("%s: %d of %d colour images have no depth image", self.name, len(color) - len(pairs), len(color))
-        truth = Trajectory.read(self.folder / "groundtruth.txt", self.max_difference)
+        truth = Trajectory.read(self.folder / "groundtruth.txt", self.max_time_difference)
         frames = [_recorded(color[i], depth[j], truth) for i, j in pairs]
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
@@ -138,7 +140,7 @@ class Trajectory:
 
     lines: Sequence[TumLine]  # in order of time; some may be no pose
     timestamps: Float64  # (L,) s, of the lines
-    max_difference: float  # s
+    max_time_difference: float  # s
 
     @classmethod
     def read(cls, path: Path, max_difference: float) -> Trajectory:
@@ -156,7 +158,7 @@ class Trajectory:
         """T_world_camera (4, 4), None where it is not known. Raises DataError when a line that it needs is no pose."""
         after = int(np.searchsorted(self.timestamps, timestamp, side="right"))
         around = range(max(after - 1, 0), min(after + 1, len(self.lines)))
-        if not any(abs(self.timestamps[k] - timestamp) <= self.max_difference for k in around):
+        if not any(abs(self.timestamps[k] - timestamp) <= self.max_time_difference for k in around):
             return None
         a, b = self.lines[around[0]], self.lines[around[-1]]
         if a is b or a.timestamp == timestamp:

@@ -32,7 +32,7 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
     if frame.truth is None:
         raise DataError(
             f"frame {frame.index} has no instance ground truth, which this detector needs:"
-            " set dataset.frame_truth=true where the dataset has a labelled mesh (scenenn, scannet),"
+            " set dataset.frame_ground_truth=true where the dataset has a labelled mesh (scenenn, scannet),"
             " or choose another dataset or detector"
         )
     index = {name: k for k, name in enumerate(classes)}

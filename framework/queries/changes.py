@@ -1,9 +1,9 @@
 """What has changed between two visits of a place: objects that appeared, vanished or moved, with probabilities.
 
 An object of one visit is looked for in the map of the other by what its camera saw. Where that looks through the
-object's surface, it is gone; where it sees a surface there, and the same thing in it, it is there still; where it never
-looked, or something stood before it, nobody knows. Both maps lie in one world: the second was made with `world=` of the
-first, or both with given poses.
+object's surface, it is gone; where it sees a surface there, and the same thing in it, it is there still; where it
+never looked, or something stood before it, nobody knows. Both maps lie in one world: the second was made with
+`localize_in=` of the first, or both with given poses.
 """
 
 from __future__ import annotations

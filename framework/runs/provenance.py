@@ -17,13 +17,13 @@ from framework.runtime.process_settings import available_cores
 PACKAGES = ("torch", "numpy", "numba", "open3d")
 UNKNOWN = "unknown"
 WITHOUT_EFFECT = (
-    *("hydra", "debug", "resume", "ahead", "detection_cache", "detection_cache_dir", "viewer"),
+    *("hydra", "debug", "skip_completed", "prefetch", "detection_cache", "detection_cache_dir", "viewer"),
     "threads",  # but for networks' last digits: a sweep goes on with another number of jobs at once
     *("row", "rows", "sequences", "table", "figure"),  # of an experiment: what its runs are compared for
 )
 """Keys of the config that change no result."""
 
-OF_SPEED = ("threads", "ahead", "detection_cache")  # of these, what times depend on ...
+OF_SPEED = ("threads", "prefetch", "detection_cache")  # of these, what times depend on ...
 OF_MACHINE = ("environment.processor", "environment.cpus")  # ... like on these, of metrics.json
 
 

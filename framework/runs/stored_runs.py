@@ -158,12 +158,14 @@ def is_recorded(directory: Path, config: DictConfig) -> bool:
         log.info("run again: the times in %s are of other settings or another machine: %s", directory, said)
         return False
     if lost := [name for name in MAPPED if not (directory / name).exists()]:
-        log.warning("%s has lost %s; resume=false would make it again", directory, ", ".join(lost))
+        log.warning("%s has lost %s; skip_completed=false would make it again", directory, ", ".join(lost))
     now = commit_of(code_version())
     if record.commit == now and not now.endswith(WITH_CHANGES):  # two trees with changes may differ
         log.info("kept: the complete record in %s", directory)
     else:
-        message = "kept: the complete record in %s, of commit %s; this is %s, and resume=false would run it again"
+        message = (
+            "kept: the complete record in %s, of commit %s; this is %s, and skip_completed=false would run it again"
+        )
         log.warning(message, directory, record.commit, now)
     return True
 

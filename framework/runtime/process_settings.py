@@ -16,7 +16,7 @@ from omegaconf import DictConfig
 
 from framework.errors import ConfigError
 
-MOST = {"seed": 2**63 - 1, "threads": 4096, "ahead": 1000}  # torch takes no larger seed; no machine has more cores
+MOST = {"seed": 2**63 - 1, "threads": 4096, "prefetch": 1000}  # torch takes no larger seed; no machine has more cores
 DEVICES = ("auto", "cpu", "cuda")
 
 
@@ -32,7 +32,7 @@ class Settings:
     seed: int  # 0 or more
     device: str  # one of DEVICES; the stages that run networks read it
     threads: int  # 0 = all cores
-    ahead: int = 0  # frames that wait to be mapped; each with its masks takes some 10 MB
+    prefetch: int = 0  # frames that wait to be mapped; each with its masks takes some 10 MB
 
     def __post_init__(self) -> None:
         for name, most in MOST.items():
@@ -44,8 +44,8 @@ class Settings:
 
     @classmethod
     def of(cls, config: DictConfig) -> Settings:
-        ahead = config.get("ahead", 0)  # a training has none
-        return cls(seed=config.seed, device=config.device, threads=config.threads, ahead=ahead)
+        prefetch = config.get("prefetch", 0)  # a training has none
+        return cls(seed=config.seed, device=config.device, threads=config.threads, prefetch=prefetch)
 
     def apply(self) -> None:
         """Limits the threads of the libraries, and seeds the random states that they keep for themselves.

@@ -43,12 +43,12 @@ class Synthetic(RGBDSequence):
     start: int = 0  # first frame
     stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
     stride: int = 1  # take every stride-th frame
-    share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
-    truth_voxel: float = 0.02  # m, spacing of the ground-truth surface points
+    frame_fraction: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
+    ground_truth_spacing: float = 0.02  # m, spacing of the ground-truth surface points
     domain = RENDERED_ROOMS
 
     def __post_init__(self) -> None:
-        check_selection(self.start, self.stop, self.stride, self.share)
+        check_selection(self.start, self.stop, self.stride, self.frame_fraction)
         bounds = {"frames": (1, MOST_FRAMES), "width": (16, MOST_SIDE), "height": (16, MOST_SIDE)}
         for name, (lowest, most) in bounds.items():
             if not lowest <= getattr(self, name) <= most:
@@ -61,8 +61,8 @@ class Synthetic(RGBDSequence):
             raise ConfigError(f"dataset.noise must be 0 (exact) or positive, found {self.noise}")
         if not self.max_depth > 0:
             raise ConfigError(f"dataset.max_depth must be positive metres, found {self.max_depth}")
-        check_truth_voxel(self.truth_voxel)
-        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.share, self.seed)
+        check_truth_voxel(self.ground_truth_spacing)
+        self._chosen = choose_frames(self.frames, self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self.name = self.scene
         focal = FOCAL_LENGTH * self.width
         self.camera = Camera(self.width, self.height, focal, focal, (self.width - 1) / 2, (self.height - 1) / 2)
@@ -109,7 +109,7 @@ class Synthetic(RGBDSequence):
         """The labelled surface within the sensor's range in the chosen frames, from their exact depth."""
         every = max(1, -(-len(self._chosen) // TRUTH_VIEWS))
         chosen = sorted({*self._chosen[::every], self._chosen[-1]})
-        return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.truth_voxel)
+        return fuse_scene_truth((self._exact(index) for index in chosen), self.class_names, self.ground_truth_spacing)
 
     def _exact(self, index: int) -> LabeledDepth:
         T_world_camera = self.path.pose(index)

@@ -38,35 +38,35 @@ PLAIN = (
 class TableChoice:
     """What a table shows: the block `table` of an experiment.
 
-    A line is a row and a column a figure, averaged over the runs that differ in `over` alone. With `across`, a column
-    is a value of that key, such as a sequence, and a line ends with their mean; with `by`, lines stand in groups, one
-    for each of its values.
+    A line is a row and a column is a metric, averaged over the runs that differ in `average_over` alone. With
+    `columns_by`, a column is a value of that key, such as a sequence, and a line ends with their mean. With `group_by`,
+    each of its values has a group of lines.
     """
 
     # keys of the config, averaged over and paired by; runs that agree in the last of them are no independent evidence
-    over: list[str] = field(default_factory=lambda: ["seed"])
-    across: str | None = None  # key of the config with a column for each value; None = columns are figures
-    by: str | None = None  # key of the config with a group of lines for each value; None = a line is all of a row
-    base: str | None = None  # name of the row that the others are compared with; None = the first
-    columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `across`, just one
+    average_over: list[str] = field(default_factory=lambda: ["seed"])
+    columns_by: str | None = None  # key of the config with a column for each value; None = columns are figures
+    group_by: str | None = None  # key of the config with a group of lines for each value; None = a line is all of a row
+    baseline: str | None = None  # name of the row that the others are compared with; None = the first
+    columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `columns_by`, just one
     names: dict[str, str] = field(default_factory=dict)  # what rows are called in the table; others go by their name
     # section of published.yaml, whose numbers stand below where all runs are of the real SceneNN; None = none
     published: str | None = None
 
     def __post_init__(self) -> None:
-        for name in ("over", "columns"):
+        for name in ("average_over", "columns"):
             if not getattr(self, name):
                 raise ConfigError(f"table.{name} must name at least one key")
-        if self.across and self.by:
+        if self.columns_by and self.group_by:
             raise ConfigError(
-                f"table.across={self.across} and table.by={self.by} are two layouts: one of them must be null"
+                f"table.columns_by={self.columns_by}, table.group_by={self.group_by}: expected one of them to be null"
             )
-        if self.split_key in self.over:
-            raise ConfigError(f"table.over has {self.split_key}, whose values table.{self.layout} shows one by one")
-        if self.across and len(self.columns) > 1:
+        if self.split_key in self.average_over:
+            raise ConfigError(f"table.average_over: expected other keys than table.{self.layout}, got {self.split_key}")
+        if self.columns_by and len(self.columns) > 1:
             raise ConfigError(
-                f"table.columns must name one figure, the one that stands across {self.across}, found "
-                f"{len(self.columns)}; table.by={self.across} shows several"
+                f"table.columns must name one figure, the one that stands across {self.columns_by}, found "
+                f"{len(self.columns)}; table.group_by={self.columns_by} shows several"
             )
         if self.published and read_published(self.published).layout != self.layout:
             raise ConfigError(
@@ -76,13 +76,13 @@ class TableChoice:
 
     @property
     def layout(self) -> str:
-        """`across`, `by` or `rows`."""
-        return "across" if self.across else "by" if self.by else "rows"
+        """`columns_by`, `group_by` or `rows`."""
+        return "columns_by" if self.columns_by else "group_by" if self.group_by else "rows"
 
     @property
     def split_key(self) -> str | None:
         """The key whose values are shown one by one, as columns or as groups of lines."""
-        return self.across or self.by
+        return self.columns_by or self.group_by
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
@@ -120,7 +120,7 @@ class ComparisonTable:
         if not records:
             why = "; ".join(f"{one.directory.name}: {one.reason}" for one in incomplete[:3])
             raise DataError(f"there is no complete run below {directory}{f' ({why})' if why else ''}")
-        keys = [*choice.over, choice.split_key] if choice.split_key else choice.over
+        keys = [*choice.average_over, choice.split_key] if choice.split_key else choice.average_over
         rows = rows_of(records, keys, overrides)
         asked = asked_runs(sweep, keys)
         superseded = len(records) - sum(len(row.records) for row in rows)
@@ -139,7 +139,7 @@ class ComparisonTable:
 
     @property
     def base_name(self) -> str:
-        return self.choice.base or next(iter(self.overrides), self.rows[0].name)
+        return self.choice.baseline or next(iter(self.overrides), self.rows[0].name)
 
     @property
     def base_called(self) -> str:
@@ -195,9 +195,9 @@ class ComparisonTable:
     @property
     def _keys(self) -> list[Key]:
         """What the table shows, as published numbers are listed."""
-        if self.choice.across:
+        if self.choice.columns_by:
             return [(sequence,) for sequence in self.sequences]
-        if self.choice.by:
+        if self.choice.group_by:
             return [(sequence, key) for sequence in self.sequences for key in self.choice.columns]
         return [(key,) for key in self.choice.columns]
 

@@ -47,8 +47,8 @@ def latex(comparison: ComparisonTable) -> str:
 
 LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[ComparisonTable], TextTable]]] = {
     "rows": (row_grid, difference_grid),
-    "across": (across_grid, difference_across_grid),
-    "by": (by_grid, difference_grid),
+    "columns_by": (across_grid, difference_across_grid),
+    "group_by": (by_grid, difference_grid),
 }
 """By TableChoice.layout: the table of the figures, and that of the differences to the base."""
 
@@ -88,7 +88,7 @@ def comma_separated_runs(comparison: ComparisonTable) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     origins = ["poses", "tracker", "annotation", "code", "config"]
-    writer.writerow(["system", "variant", *comparison.choice.over, split_key, "figure", "value", *origins])
+    writer.writerow(["system", "variant", *comparison.choice.average_over, split_key, "figure", "value", *origins])
     for row in comparison.rows:
         origins_of = {
             run: [

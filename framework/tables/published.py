@@ -45,7 +45,7 @@ class PublishedRow:
 class Published:
     """A section of the file."""
 
-    layout: str  # of the tables that the numbers go below: rows, across or by
+    layout: str  # of the tables that the numbers go below: rows, columns_by or group_by
     sequences: tuple[str, ...]  # of the published table, in its order
     rows: tuple[PublishedRow, ...]
 

@@ -42,8 +42,8 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:
     """How figures come about, and how rows are compared."""
-    choice, over = comparison.choice, ", ".join(comparison.choice.over)
-    if others := following(comparison.records, choice.over):
+    choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
+    if others := following(comparison.records, choice.average_over):
         yield f"Averaged over with {over}, whose value they have in every run: {', '.join(others)}."
     if choice.split_key:
         yield (
@@ -54,9 +54,9 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
     else:
         yield f"Mean ± sample standard deviation over {over}; runs: how many are complete."
     if not comparison.has_base:
-        yield f"No differences: {comparison.base_name} is no row with a complete run; table.base=ROW names another."
+        yield f"No differences: {comparison.base_name} is no row with a complete run; table.baseline=ROW names another."
     elif len(comparison.rows) > 1:
-        keys = [*choice.over, *filter(None, [choice.split_key])]
+        keys = [*choice.average_over, *filter(None, [choice.split_key])]
         error = "mean ± standard error"
         if len(keys) > 1:
             kinds = "the sequences" if choice.split_key else f"the values of {keys[-1]}"
@@ -81,7 +81,7 @@ def _with_needs(columns: Sequence[str]) -> str:
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
     """In which sequences the base is better than each of the others, and in which it loses."""
-    if not comparison.choice.across:
+    if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
     for row, base in comparison.compared:
@@ -126,7 +126,7 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
     run_of = {run[-1] for row in comparison.rows for run in row.records}
     if absent := [sequence for sequence in comparison.sequences if sequence not in run_of]:
         yield f"Without a complete run of any row: {comparison.choice.split_key}={','.join(absent)}."
-    keys = [*comparison.choice.over, *filter(None, [comparison.choice.split_key])]
+    keys = [*comparison.choice.average_over, *filter(None, [comparison.choice.split_key])]
     for row, missing in comparison.missing():
         yield f"Missing in {row.name}: {_as_overrides(keys, missing)}."
     if comparison.superseded:

@@ -49,7 +49,7 @@ class MaskRCNNDetector(Detector):
     short_side: int = 0  # px >= 32, to which images are resized; 0 = as in the network's training
     long_side: int = 0  # px >= short_side, bound on the other side; 0 = in the proportion of the network's training
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
-    half: bool = True  # half precision on CUDA; the CPU always computes in single
+    half_precision: bool = True  # half precision on CUDA; the CPU always computes in single
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
 
     reads = ("color",)
@@ -83,7 +83,7 @@ class MaskRCNNDetector(Detector):
         )
         fuse_batch_norms(network)  # before halving: variances may be too large for float16
         network = network.requires_grad_(False).to(self._device, memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self._network = network.half() if self.half and self._device.type == "cuda" else network
+        self._network = network.half() if self.half_precision and self._device.type == "cuda" else network
 
     @torch.inference_mode()
     def detect(self, frame: Frame) -> Detections:
@@ -140,7 +140,9 @@ class MaskRCNNDetector(Detector):
         array: Float32 = tensor.float().cpu().numpy()
         if not np.isfinite(array).all():
             advice = (
-                "set detector.half=false" if self._network.rpn.head.cls_logits.weight.dtype == torch.float16 else ""
+                "set detector.half_precision=false"
+                if self._network.rpn.head.cls_logits.weight.dtype == torch.float16
+                else ""
             )
             raise DataError(f"{self.weights.name} computed numbers that are not finite{advice and '; '}{advice}")
         return array

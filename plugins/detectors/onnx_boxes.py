@@ -43,9 +43,11 @@ class OnnxBoxes(Detector):
     placement: Placement = Placement.top_left  # of the image in the input
     padding: int = 114  # in [0, 255], grey around the image
     bgr: bool = True  # channel order: True = BGR, False = RGB
-    black: float = 0.0  # what the network gets for a channel of 0
-    white: float = 255.0  # what it gets for 255: 1 where it takes 0..1
-    significance: float = 0.4  # share in [0, 1] of the box's readings, the centre's count most, for a foreground
+    black_level: float = 0.0  # what the network gets for a channel of 0
+    white_level: float = 255.0  # what it gets for 255: 1 where it takes 0..1
+    min_foreground_fraction: float = (
+        0.4  # share in [0, 1] of the box's readings, the centre's count most, for a foreground
+    )
     max_slant: float = 85.0  # degrees in (0, 90) to the image plane: a steeper surface is a gap between two objects
     min_readings: float = 0.1  # share in [0, 1] of the box's pixels with depth; with fewer it is dropped
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where onnxruntime has it
@@ -56,7 +58,12 @@ class OnnxBoxes(Detector):
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
-        require(0 <= self.significance <= 1, "detector.significance", self.significance, "in [0, 1]")
+        require(
+            0 <= self.min_foreground_fraction <= 1,
+            "detector.min_foreground_fraction",
+            self.min_foreground_fraction,
+            "in [0, 1]",
+        )
         require(0 < self.max_slant < 90, "detector.max_slant", self.max_slant, "in (0, 90) degrees")
         require(0 <= self.min_readings <= 1, "detector.min_readings", self.min_readings, "in [0, 1]")
         self._labels = read_labels(self.labels)
@@ -71,8 +78,8 @@ class OnnxBoxes(Detector):
             placement=self.placement,
             padding=self.padding,
             bgr=self.bgr,
-            black=self.black,
-            white=self.white,
+            black=self.black_level,
+            white=self.white_level,
         )
         decode(self.layout, self._network.try_out(), self._network.shape, len(self._labels))
 
@@ -86,7 +93,7 @@ class OnnxBoxes(Detector):
             letterbox.to_image(candidates.boxes[best]),
             frame.depth,
             frame.camera,
-            self.significance,
+            self.min_foreground_fraction,
             self.max_slant,
             self.min_readings,
         )

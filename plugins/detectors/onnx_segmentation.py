@@ -32,10 +32,10 @@ class OnnxSegmentation(Detector):
     onnxruntime (the extra `onnx`).
 
     The class distribution of a detection is its class scores divided by their sum; its score is the largest of them
-    before the division. With suppression inside, the scores of the other classes are lost: what the score lacks to 1 is
-    shared evenly among them, as `spread` says, and a map learns less from such a network about objects that could be
-    this or that. The other defaults are those of exports by Ultralytics; neither their code nor their weights (AGPL)
-    are part of this project.
+    before the division. With suppression inside, the scores of the other classes are lost: what the score lacks to 1
+    is shared evenly among them, as `class_spread` says, and a map learns less from such a network about objects that
+    could be this or that. The other defaults are those of exports by Ultralytics; neither their code nor their weights
+    (AGPL) are part of this project.
     """
 
     weights: Path  # ONNX file; a relative path is tried from the working, then the project folder
@@ -43,7 +43,7 @@ class OnnxSegmentation(Detector):
     labels: str = "coco"  # the network's classes: a label space, or a text file with one name a line
     objectness: bool = False  # an objectness stands before the class scores, as in YOLOv5
     boxes: BoxKind = BoxKind.AUTO  # what the four numbers of a box are
-    spread: float = 1.0  # in [0, 1]: with suppression inside, share of 1 - score that goes to the other classes
+    class_spread: float = 1.0  # in [0, 1]: with suppression inside, share of 1 - score that goes to the other classes
     score_threshold: float = 0.1  # in (0, 1): low, for weak detections may still update instances that exist
     nms: float = 0.45  # IoU in (0, 1] above which a box falls to a better one of its class
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
@@ -53,13 +53,13 @@ class OnnxSegmentation(Detector):
     placement: Placement = Placement.center  # of the image in the input
     padding: int = 114  # in [0, 255], grey around the image
     bgr: bool = False  # channel order: True = BGR, False = RGB
-    black: float = 0.0  # what the network gets for a channel of 0
-    white: float = 1.0  # what it gets for 255
+    black_level: float = 0.0  # what the network gets for a channel of 0
+    white_level: float = 1.0  # what it gets for 255
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where onnxruntime has it
     reads = ("color",)
 
     def __post_init__(self) -> None:
-        require(0 <= self.spread <= 1, "detector.spread", self.spread, "in [0, 1]")
+        require(0 <= self.class_spread <= 1, "detector.class_spread", self.class_spread, "in [0, 1]")
         require(0 < self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in (0, 1)")
         require(0 < self.nms <= 1, "detector.nms", self.nms, "in (0, 1]")
         require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
@@ -76,8 +76,8 @@ class OnnxSegmentation(Detector):
             placement=self.placement,
             padding=self.padding,
             bgr=self.bgr,
-            black=self.black,
-            white=self.white,
+            black=self.black_level,
+            white=self.white_level,
         )
         self._layout = recognise(
             self._network.try_out(),
@@ -99,7 +99,7 @@ class OnnxSegmentation(Detector):
         best, class_probabilities = best[known], class_probabilities[known]
         scores = candidates.class_scores[best].max(axis=1).clip(0, 1)
         if self._layout.suppressed:
-            class_probabilities = spread_rest(class_probabilities, scores, self.spread)
+            class_probabilities = spread_rest(class_probabilities, scores, self.class_spread)
         masks = masks_from_prototypes(
             output.coefficients[best],
             output.prototypes,
@@ -113,8 +113,11 @@ class OnnxSegmentation(Detector):
     def _tell_of_labels(self) -> None:
         """What to know of a network's classes before its map is looked at."""
         if self._layout.suppressed:
-            log.info("%s gives one class a detection: what its score lacks to 1 goes to the others as detector.spread"
-                     " says, now %g", self.weights.name, self.spread)  # fmt: skip
+            log.info(
+                "%s reports one class per detection; the other classes get detector.class_spread=%g of the rest",
+                self.weights.name,
+                self.class_spread,
+            )
         names = self._network.metadata.names
         different = [(k, a, b) for k, (a, b) in enumerate(zip(names, self._labels, strict=False)) if a != b]
         if different:

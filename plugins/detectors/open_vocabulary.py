@@ -41,7 +41,7 @@ class OpenVocabulary(Detector):
     nms: float = 0.5  # IoU in (0, 1] above which a box falls to a better one, of whatever word
     agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one; 1 = off
     max_detections: int = 50  # >= 1, an image
-    half: bool = True  # half precision on CUDA
+    half_precision: bool = True  # half precision on CUDA
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
     reads = ("color", "depth", "camera")
 
@@ -55,8 +55,10 @@ class OpenVocabulary(Detector):
         require(fits, "detector.words", self.words, f"1 to {MOST_WORDS} different words, not {SOMETHING_ELSE!r}")
         device = torch_device(self.device)
         self.classes = (*names, SOMETHING_ELSE)
-        self._boxes = WordBoxes(self.model, self.revision, names, device, self.half)
-        self._masks = BoxPromptedMasks(self.masks, self.masks_revision, device, self.half) if self.masks else None
+        self._boxes = WordBoxes(self.model, self.revision, names, device, self.half_precision)
+        self._masks = (
+            BoxPromptedMasks(self.masks, self.masks_revision, device, self.half_precision) if self.masks else None
+        )
         commits = [model.folder for model in (self._boxes, self._masks) if model is not None]
         self._commits = " ".join(folder.name for folder in commits if folder.parent.name == "snapshots")
 

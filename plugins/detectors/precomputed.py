@@ -48,12 +48,12 @@ class Precomputed(Detector):
     labels: str = "coco"  # a label space, or a text file with one name a line: that of the file
     category_ids: CategoryIds = CategoryIds.COCO_91  # what category_id counts, where there is no category_name
     score_threshold: float = 0.0  # in [0, 1]: detections below are dropped
-    spread: float = 1.0  # in [0, 1]: how much of what a score lacks to 1 goes to the other classes
+    class_spread: float = 1.0  # in [0, 1]: how much of what a score lacks to 1 goes to the other classes
 
     reads = ("index", "camera")
 
     def __post_init__(self) -> None:
-        check_bounds(self, score_threshold=(0.0, 1.0), spread=(0.0, 1.0))
+        check_bounds(self, score_threshold=(0.0, 1.0), class_spread=(0.0, 1.0))
         self.path = Path(self.path).expanduser()
         self._labels = read_labels(self.labels)
         if len(set(self._labels)) < len(self._labels):
@@ -114,7 +114,7 @@ class Precomputed(Detector):
         if self.classes == self._labels:
             rows = given  # to the bit: normalising could change the last digit
         scores = np.array([one.score for one in stored])
-        rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.spread)
+        rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.class_spread)
         return rows, known
 
     def _expect_a_match(self, index: int) -> None:

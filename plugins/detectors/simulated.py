@@ -81,14 +81,14 @@ class SimulatedDetector(Detector):
     In this order: things of unknown class are taken for objects (`clutter_rate`); an object comes back with a thing
     that touches it, as a sink with its cupboard (`attach_rate`); touching neighbours come back under one mask
     (`merge_rate`); objects are missed, the more so the smaller (`small_side`) or when cut by the image's border, some
-    objects nearly always and others never (`miss_spread`); objects come back in two halves (`split_rate`); masks
-    are shifted, bleed over the border, wobble smoothly along it and pass through a coarse grid; the class becomes a
+    objects nearly always and others never (`miss_spread`); objects come back in two halves (`split_rate`); masks are
+    shifted, bleed over the border, wobble smoothly along it and pass through a coarse grid; the class becomes a
     distribution around a confusion kernel of lookalikes, the same one in many of an object's frames
     (`confusion_consistency`); the score follows the mask's quality and the class's certainty; false detections appear,
-    some of them at the same places of the room again and again (`ghost_share`, where poses are known). What an object
-    or a place has of its own does not average out over a video, as the errors of real detectors do not. Every number
-    is drawn from (seed, purpose, frame, instance): the order of calls does not matter, and changing one error leaves
-    the draws of the others alone. Raises DataError without ground truth.
+    some of them at the same places of the room again and again (`recurring_fraction`, where poses are known). What an
+    object or a place has of its own does not average out over a video, as the errors of real detectors do not. Every
+    number is drawn from (seed, purpose, frame, instance): the order of calls does not matter, and changing one error
+    leaves the draws of the others alone. Raises DataError without ground truth.
     """
 
     seed: int = 0  # >= 0
@@ -114,7 +114,7 @@ class SimulatedDetector(Detector):
     score_threshold: float = 0.1  # in [0, 1), detections below are dropped
     false_positives: float = 0.5  # >= 0, mean number an image
     false_positive_score: float = 0.25  # in (0, 1), mean
-    ghost_share: float = 0.0  # in [0, 1], of the false positives: at places of the room, of one class each
+    recurring_fraction: float = 0.0  # in [0, 1], of the false positives: at places of the room, of one class each
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, "detector.seed", self.seed, "at least 0")
@@ -295,7 +295,7 @@ class SimulatedDetector(Detector):
         random = self._random(Draw.FALSE_POSITIVES, frame.index)
         height, width = frame.camera.shape
         count = int(random.poisson(self.false_positives))
-        is_ghost = self._random(Draw.GHOST, frame.index).random(count) < self.ghost_share
+        is_ghost = self._random(Draw.GHOST, frame.index).random(count) < self.recurring_fraction
         places = ghost_places(frame, self.seed, int(is_ghost.sum()))
         candidates = []
         for k in range(count):

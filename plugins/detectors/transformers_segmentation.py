@@ -89,7 +89,7 @@ class TransformersSegmentation(Detector):
     short_side: int = 0  # px, to which images are resized; 0 = as published
     long_side: int = 0  # px >= short_side, bound on the other side; 0 where short_side is
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
-    half: bool = True  # half precision on CUDA
+    half_precision: bool = True  # half precision on CUDA
     device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
     reads = ("color",)
 
@@ -151,12 +151,12 @@ class TransformersSegmentation(Detector):
 
     def _predict(self, pixels: Tensor) -> tuple[Float32, Tensor]:
         """The queries' class logits (Q, C or C + 1), and their mask logits (Q, h, w) float32 on the device."""
-        half = self.half and self._device.type == "cuda"
+        half = self.half_precision and self._device.type == "cuda"
         with torch.autocast(self._device.type, torch.float16, enabled=half):
             output = self._network(pixel_values=pixels)
         logits, grids = output[self._family.logits][0].float(), output[self._family.masks][0].float()
         if not (torch.isfinite(logits).all() and torch.isfinite(grids).all()):
-            advice = "; try detector.half=false" if half else ""
+            advice = "; try detector.half_precision=false" if half else ""
             raise DataError(f"detector.model: the output of {self.model} is not finite{advice}")
         return np.asarray(logits.cpu().numpy(), np.float32), grids
 

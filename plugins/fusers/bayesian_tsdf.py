@@ -29,10 +29,12 @@ class BayesianTsdf(MapFuser):
     association: Association = field(default_factory=Association)
     class_floor: float = 0.1  # in (0, 1): share of the uniform distribution mixed into a measured one
     instance_floor: float = 0.05  # in (0, 1): P(O = another instance); the matched one has the detection's score
-    absence: float = 0.7  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
+    absence_likelihood: float = (
+        0.7  # in (0, 1]: P(outside the mask | of the matched instance); 1 = no evidence of absence
+    )
 
     def __post_init__(self) -> None:
-        check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence=(1e-6, 1.0))
+        check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence_likelihood=(1e-6, 1.0))
         self.scene: InstanceMap = self.voxels.new_map(RULE)
 
     def go_on(self, scene: SceneMap) -> None:
@@ -56,5 +58,5 @@ class BayesianTsdf(MapFuser):
         return DetectionEvidence(
             instances=np.asarray(np.log(scores / self.instance_floor), np.float32),
             classes=floored_log(clusters.class_probabilities, self.class_floor),
-            absence=float(np.log(self.absence)),
+            absence=float(np.log(self.absence_likelihood)),
         )

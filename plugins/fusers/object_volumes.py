@@ -35,9 +35,9 @@ class ObjectVolumes(MapFuser):
     """
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
-    overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap
+    min_overlap: float = 0.2  # in [0, 1]: a detection may belong to an object above this overlap
     overlap_rule: OverlapRule = OverlapRule.IOU  # what an overlap is counted over
-    same_class: bool = False  # whether their likeliest classes must be the same
+    require_same_class: bool = False  # whether their likeliest classes must be the same
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an object; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; an object is seen, or missed, with this many in view
     min_existence: float = 0.1  # in [0, 1]: an object that exists with less probability is forgotten
@@ -47,7 +47,7 @@ class ObjectVolumes(MapFuser):
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            overlap=(0.0, 1.0),
+            min_overlap=(0.0, 1.0),
             create_score=(0.0, 1.0),
             create_points=(1, 2**31),
             min_existence=(0.0, 1.0),
@@ -81,7 +81,7 @@ class ObjectVolumes(MapFuser):
         instance_ids = np.zeros(len(clusters), np.int32)
         if shares.size:
             best = shares.argmax(axis=1)
-            instance_ids[:] = np.where(shares.max(axis=1) > self.overlap, overlaps.instance_ids[best], 0)
+            instance_ids[:] = np.where(shares.max(axis=1) > self.min_overlap, overlaps.instance_ids[best], 0)
         may_create = (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         for k in np.flatnonzero((instance_ids == 0) & may_create):
             instance_ids[k] = self.scene.create(frame.index)
@@ -89,7 +89,7 @@ class ObjectVolumes(MapFuser):
 
     def _agree(self, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """(N, M) whether a cluster may be an object, by their classes."""
-        if not self.same_class or not len(instance_ids):
+        if not self.require_same_class or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.array([self.scene.table.records[k].class_evidence.argmax() for k in instance_ids.tolist()])
         return np.asarray(clusters.class_probabilities.argmax(axis=1)[:, None] == known[None, :])

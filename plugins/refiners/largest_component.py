@@ -17,23 +17,25 @@ from framework.refinement.selection import keep_points
 class LargestComponent(ClusterRefiner):
     """Keeps of each cluster its largest piece that is connected in 3D.
 
-    Two points of a cluster are connected when they are at most `reach` pixels apart in the image and their depths
-    differ by less than `gap` + `gap_per_depth` * depth of the nearer one: the spacing of depth readings and the noise
-    of the sensor both grow with depth. Of equally large pieces the one seen first in the image stays. A dropped point
-    leaves the arrays, clusters keep their index.
+    Two points of a cluster are connected when they are at most `connection_radius` pixels apart in the image and their
+    depths differ by less than `max_gap` + `gap_per_depth` * depth of the nearer one: the spacing of depth readings and
+    the noise of the sensor both grow with depth. Of equally large pieces the one seen first in the image stays. A
+    dropped point leaves the arrays, clusters keep their index.
     """
 
-    gap: float = 0.03  # m, from 0
+    max_gap: float = 0.03  # m, from 0
     gap_per_depth: float = 0.02  # m per m, from 0
-    reach: int = 2  # px, from 1; 2 bridges single missing readings
+    connection_radius: int = 2  # px, from 1; 2 bridges single missing readings
 
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            gap=(0.0, np.inf),
+            max_gap=(0.0, np.inf),
             gap_per_depth=(0.0, np.inf),
-            reach=(1, 16),
+            connection_radius=(1, 16),
         )
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        return keep_points(clusters, in_largest_piece(clusters, frame, self.gap, self.gap_per_depth, self.reach))
+        return keep_points(
+            clusters, in_largest_piece(clusters, frame, self.max_gap, self.gap_per_depth, self.connection_radius)
+        )

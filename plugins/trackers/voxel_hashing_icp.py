@@ -70,7 +70,7 @@ class VoxelHashingIcp(PoseTracker):
     witness.
     """
 
-    finest: float = 0.5  # of the image's size, a power of 1/2: the resolution of the view and of the finest level
+    finest_scale: float = 0.5  # of the image's size, a power of 1/2: the resolution of the view and of the finest level
     iterations_coarse: int = 8  # >= 0, at 1/4 of the finest resolution
     iterations_middle: int = 6  # >= 0, at 1/2
     iterations_fine: int = 4  # >= 1
@@ -88,14 +88,14 @@ class VoxelHashingIcp(PoseTracker):
     min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
     min_information: float = 1e-3  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
     min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
-    max_behind: float = 0.015  # in [0, 1]: ... and behind it; what fails takes a second witness, see above
+    max_occluded: float = 0.015  # in [0, 1]: ... and behind it; what fails takes a second witness, see above
     relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited places, when lost
     seed: int = 0  # of the relocalization's random samples
 
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            finest=(1 / 64, 1.0),
+            finest_scale=(1 / 64, 1.0),
             iterations_coarse=(0, 1000),
             iterations_middle=(0, 1000),
             iterations_fine=(1, 1000),
@@ -113,9 +113,9 @@ class VoxelHashingIcp(PoseTracker):
             min_matched=(0.0, 1.0),
             min_information=(0.0, 1.0),
             min_agreement=(0.0, 1.0),
-            max_behind=(0.0, 1.0),
+            max_occluded=(0.0, 1.0),
         )
-        require(np.log2(self.finest) % 1 == 0, "VoxelHashingIcp.finest", self.finest, "1, 1/2, 1/4, ...")
+        require(np.log2(self.finest_scale) % 1 == 0, "VoxelHashingIcp.finest", self.finest_scale, "1, 1/2, 1/4, ...")
         self._weights = Weights(
             max_distance=np.float32(self.max_distance),
             close_distance=np.float32(self.close_distance),
@@ -143,7 +143,7 @@ class VoxelHashingIcp(PoseTracker):
             return self._entered(seen, self._before)
         if self._T_world_last is None or scene.voxel_count == 0:
             return self._first(seen, scene)
-        levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest, LEVELS)
+        levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS)
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
         T_world_predicted = self._T_world_last @ self._T_last_next
         if self._lost_frames:
@@ -177,7 +177,7 @@ class VoxelHashingIcp(PoseTracker):
         found = self._keyframes.relocalize(seen.frame)
         alignment = unknown
         if found is not None:
-            levels = build_pyramid(seen.frame.camera, seen.frame.depth, seen.frame.color, self.finest, LEVELS)
+            levels = build_pyramid(seen.frame.camera, seen.frame.depth, seen.frame.color, self.finest_scale, LEVELS)
             self._coarse_depth = is_coarse(seen.frame.depth, otherwise=self._coarse_depth)
             alignment = self._checked(unknown, found.T_world_camera, levels, before)
         if not alignment.trusted:
@@ -212,10 +212,10 @@ class VoxelHashingIcp(PoseTracker):
     def _first(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
         """The pose that defines the world, of the first frame with something in it to be tracked by."""
         frame = seen.frame
-        if min(frame.camera.shape) * self.finest < SMALLEST * 2 ** (LEVELS - 1):
+        if min(frame.camera.shape) * self.finest_scale < SMALLEST * 2 ** (LEVELS - 1):
             raise DataError(
-                f"images of {frame.camera.width}x{frame.camera.height} px are too small for tracker.finest="
-                f"{self.finest:g}: {LEVELS} levels from there leave less than {SMALLEST} px"
+                f"images of {frame.camera.width}x{frame.camera.height} px are too small for tracker.finest_scale="
+                f"{self.finest_scale:g}: {LEVELS} levels from there leave less than {SMALLEST} px"
             )
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         nearest, farthest = scene.depth_range
@@ -331,7 +331,7 @@ class VoxelHashingIcp(PoseTracker):
         beside = equations.close / max(equations.visible - equations.behind, 1)
         reason = self._why_impossible(levels[0], equations, inverse(T_world_from) @ T_world_camera)
         doubt = ""
-        if agreement < self.min_agreement or behind > self.max_behind:
+        if agreement < self.min_agreement or behind > self.max_occluded:
             doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
         elif matched < self.min_matched:
             doubt = f"{agreement:.0%} of the points in view agree with the map, but {matched:.0%} in their normals, too"

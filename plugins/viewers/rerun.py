@@ -49,11 +49,11 @@ class RerunViewer(Viewer):
 
     mode: Mode = Mode.RECORD  # RECORD, WINDOW or BROWSER
     file: str = ""  # "" = recording.rrd in the run's directory in mode RECORD, none in the others
-    every: int = 3  # frames from one picture to the next, from 1
-    mesh_every: float = 2.0  # s, from one look at the map to the next at least, in [0.1, 3600]
+    frame_interval: int = 3  # frames from one picture to the next, from 1
+    mesh_interval: float = 2.0  # s, from one look at the map to the next at least, in [0.1, 3600]
     stride: int = 2  # px of a frame for one of its picture, in [1, 16]
     jpeg_quality: int = 75  # in [1, 100]
-    region: float = 1.0  # m, in [0.1, 1000], side of the cubes that the mesh is drawn in
+    region_size: float = 1.0  # m, in [0.1, 1000], side of the cubes that the mesh is drawn in
     min_confidence: float = 0.3  # in [0, 1], from which on an object is drawn, and a detection named
     memory_limit: str = "2GB"  # of what WINDOW or BROWSER keep; what is oldest goes first
     port: int = 9876  # of the data, in [1024, 65535]; WINDOW takes the viewer that listens there, if one does
@@ -62,11 +62,11 @@ class RerunViewer(Viewer):
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            every=(1, 10**6),
-            mesh_every=(0.1, 3600.0),
+            frame_interval=(1, 10**6),
+            mesh_interval=(0.1, 3600.0),
             stride=(1, 16),
             jpeg_quality=(1, 100),
-            region=(0.1, 1000.0),
+            region_size=(0.1, 1000.0),
             min_confidence=(0.0, 1.0),
             port=(1024, 65535),
             web_port=(1024, 65535),
@@ -87,8 +87,8 @@ class RerunViewer(Viewer):
         recording = rr.RecordingStream("instancemap", recording_id=uuid4(), batcher_config=batches)
         recording.set_sinks(*self._sinks(rr, directory), default_blueprint=layout())
         recording.send_recording_name(video)
-        drawing = RerunDrawing(recording, self.stride, self.jpeg_quality, self.region, self.min_confidence)
-        self._background = Background(scene, drawing, self.every, self.mesh_every)
+        drawing = RerunDrawing(recording, self.stride, self.jpeg_quality, self.region_size, self.min_confidence)
+        self._background = Background(scene, drawing, self.frame_interval, self.mesh_interval)
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
         self._background.show(frame, detections, pose, stage_ms)

@@ -53,7 +53,7 @@ def start(directory: Path, *arguments: str, sweep: bool = False) -> subprocess.C
         ("fuser.capcity=3", ["fuser.capcity", "did you mean fuser.capacity?"]),
         ("dataset.frames=[1", ["dataset.frames=[1", "key=value"]),
         ("seed=-1", ["ERROR", "seed", "0 or more", "-1"]),
-        ("resume=flase", ["ERROR", "resume must be true or false, found 'flase'"]),
+        ("skip_completed=flase", ["ERROR", "resume must be true or false, found 'flase'"]),
         ("debug=maybe", ["ERROR", "debug must be true or false, found 'maybe'"]),
         ("tracker=null", ["group override must be a string"]),
         ("ahead=x", ["ERROR", "ahead must be a whole number, 0 or more and at most 1000, found 'x'"]),

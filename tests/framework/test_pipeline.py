@@ -36,12 +36,12 @@ from tests.support.scenes.corner_room import (
 )
 
 PATIENCE_S = 60.0  # kernels may have to be compiled
-AHEAD = pytest.mark.parametrize("ahead", [0, 1, 3])
+PREFETCH = pytest.mark.parametrize("prefetch", [0, 1, 3])
 
 
-def pipeline(ahead: int = 2, **stages: object) -> Pipeline:
+def pipeline(prefetch: int = 2, **stages: object) -> Pipeline:
     chosen = {"detector": SphereDetector(), "tracker": GivenPose(), "refiner": KeepAll(), "fuser": GridFuser()} | stages
-    return Pipeline(**chosen, ahead=ahead)  # type: ignore[arg-type]
+    return Pipeline(**chosen, prefetch=prefetch)  # type: ignore[arg-type]
 
 
 def mapped(result: RunResult) -> GridMap:
@@ -49,9 +49,9 @@ def mapped(result: RunResult) -> GridMap:
     return result.scene
 
 
-@AHEAD
-def test_maps_every_frame_in_order(room: CornerRoom, ahead: int) -> None:
-    result = pipeline(ahead).run(room)
+@PREFETCH
+def test_maps_every_frame_in_order(room: CornerRoom, prefetch: int) -> None:
+    result = pipeline(prefetch).run(room)
     assert (result.frames, result.frames_lost, result.frames_skipped, result.stopped_by) == (6, 0, 0, None)
     assert [frame.index for frame in result.tracked] == list(range(6))
     np.testing.assert_array_equal(result.tracked[5].pose.T_world_camera, pose_at(5))
@@ -66,7 +66,7 @@ def test_maps_every_frame_in_order(room: CornerRoom, ahead: int) -> None:
 
 
 def test_worker_threads_change_nothing(room: CornerRoom) -> None:
-    meshes = [mapped(pipeline(ahead, fuser=GridFuser(slow_s=0.002)).run(room)).mesh() for ahead in (0, 1, 4)]
+    meshes = [mapped(pipeline(prefetch, fuser=GridFuser(slow_s=0.002)).run(room)).mesh() for prefetch in (0, 1, 4)]
     for mesh in meshes[1:]:
         for name in ("vertices", "triangles", "colors", "instance_ids"):
             np.testing.assert_array_equal(getattr(mesh, name), getattr(meshes[0], name))
@@ -77,17 +77,17 @@ def test_frame_indices_are_those_of_the_sequence() -> None:
     assert [frame.index for frame in result.tracked] == [1, 4, 7]
 
 
-@AHEAD
-def test_an_unreadable_frame_is_skipped(ahead: int, caplog: pytest.LogCaptureFixture) -> None:
-    result = pipeline(ahead).run(CornerRoom(unreadable=2))
+@PREFETCH
+def test_an_unreadable_frame_is_skipped(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
+    result = pipeline(prefetch).run(CornerRoom(unreadable=2))
     assert (result.frames, result.frames_skipped) == (6, 1)
     assert [frame.index for frame in result.tracked] == [0, 1, 3, 4, 5]
     assert [record.message for record in caplog.records] == ["frame skipped: frame 2: depth/000002.png is truncated"]
 
 
-@AHEAD
-def test_a_frame_that_the_detector_refuses_is_skipped(room: CornerRoom, ahead: int) -> None:
-    result = pipeline(ahead, detector=SphereDetector(broken_at=0)).run(room)
+@PREFETCH
+def test_a_frame_that_the_detector_refuses_is_skipped(room: CornerRoom, prefetch: int) -> None:
+    result = pipeline(prefetch, detector=SphereDetector(broken_at=0)).run(room)
     assert (result.frames_skipped, len(result.tracked)) == (1, 5)
 
 
@@ -130,7 +130,7 @@ def test_true_masks_are_not_refined_and_made_up_pixels_end_the_run(room: CornerR
 def test_a_stage_that_forgets_to_return_is_told(
     room: CornerRoom, monkeypatch: pytest.MonkeyPatch, stage: str, verb: str, said: str
 ) -> None:
-    stages = pipeline(ahead=0)
+    stages = pipeline(prefetch=0)
     monkeypatch.setattr(getattr(stages, stage), verb, lambda *_: None)
     with pytest.raises(DataError, match=f"frame 0: {said}, found NoneType"):
         stages.run(room)
@@ -178,13 +178,13 @@ def test_a_run_that_maps_nothing_is_an_error_that_says_what_became_of_its_frames
     )
 
 
-@AHEAD
-def test_other_errors_surface_and_leave_no_thread(ahead: int) -> None:
+@PREFETCH
+def test_other_errors_surface_and_leave_no_thread(prefetch: int) -> None:
     before = threading.active_count()
     with pytest.raises(DataError, match="no true pose"):
-        pipeline(ahead, detector=_Blind()).run(CornerRoom(truth=False))
+        pipeline(prefetch, detector=_Blind()).run(CornerRoom(truth=False))
     with pytest.raises(DataError, match="no true instances"):  # raised in the worker
-        pipeline(ahead).run(CornerRoom(truth=False))
+        pipeline(prefetch).run(CornerRoom(truth=False))
     assert threading.active_count() == before
 
 
@@ -252,14 +252,14 @@ def test_a_fault_of_the_last_place_keeps_the_map(room: CornerRoom) -> None:
     assert "40 GiB" in str(result.stopped_by), "what came first"
 
 
-@AHEAD
-def test_a_fault_before_anything_is_in_the_map_is_raised(room: CornerRoom, ahead: int) -> None:
+@PREFETCH
+def test_a_fault_before_anything_is_in_the_map_is_raised(room: CornerRoom, prefetch: int) -> None:
     for stages in (
         {"detector": FaultyDetector(at=0)},
         {"tracker": GivenPose(lost_to=3), "detector": FaultyDetector(at=3)},
     ):
         with pytest.raises(OSError, match="Input/output error"):
-            pipeline(ahead, **stages).run_to_any_end(room)
+            pipeline(prefetch, **stages).run_to_any_end(room)
 
 
 @dataclass
@@ -281,10 +281,10 @@ def working_threads() -> int:
     return sum(not isinstance(thread, TMonitor) for thread in threading.enumerate())
 
 
-@AHEAD
-def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, ahead: int) -> None:
+@PREFETCH
+def test_ctrl_c_ends_the_run_after_the_frame(room: CornerRoom, prefetch: int) -> None:
     handler, threads = signal.getsignal(signal.SIGINT), working_threads()
-    result = pipeline(ahead, tracker=PressesCtrlC()).run(room)
+    result = pipeline(prefetch, tracker=PressesCtrlC()).run(room)
     assert isinstance(result.stopped_by, KeyboardInterrupt)
     assert (result.frames, len(mapped(result).vertices)) == (4, 4)
     assert signal.getsignal(signal.SIGINT) is handler
@@ -373,16 +373,16 @@ def pretend_cores(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(numba, "set_num_threads", lambda number: None)
 
 
-@pytest.mark.parametrize("ahead", [2, 3])
+@pytest.mark.parametrize("prefetch", [2, 3])
 def test_a_detector_that_can_is_given_two_frames_at_once_and_they_are_read_and_mapped_in_order(
-    ahead: int, monkeypatch: pytest.MonkeyPatch
+    prefetch: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pretend_cores(2, monkeypatch)
     threads = working_threads()
-    result = pipeline(ahead, detector=_InPairs()).run(_OneReader())
+    result = pipeline(prefetch, detector=_InPairs()).run(_OneReader())
     assert [frame.index for frame in result.tracked] == list(range(6))
     np.testing.assert_array_equal(mapped(result).mesh().vertices, mapped(pipeline().run(CornerRoom())).mesh().vertices)
-    result = pipeline(ahead, detector=_InPairs()).run(_OneReader(frames=7, unreadable=3))
+    result = pipeline(prefetch, detector=_InPairs()).run(_OneReader(frames=7, unreadable=3))
     assert [frame.index for frame in result.tracked] == [0, 1, 2, 4, 5, 6]
     assert working_threads() == threads
 
@@ -397,16 +397,16 @@ def test_a_detector_that_can_is_given_one_frame_at_a_time_where_there_are_no_cor
             return super().detect(frame)
 
     found: list[list[str]] = []
-    for cores, ahead in ((1, 2), (2, 1), (2, 0)):
+    for cores, prefetch in ((1, 2), (2, 1), (2, 0)):
         pretend_cores(cores, monkeypatch)
-        pipeline(ahead, detector=Alone()).run(CornerRoom())
-        assert max(map(len, found)) == min(ahead, 1)
+        pipeline(prefetch, detector=Alone()).run(CornerRoom())
+        assert max(map(len, found)) == min(prefetch, 1)
         found.clear()
 
 
 def test_ahead_is_checked() -> None:
-    with pytest.raises(ConfigError, match="ahead"):
-        pipeline(ahead=-1)
+    with pytest.raises(ConfigError, match="prefetch"):
+        pipeline(prefetch=-1)
 
 
 def test_quiet_when_not_a_terminal(room: CornerRoom, capfd: pytest.CaptureFixture[str]) -> None:
@@ -441,15 +441,15 @@ class Listener(Viewer):
         self.heard.append("end")
 
 
-@AHEAD
-def test_a_viewer_hears_of_every_frame_in_order(ahead: int, tmp_path: Path) -> None:
+@PREFETCH
+def test_a_viewer_hears_of_every_frame_in_order(prefetch: int, tmp_path: Path) -> None:
     @dataclass
     class GetsLost(GivenPose):
         def track(self, frame: Frame, scene: SceneMap) -> Pose:
             return replace(super().track(frame, scene), lost=frame.index == 3)
 
     listener = Listener()
-    pipeline(ahead, tracker=GetsLost(), viewer=listener).run_to_any_end(CornerRoom(unreadable=1), tmp_path)
+    pipeline(prefetch, tracker=GetsLost(), viewer=listener).run_to_any_end(CornerRoom(unreadable=1), tmp_path)
     skipped = "skipped frame 1: depth/000001.png is truncated"
     assert listener.heard == [
         f"begin corner_room in {tmp_path.name}",
@@ -468,10 +468,10 @@ def test_a_viewer_hears_of_the_end_however_it_comes(room: CornerRoom, stages: di
     assert listener.heard.count("end") == 1
 
 
-@AHEAD
+@PREFETCH
 @pytest.mark.parametrize("verb", ["show", "skip", "end"])
 def test_a_viewer_that_fails_takes_nothing_from_the_run(
-    verb: str, ahead: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    verb: str, prefetch: int, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(*_: object) -> None:
         calls.append(verb)
@@ -480,7 +480,7 @@ def test_a_viewer_that_fails_takes_nothing_from_the_run(
     calls: list[str] = []
     listener = Listener()
     monkeypatch.setattr(listener, verb, fails)
-    result = pipeline(ahead, viewer=listener).run_to_any_end(CornerRoom(unreadable=1))
+    result = pipeline(prefetch, viewer=listener).run_to_any_end(CornerRoom(unreadable=1))
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
     told = [record.message for record in caplog.records if "viewer" in record.message]
     assert told == ["viewer: it failed, and the run goes on without it: no screen any more"]

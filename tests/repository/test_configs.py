@@ -126,7 +126,7 @@ def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_w
 
 
 def test_what_changes_no_result_is_not_in_the_name_of_a_sweeps_run() -> None:
-    """Else a run that was watched, or asked for with resume=true, would not be found again."""
+    """Else a run that was watched, or asked for with skip_completed=true, would not be found again."""
     main = OmegaConf.load(CONF / "config.yaml")
     left_out = set(OmegaConf.select(main, "hydra.job.config.override_dirname.exclude_keys"))
     shown = {

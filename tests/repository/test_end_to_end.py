@@ -20,10 +20,10 @@ def sequence() -> Synthetic:
     return Synthetic(seed=3, width=320, height=240, frames=240, stop=24)
 
 
-def mapped(sequence: Synthetic, detector: SimulatedDetector | GroundTruthDetector, ahead: int) -> InstanceMap:
+def mapped(sequence: Synthetic, detector: SimulatedDetector | GroundTruthDetector, prefetch: int) -> InstanceMap:
     fuser = assemble(BayesianTsdf, voxel_size=0.02)
-    tracker = VoxelHashingIcp(finest=1.0)
-    result = Pipeline(detector, tracker, GmmEm(), fuser, ahead=ahead).run(sequence)
+    tracker = VoxelHashingIcp(finest_scale=1.0)
+    result = Pipeline(detector, tracker, GmmEm(), fuser, prefetch=prefetch).run(sequence)
     assert result.frames_lost == 0
     assert result.frames_skipped == 0
     return fuser.scene
@@ -32,8 +32,8 @@ def mapped(sequence: Synthetic, detector: SimulatedDetector | GroundTruthDetecto
 def test_running_ahead_changes_nothing(sequence: Synthetic) -> None:
     """The worker thread competes with the mapping kernels for the cores, and the map is the same to the byte."""
     maps = []
-    for ahead in (0, 2):
-        scene = mapped(sequence, SimulatedDetector(seed=1), ahead)
+    for prefetch in (0, 2):
+        scene = mapped(sequence, SimulatedDetector(seed=1), prefetch)
         b, r = scene.volume.voxels.block_count, scene.labels.row_count
         grid = scene.volume.voxels.grid
         arrays = [a[:b] for a in (grid.block_coords, grid.tsdf, grid.weight, grid.color, grid.label_row)]
@@ -43,7 +43,7 @@ def test_running_ahead_changes_nothing(sequence: Synthetic) -> None:
 
 def test_true_masks_give_true_instances(sequence: Synthetic) -> None:
     """What is missing to 1 is lost by tracking and mapping, not by detection."""
-    scene = mapped(sequence, GroundTruthDetector(), ahead=2)
+    scene = mapped(sequence, GroundTruthDetector(), prefetch=2)
     truth = sequence.scene_truth()
     assert truth is not None
     predicted = PredictedInstances.of_map(scene.mesh(), scene.instances(), scene.classes)

@@ -121,7 +121,7 @@ def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:
 
 
 def _nested(made_of: Mapping[str, str], place: str, plugin_class: type) -> str:
-    """The options that a field at `place` (detector.of) holds: one, or several by name."""
+    """The options that a field at `place` (detector.detector) holds: one, or several by name."""
     if holds_one(plugin_class, place.rpartition(".")[2]):
         own = [path for path, package in made_of.items() if package == place]
         return own[-1].rpartition("/")[2] if own else ""  # after those that it inherits from

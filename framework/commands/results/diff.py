@@ -24,7 +24,7 @@ UNCHANGED = (Kind.STAYED, Kind.NOT_SEEN)
 def main() -> None:
     parser = argparse.ArgumentParser(
         description="Lists the objects that appeared, vanished or moved from one run to another, with probabilities. "
-        "Both must lie in one world: run the second with world=FIRST, or both with given poses.",
+        "Both must lie in one world: run the second with localize_in=FIRST, or both with given poses.",
     )
     parser.add_argument("before", metavar="FIRST", type=Path, help="the directory of the first visit's run")
     parser.add_argument("after", metavar="SECOND", type=Path, help="that of the second's")
@@ -35,7 +35,7 @@ def main() -> None:
     with one_line_errors():
         if not in_world(asked.after, asked.before):
             log.warning(
-                "%s does not say that it lies in the world of %s: run it with world=%s, or both with given poses",
+                "%s does not say that it lies in the world of %s: run it with localize_in=%s, or both with given poses",
                 asked.after,
                 asked.before,
                 asked.before,
@@ -61,7 +61,7 @@ def visit_of(run: Path) -> Visit:
 def in_world(run: Path, world: Path) -> bool:
     """Whether a run lies in the world of another, as far as their records say."""
     config = load_yaml(run / CONFIG) if is_there(run / CONFIG) else None
-    asked = [config.get(key) for key in ("world", "map")] if isinstance(config, DictConfig) else []
+    asked = [config.get(key) for key in ("localize_in", "resume_from")] if isinstance(config, DictConfig) else []
     if any(isinstance(path, str) and Path(path).expanduser().resolve() == world.resolve() for path in asked):
         return True
     records = [read_json(place / METRICS) if is_there(place / METRICS) else None for place in (run, world)]

@@ -39,7 +39,7 @@ def job(config: DictConfig) -> None:
     config, choices = with_row(config, hydra_config)
     # where a sweep was killed and not its workers, they go on; a run by itself has its place since it was started
     with locked(directory, wait=True) if is_of_sweep(hydra_config) else nullcontext():
-        if config.resume and is_recorded(directory, config):
+        if config.skip_completed and is_recorded(directory, config):
             return
         interruption = run(config, directory, choices)
     if is_of_sweep(hydra_config):  # which has not ended with this run

@@ -60,7 +60,9 @@ class PlaceCallback(Callback):
     def on_run_start(self, config: DictConfig, **_: Any) -> None:
         HydraConfig.instance().set_config(config)  # as it does itself a moment later: the place names the dataset
         if self.of_run:
-            self.take(lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.resume is True))
+            self.take(
+                lambda: run_in(place_of("hydra.run.dir", config.hydra.run.dir), wait=config.skip_completed is True)
+            )
 
     def on_multirun_start(self, config: DictConfig, **_: Any) -> None:
         self.take(lambda: sweep_of(config, with_table=self.of_run))

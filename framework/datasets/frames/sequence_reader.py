@@ -56,14 +56,14 @@ class Recording(RGBDSequence):
     start: int = 0  # first frame
     stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
     stride: int = 1  # take every stride-th frame
-    share: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
+    frame_fraction: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
     seed: int = 0  # of the share
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
 
     def __post_init__(self) -> None:
-        check_selection(self.start, self.stop, self.stride, self.share)
+        check_selection(self.start, self.stop, self.stride, self.frame_fraction)
         check_max_depth(self.max_depth)
         self.root = folder_of(Path(self.root))
         self.folder = self.root / self.scene
@@ -77,7 +77,7 @@ class Recording(RGBDSequence):
             self.camera, stored.camera_source, stored.depth_scale, self.max_depth, stored.distortion
         )
         self.chosen = choose_frames(
-            len(self.contents.frames), self.start, self.stop, self.stride, self.share, self.seed
+            len(self.contents.frames), self.start, self.stop, self.stride, self.frame_fraction, self.seed
         )
         self._check_first_image()
 

@@ -32,14 +32,14 @@ def check_truth_voxel(size: float) -> None:
     """Raises ConfigError for a spacing of true points that no recording has."""
     if not SMALLEST_VOXEL <= size <= LARGEST_VOXEL:  # NaN is neither
         raise ConfigError(
-            f"dataset.truth_voxel must be positive metres, in [{SMALLEST_VOXEL:g}, {LARGEST_VOXEL:g}], found {size}"
+            f"dataset.ground_truth_spacing: expected [{SMALLEST_VOXEL:g}, {LARGEST_VOXEL:g}] m, got {size}"
         )
 
 
 def fuse_scene_truth(
-    views: Iterable[LabeledDepth], class_names: Mapping[int, str | None], truth_voxel: float = 0.02
+    views: Iterable[LabeledDepth], class_names: Mapping[int, str | None], ground_truth_spacing: float = 0.02
 ) -> SceneTruth:
-    """One labelled point for each voxel of `truth_voxel` metres that a view's pixels fall into.
+    """One labelled point for each voxel of `ground_truth_spacing` metres that a view's pixels fall into.
 
     Every pixel with depth votes for (its voxel, its instance id). A voxel gets the id with most votes, the smaller
     one if two have as many, and the mean of the points that voted for it. Views are taken one by one, so memory
@@ -47,7 +47,7 @@ def fuse_scene_truth(
     """
     table = _VoteTable()
     for view in views:
-        table.add(view, truth_voxel)
+        table.add(view, ground_truth_spacing)
     points, ids = table.elect()
     return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
 
@@ -74,7 +74,7 @@ class _VoteTable:
         self.taken = 0
         self.slots = _Slots.empty(INITIAL_CAPACITY)
 
-    def add(self, view: LabeledDepth, truth_voxel: float) -> None:
+    def add(self, view: LabeledDepth, ground_truth_spacing: float) -> None:
         pixels = view.depth.size
         while 2 * (self.taken + pixels) > len(self.slots.keys):  # a view can at worst bring one new slot a pixel
             larger = _Slots.empty(2 * len(self.slots.keys))
@@ -86,12 +86,14 @@ class _VoteTable:
             np.ascontiguousarray(view.instance_ids),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
             np.ascontiguousarray(view.T_world_camera),
-            1.0 / truth_voxel,
+            1.0 / ground_truth_spacing,
             self.slots,
             self.taken,
         )
         if self.taken < 0:
-            raise DataError(f"ground truth: a point lies more than {KEY_OFFSET * truth_voxel:.0f} m from the origin")
+            raise DataError(
+                f"ground truth: a point lies more than {KEY_OFFSET * ground_truth_spacing:.0f} m from the origin"
+            )
 
     def elect(self) -> tuple[Float32, Int32]:
         """Each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""

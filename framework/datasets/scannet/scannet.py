@@ -66,9 +66,9 @@ class ScanNet(LabeledRecording):
         self._label_tables = [table for table in tables if is_there(table)]
         files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
         self.mesh = mesh_of(files, self._read_mesh)
-        if self.mesh is None and self.frame_truth:
+        if self.mesh is None and self.frame_ground_truth:
             raise DataError(
-                f"dataset.frame_truth needs a labelled mesh: {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
+                f"dataset.frame_ground_truth: expected {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
             )
         if self.mesh and not self._label_tables:
             log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[-1])

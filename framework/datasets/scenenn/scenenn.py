@@ -77,8 +77,8 @@ class SceneNN(LabeledRecording):
         poses = read_trajectory_log(log_file) if is_there(log_file) else None
         times = _optional_times(self.folder / "timestamp.txt", list(images))
         self.mesh = mesh_of([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
-        if self.mesh is None and self.frame_truth:
-            raise DataError(f"dataset.frame_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
+        if self.mesh is None and self.frame_ground_truth:
+            raise DataError(f"dataset.frame_ground_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
         frames = [_recorded(pair, k - 1, poses, times.get(k, (k - 1) / FRAME_RATE)) for k, pair in images.items()]
         ini = self.root / "intrinsic" / f"{self.sensor}.ini"

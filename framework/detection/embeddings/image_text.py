@@ -105,7 +105,9 @@ class ImageTextModel:
         vectors = tensor.float().cpu().numpy()
         lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
         if not np.isfinite(lengths).all() or (lengths == 0).any():
-            raise DataError(f"{self.space} computed an embedding that is not finite, or 0; set detector.half=false")
+            raise DataError(
+                f"{self.space} computed an embedding that is not finite, or 0; set detector.half_precision=false"
+            )
         return np.asarray(vectors / lengths, np.float32)
 
 

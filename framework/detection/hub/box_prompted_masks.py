@@ -63,7 +63,9 @@ class BoxPromptedMasks:
         output = self._network(pixel_values=pixels.to(self._dtype), input_boxes=prompts, multimask_output=False)
         logits = output.pred_masks[0, :, 0].float()
         if not torch.isfinite(logits).all():
-            raise DataError(f"detector.masks: the output of {self._model} is not finite; try detector.half=false")
+            raise DataError(
+                f"detector.masks: the output of {self._model} is not finite; try detector.half_precision=false"
+            )
         whole = functional.interpolate(logits[None], (self._side, self._side), mode="bilinear", align_corners=False)
         inside = whole[..., : resized[1], : resized[0]]
         shown = functional.interpolate(inside, (height, width), mode="bilinear", align_corners=False)[0]

@@ -59,5 +59,7 @@ class WordBoxes:
         boxes = np.concatenate([centers[:, :2] - half, centers[:, :2] + half], axis=1) * np.float32(long) - 0.5
         probabilities = torch.sigmoid(output.logits[0].float()).cpu().numpy()
         if not (np.isfinite(boxes).all() and np.isfinite(probabilities).all()):
-            raise DataError(f"detector.model: the output of {self.folder} is not finite; try detector.half=false")
+            raise DataError(
+                f"detector.model: the output of {self.folder} is not finite; try detector.half_precision=false"
+            )
         return boxes.astype(np.float32), probabilities

@@ -36,13 +36,17 @@ class ImageNetwork:
         allowed = f"0 (the network's own) or positive px, at most {LONGEST_SIDE}"
         require(0 <= input_size <= LONGEST_SIDE, "detector.input_size", input_size, allowed)
         require(0 <= padding <= 255, "detector.padding", padding, "in [0, 255]")
-        require(bool(np.isfinite([black, white]).all()) and black != white, "detector.white", white, f"not {black}")
+        require(
+            bool(np.isfinite([black, white]).all()) and black != white, "detector.white_level", white, f"not {black}"
+        )
         require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
         onnx = "an ONNX file; convert a .tflite file with tf2onnx (docs/guides/detectors.md)"
         require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
         self._network = OnnxNetwork(path, sha256, device, input_size)
         whole = self._network.dtype != "uint8" or (black, white) == (0, 255)
-        require(whole, "detector.black and white", f"{black} and {white}", "0 and 255 for a network of whole numbers")
+        require(
+            whole, "detector.black_level and white", f"{black} and {white}", "0 and 255 for a network of whole numbers"
+        )
         self.shape = self._network.shape  # (height, width) px
         self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
         self.metadata = self._network.metadata

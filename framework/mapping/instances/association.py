@@ -249,13 +249,17 @@ def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding
 class Association:
     """A frame's clusters update the instances that the map has, or make new ones; instances seen as one are merged."""
 
-    overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
+    min_overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
-    class_gate: float = 0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
+    min_class_agreement: float = (
+        0.0  # in [0, 1]: and if their classes agree so much (Bhattacharyya coefficient); 0 = whatever
+    )
     create_score: float = 0.3  # in [0, 1]: a detection needs this to create an instance; any may update one
     create_points: int = 50  # pixels, >= 1: and this many; overlaps with less of an instance are counted over this many
     duplicate_overlap: float = 0.6  # in [0, 1]: a cluster that shares this with a better one creates nothing
-    split: bool = True  # whether two clusters on one instance split it: the better one keeps it, the other is new
+    split_instances: bool = (
+        True  # whether two clusters on one instance split it: the better one keeps it, the other is new
+    )
     merge_overlap: float = 0.5  # in [0, 1]: two instances under one cluster above this are one object ...
     merge_frames: int = 3  # frames, >= 1: ... when seen so in this many more frames than apart ...
     merge_agreement: float = 0.1  # in [0, 1]: ... and if their classes agree so much (as in class_gate); so must those
@@ -264,8 +268,8 @@ class Association:
     def __post_init__(self) -> None:
         check_bounds(
             self,
-            overlap=(0.0, 1.0),
-            class_gate=(0.0, 1.0),
+            min_overlap=(0.0, 1.0),
+            min_class_agreement=(0.0, 1.0),
             create_score=(0.0, 1.0),
             create_points=(1, 2**31),
             duplicate_overlap=(0.0, 1.0),
@@ -287,14 +291,14 @@ class Association:
     ) -> Matches:
         """Matches each cluster with an instance that overlaps enough, or creates one where it is good enough."""
         frame_index = table.number_of(frame_index)
-        allowed = overlaps.by(self.overlap_rule, self.create_points) > self.overlap
+        allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
         match = match_one_to_one(allowed, overlaps.over_union(self.create_points))
         instance_ids = np.where(match >= 0, np.append(overlaps.instance_ids, 0)[match], 0).astype(np.int32)
         may_create = (
             (instance_ids == 0) & (clusters.scores >= self.create_score) & (overlaps.sizes >= self.create_points)
         )
-        if not self.split:
+        if not self.split_instances:
             may_create &= ~allowed.any(axis=1)
         if may_create.any():
             may_create &= ~cover_another(points, clusters.scores, self.duplicate_overlap)
@@ -314,20 +318,22 @@ class Association:
         in every frame would never get enough to be seen.
         """
         free = ~np.isin(hidden.instance_ids, instance_ids)
-        allowed = may_create[:, None] & free & (hidden.by(self.overlap_rule, self.create_points) > self.overlap)
+        allowed = may_create[:, None] & free & (hidden.by(self.overlap_rule, self.create_points) > self.min_overlap)
         if not allowed.any():
             return
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in hidden.instance_ids])
-        allowed &= class_agreement(clusters.class_probabilities, known) >= max(self.class_gate, self.merge_agreement)
+        allowed &= class_agreement(clusters.class_probabilities, known) >= max(
+            self.min_class_agreement, self.merge_agreement
+        )
         match = match_one_to_one(allowed, hidden.over_union(self.create_points))
         instance_ids[match >= 0] = hidden.instance_ids[match[match >= 0]]
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
         """(N, M) whether a cluster may be the same thing as an instance, by their classes."""
-        if self.class_gate == 0 or not len(instance_ids):
+        if self.min_class_agreement == 0 or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
-        return class_agreement(clusters.class_probabilities, known) >= self.class_gate
+        return class_agreement(clusters.class_probabilities, known) >= self.min_class_agreement
 
     def observe(self, table: InstanceTable, matches: Matches, class_evidence: Float64) -> None:
         """Brings the table of instances up to date with what this frame saw."""

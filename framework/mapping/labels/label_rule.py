@@ -78,12 +78,16 @@ class LabeledVoxels:
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
-    on_top: float = 0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
-    lying_on: float = 0.6  # in [0, 1]: an instance covered so much by a cluster of another class lies on it; 1 = off
+    occlusion_area_ratio: float = (
+        0.25  # in [0, 1]: where clusters overlap, one smaller than this share of another takes the pixels
+    )
+    support_overlap: float = (
+        0.6  # in [0, 1]: an instance covered so much by a cluster of another class lies on it; 1 = off
+    )
     storage: Storage = Storage.COMPACT  # COMPACT: the best few labels a voxel; EXACT: all of them, for comparison
 
     def __post_init__(self) -> None:
-        check_bounds(self, on_top=(0.0, 1.0), lying_on=(0.0, 1.0))
+        check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
 
     def new_map(self, rule: LabelRule) -> InstanceMap:
         """An empty one for labels by this rule."""
@@ -110,7 +114,7 @@ class LabeledVoxels:
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
         """What a frame's clusters, in the lists of each pixel, say of the voxels by this rule."""
-        points = keep_on_top(points, matches.instance_ids, self.on_top)
+        points = keep_on_top(points, matches.instance_ids, self.occlusion_area_ratio)
         others = self.lying_on_clusters(table, matches)
         if others.any():
             points = leave_to_others(points, others, matches.overlaps.seen, matches.overlaps.stride)
@@ -144,9 +148,9 @@ class LabeledVoxels:
         """
         overlaps, clusters = matches.overlaps, matches.clusters
         lying = np.zeros((len(clusters), table.last_id + 1), np.bool_)
-        if self.lying_on >= 1 or not len(overlaps.instance_ids):
+        if self.support_overlap >= 1 or not len(overlaps.instance_ids):
             return lying
-        covered = overlaps.votes >= self.lying_on * np.maximum(overlaps.visible, 1)
+        covered = overlaps.votes >= self.support_overlap * np.maximum(overlaps.visible, 1)
         small = 2 * overlaps.visible <= overlaps.sizes[:, None]
         other = matches.instance_ids[:, None] != overlaps.instance_ids
         under = covered & small & other

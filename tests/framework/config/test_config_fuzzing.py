@@ -26,7 +26,7 @@ path: /nowhere/results.json # of a program
 labels: coco
 category_ids: FROM_ONE
 score_threshold: 0.1
-spread: 1.0
+class_spread: 1.0
 """
 TOKENS = (
     *(

@@ -12,9 +12,9 @@ from framework.errors import ConfigError
 
 
 def test_the_overrides_of_each_row() -> None:
-    config = OmegaConf.create("{kind: gmm_em, rows: {ours: [], 2: ['refiner=${kind}', fuser.overlap=0.1]}}")
+    config = OmegaConf.create("{kind: gmm_em, rows: {ours: [], 2: ['refiner=${kind}', fuser.min_overlap=0.1]}}")
     found = checked_rows(config.rows)
-    assert found == {"ours": [], "2": ["refiner=gmm_em", "fuser.overlap=0.1"]}
+    assert found == {"ours": [], "2": ["refiner=gmm_em", "fuser.min_overlap=0.1"]}
     assert checked_rows(None) == checked_rows({}) == {}
 
 

@@ -74,18 +74,18 @@ def test_a_frame_holds_exactly_what_the_files_hold(folder):
 
 
 def test_a_share_keeps_order_index_and_what_belongs_together(folder):
-    sequence = RgbdFolder(folder, share=0.5, seed=1)
+    sequence = RgbdFolder(folder, frame_fraction=0.5, seed=1)
     indices = [frame.index for frame in sequence]
     assert len(indices) == 2
     assert indices == sorted(indices)
     for frame in sequence:
         assert frame.timestamp == pytest.approx(frame.index / 10)
         np.testing.assert_array_equal(frame.color, picture(frame.index))
-    assert {tuple(frame.index for frame in RgbdFolder(folder, share=0.5, seed=seed)) for seed in range(9)} > {
+    assert {tuple(frame.index for frame in RgbdFolder(folder, frame_fraction=0.5, seed=seed)) for seed in range(9)} > {
         tuple(indices)
     }
-    with pytest.raises(ConfigError, match=r"dataset.share"):
-        RgbdFolder(folder, share=1.5)
+    with pytest.raises(ConfigError, match=r"dataset.frame_fraction"):
+        RgbdFolder(folder, frame_fraction=1.5)
 
 
 def test_start_stop_stride_choose_and_the_index_counts_before_them(folder):
@@ -349,7 +349,7 @@ def test_images_of_another_size_than_the_camera(folder):
         RgbdFolder(folder)
 
 
-@pytest.mark.parametrize("values", [{"max_depth": -1.0}, {"truth_voxel": 0.0}, {"stride": 0}])
+@pytest.mark.parametrize("values", [{"max_depth": -1.0}, {"ground_truth_spacing": 0.0}, {"stride": 0}])
 def test_parameters_are_checked(folder, values):
     with pytest.raises(ConfigError, match=f"dataset.{next(iter(values))}"):
         RgbdFolder(folder, **values)

@@ -31,7 +31,7 @@ def test_nothing_visible():
 
 def test_no_truth_and_unknown_classes_concern_the_whole_sequence():
     with pytest.raises(
-        DataError, match=r"frame 7 has no instance ground truth.*: set dataset\.frame_truth=true"
+        DataError, match=r"frame 7 has no instance ground truth.*: set dataset\.frame_ground_truth=true"
     ) as caught:
         true_instances(frame_with(None), ("tv",))
     assert not isinstance(caught.value, FrameError)

@@ -157,7 +157,9 @@ def test_frames_that_are_none_are_told() -> None:
 
 @pytest.mark.parametrize("value", ["a b", "it's", r"C:\x\new", "x=1,2", "[1]", "{a: b}", "null", "é", "a\\"])
 def test_stages_and_parameters_go_by_name(value: str) -> None:
-    named = Mapper(detector="none", tracker="ground_truth", threads=1, detection_cache_dir=value, debug=False, map=None)
+    named = Mapper(
+        detector="none", tracker="ground_truth", threads=1, detection_cache_dir=value, debug=False, resume_from=None
+    )
     assert type(named.pipeline.detector).__name__ == "NoDetections"
     assert Mapper("detector=none", **{"fuser.voxel_size": 0.05}).scene.voxel_count == 0  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="detector must be a name, a number"):

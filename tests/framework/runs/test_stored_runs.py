@@ -134,7 +134,7 @@ def test_what_a_record_has_lost_is_named(directory: Path, caplog: pytest.LogCapt
     (directory / "map.npz").unlink()
     (directory / "mesh.ply").unlink()
     assert is_recorded(directory, OmegaConf.create(CONFIG))
-    assert f"{directory} has lost mesh.ply, map.npz; resume=false would make it again" in caplog.messages
+    assert f"{directory} has lost mesh.ply, map.npz; skip_completed=false would make it again" in caplog.messages
 
 
 def test_a_record_of_another_config_is_not(directory: Path, caplog: pytest.LogCaptureFixture) -> None:

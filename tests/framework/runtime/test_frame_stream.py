@@ -122,9 +122,9 @@ def test_what_is_neither_recorded_nor_live_is_refused() -> None:
 
 
 @AHEAD
-def test_a_live_video_that_is_slow_enough_is_mapped_whole(ahead: int) -> None:
+def test_a_live_video_that_is_slow_enough_is_mapped_whole(prefetch: int) -> None:
     threads, video = working_threads(), LiveRoom(unreadable=2)
-    result = pipeline(ahead).run(video)
+    result = pipeline(prefetch).run(video)
     assert (result.frames, result.frames_skipped, result.stopped_by) == (6, 1, None)
     assert result.live is not None
     assert result.live.frames_dropped == 0
@@ -136,9 +136,9 @@ def test_a_live_video_that_is_slow_enough_is_mapped_whole(ahead: int) -> None:
 
 
 @AHEAD
-def test_when_mapping_is_behind_frames_are_dropped_and_counted(ahead: int, caplog: pytest.LogCaptureFixture) -> None:
+def test_when_mapping_is_behind_frames_are_dropped_and_counted(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
-    result = pipeline(ahead, fuser=GridFuser(slow_s=SLOW_S)).run(video)
+    result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)
     assert result.live is not None
     assert result.frames + result.live.frames_dropped == video.sent == 60
     assert result.frames < 40
@@ -149,7 +149,7 @@ def test_when_mapping_is_behind_frames_are_dropped_and_counted(ahead: int, caplo
 
 
 def test_no_frame_waits_behind_another() -> None:
-    """However far the loop may look ahead in a recording: a queue would add its length to each latency."""
+    """However far the loop may look prefetch in a recording: a queue would add its length to each latency."""
     video, waiting = LiveRoom(frames_sent=200, period_s=0.002), []
 
     @dataclass
@@ -158,7 +158,7 @@ def test_no_frame_waits_behind_another() -> None:
             super().fuse(frame, pose, clusters)
             waiting.append(video.read - len(waiting) - 1)
 
-    pipeline(ahead=5, fuser=Slow(slow_s=SLOW_S)).run(video)
+    pipeline(prefetch=5, fuser=Slow(slow_s=SLOW_S)).run(video)
     assert max(waiting) == 1
 
 
@@ -180,9 +180,9 @@ def test_a_recording_has_none_of_these_figures_and_drops_nothing(room: CornerRoo
 
 
 @AHEAD
-def test_ctrl_c_is_the_end_of_a_live_video(ahead: int) -> None:
+def test_ctrl_c_is_the_end_of_a_live_video(prefetch: int) -> None:
     video, threads = LiveRoom(frames_sent=1000), working_threads()
-    result = pipeline(ahead, tracker=PressesCtrlC(at=0)).run(video)
+    result = pipeline(prefetch, tracker=PressesCtrlC(at=0)).run(video)
     assert result.stopped_by is None
     assert len(mapped(result).vertices) == result.frames == 1
     assert video.closed
@@ -231,13 +231,13 @@ def test_a_live_video_without_a_usable_frame_is_an_error() -> None:
 
 
 @AHEAD
-def test_a_fault_of_a_stage_leaves_no_thread(ahead: int) -> None:
+def test_a_fault_of_a_stage_leaves_no_thread(prefetch: int) -> None:
     """The worker may be waiting for a frame, and the listener for the video."""
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     with pytest.raises(OSError, match="Input/output error"):
-        pipeline(ahead, detector=FaultyDetector(at=0)).run(video)
+        pipeline(prefetch, detector=FaultyDetector(at=0)).run(video)
     with pytest.raises(OSError, match="Input/output error"):
-        pipeline(ahead, detector=FaultyDetector(at=2)).run(LiveRoom(frames_sent=1000))
+        pipeline(prefetch, detector=FaultyDetector(at=2)).run(LiveRoom(frames_sent=1000))
     assert video.closed
     assert working_threads() == threads
 

@@ -62,7 +62,7 @@ def test_frames_do_not_depend_on_order_or_threads(bedroom):
 
 
 def test_a_share_leaves_frames_out_and_the_others_as_they_are(bedroom):
-    share = Synthetic(seed=1, share=0.1, **SMALL)
+    share = Synthetic(seed=1, frame_fraction=0.1, **SMALL)
     assert len(share) == 24
     indices = [share[k].index for k in (0, 9, 23)]
     assert indices == sorted(indices)
@@ -177,11 +177,11 @@ def test_scene_truth_lies_on_the_exact_surface(exact):
         ({"noise": -0.5}, "dataset.noise"),
         ({"noise": float("nan")}, "dataset.noise"),
         ({"max_depth": 0.0}, "dataset.max_depth"),
-        ({"truth_voxel": -1.0}, "dataset.truth_voxel"),
+        ({"ground_truth_spacing": -1.0}, "dataset.ground_truth_spacing"),
         ({"seed": -1}, "seed"),
         ({"start": 240}, "dataset.start"),
         ({"stride": 0}, "dataset.stride"),
-        ({"share": 0.0}, "dataset.share"),
+        ({"share": 0.0}, "dataset.frame_fraction"),
     ],
 )
 def test_parameters_are_checked_before_any_work(values, name):

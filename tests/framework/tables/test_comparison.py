@@ -12,17 +12,29 @@ from framework.tables.comparison import TableChoice
     ("node", "said"),
     [
         ({"columns": []}, "table.columns must name at least one key"),
-        ({"over": [], "columns": ["fps"]}, "table.over must name at least one key"),
+        ({"average_over": [], "columns": ["fps"]}, "table.average_over must name at least one key"),
         (
-            {"across": "dataset.scene", "by": "dataset.scene", "columns": ["fps"]},
-            "two layouts: one of them must be null",
+            {"columns_by": "dataset.scene", "group_by": "dataset.scene", "columns": ["fps"]},
+            "columns_by=dataset.scene, table.group_by=dataset.scene",
         ),
-        ({"across": "seed", "columns": ["fps"]}, "table.over has seed, whose values table.across shows one by one"),
-        ({"by": "seed", "columns": ["fps"]}, "table.over has seed, whose values table.by shows one by one"),
-        ({"across": "dataset.scene", "columns": ["fps", "frames"]}, "must name one figure, .* found 2; table.by="),
+        (
+            {"columns_by": "seed", "columns": ["fps"]},
+            "table.average_over: .*table.columns_by, got seed",
+        ),
+        (
+            {"group_by": "seed", "columns": ["fps"]},
+            "table.average_over: .*table.group_by, got seed",
+        ),
+        (
+            {"columns_by": "dataset.scene", "columns": ["fps", "frames"]},
+            "must name one figure, .* found 2; table.group_by=",
+        ),
         ({"published": "table4", "columns": ["fps"]}, "table.published must be null or one of table1, table2, table3"),
-        ({"published": "table3", "columns": ["fps"]}, "a table with another layout: across, found rows"),
-        ({"published": "table1", "by": "dataset.scene", "columns": ["fps"]}, "another layout: rows, found by"),
+        ({"published": "table3", "columns": ["fps"]}, "a table with another layout: columns_by, found rows"),
+        (
+            {"published": "table1", "group_by": "dataset.scene", "columns": ["fps"]},
+            "another layout: rows, found group_by",
+        ),
         ({"names": ["ours"], "columns": ["fps"]}, "table: "),
         ({"colums": ["fps"]}, "colums"),
         ({"columns": "fps"}, "table: "),

@@ -19,7 +19,7 @@ from framework.tables.experiment_tables import write_tables
 from framework.tables.layouts import head
 
 CHECKOUT = Path(__file__).resolve().parents[3]
-TABLE = {"over": ["seed"], "base": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
+TABLE = {"average_over": ["seed"], "baseline": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
 ROWS = {"identity": ["refiner=identity"], "chain": [], "none_yet": ["refiner=none_yet"]}
 
 
@@ -78,7 +78,7 @@ def test_every_figure_by_hand(sweep: Path) -> None:
 
 def test_seeds_of_a_scene_are_no_independent_evidence(tmp_path: Path) -> None:
     """By scene the differences are 0.3 and 0.1: mean 0.2, error 0.1, whatever the number of seeds."""
-    table = {"over": ["seed", "scene"], "columns": ["instances.ap50"]}
+    table = {"average_over": ["seed", "scene"], "columns": ["instances.ap50"]}
     rows = {"chain": [], "other": ["refiner=other"]}
     (tmp_path / "multirun.yaml").write_text(OmegaConf.to_yaml({"table": table, "rows": rows}))
     for row, scene, ap in (("chain", "a", 0.5), ("chain", "b", 0.5), ("other", "a", 0.8), ("other", "b", 0.6)):
@@ -151,7 +151,7 @@ def test_no_differences_without_the_base(sweep: Path) -> None:
         path.unlink()
     text = write_tables(sweep)
     assert "less chain" not in text
-    assert "- No differences: chain is no row with a complete run; table.base=ROW names another." in text
+    assert "- No differences: chain is no row with a complete run; table.baseline=ROW names another." in text
     assert text.count("| identity ") == 1
 
 
@@ -163,7 +163,11 @@ def test_rows_go_by_the_names_that_they_are_given(sweep: Path) -> None:
     assert "| less all of it |" in text
 
 
-RUN_TIMES = {"over": ["seed"], "columns": ["fps", "stage_ms.refine.median", "frames_lost"], "published": "table1"}
+RUN_TIMES = {
+    "average_over": ["seed"],
+    "columns": ["fps", "stage_ms.refine.median", "frames_lost"],
+    "published": "table1",
+}
 
 
 def of_dataset(sweep: Path, dataset: str, annotation: str | None = None, only: str = "") -> None:

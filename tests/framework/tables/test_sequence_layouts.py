@@ -16,8 +16,13 @@ from framework.tables.experiment_tables import write_tables
 AP50 = "instances.ap50"
 ROWS = {"ours": [], "rival": ["refiner=geometric"], "other": ["refiner=identity"]}
 NAMES = {"rival": "Rival (re-implementation)"}
-ACROSS = {"over": ["seed"], "across": "dataset.scene", "columns": [AP50], "names": NAMES}
-BY = {"over": ["seed"], "by": "dataset.scene", "names": NAMES, "columns": [f"{AP50}.couch", f"{AP50}.tv", AP50]}
+ACROSS = {"average_over": ["seed"], "columns_by": "dataset.scene", "columns": [AP50], "names": NAMES}
+BY = {
+    "average_over": ["seed"],
+    "group_by": "dataset.scene",
+    "names": NAMES,
+    "columns": [f"{AP50}.couch", f"{AP50}.tv", AP50],
+}
 FIGURES = {  # by row and scene: AP50 of seeds 0 and 1
     ("ours", "011"): (0.6, 0.8),
     ("ours", "016"): (0.5, 0.3),

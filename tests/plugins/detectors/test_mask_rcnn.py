@@ -165,7 +165,9 @@ def test_no_proposals_are_no_detections(detector, monkeypatch):
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA here: half precision is not compared")
 def test_half_precision_finds_the_same(path):
     frame = noise(9)
-    half, single = (MaskRCNNDetector(weights=path, device="cuda", half=half).detect(frame) for half in (True, False))
+    half, single = (
+        MaskRCNNDetector(weights=path, device="cuda", half_precision=half).detect(frame) for half in (True, False)
+    )
     assert len(half) == pytest.approx(len(single), rel=0.2)
     np.testing.assert_allclose(half.scores[:5], single.scores[:5], atol=0.02)
 

@@ -103,7 +103,7 @@ def suppressed(folder, **parameters):
 def test_one_class_a_detection_leaves_the_rest_to_the_others(tmp_path, spread, expected, caplog):
     """A score of 0.4 is less than the even share of two classes, with spread 1."""
     with caplog.at_level("INFO"):
-        found = suppressed(tmp_path, spread=spread).detect(frame())
+        found = suppressed(tmp_path, class_spread=spread).detect(frame())
     assert "n.onnx gives one class a detection" in caplog.text
     whole = tiny(tmp_path).detect(frame())
     np.testing.assert_array_equal(found.masks, whole.masks)
@@ -142,14 +142,14 @@ def test_a_network_of_another_form_is_refused_when_the_detector_is_built(tmp_pat
 @pytest.mark.parametrize(
     "parameters",
     [
-        {"spread": 1.1},
+        {"class_spread": 1.1},
         {"score_threshold": 0.0},
         {"nms": 1.1},
         {"agnostic_nms": 0.0},
         {"max_detections": 0},
         {"mask_threshold": 1.0},
         {"padding": -1},
-        {"white": float("inf")},
+        {"white_level": float("inf")},
         {"device": "tpu"},
     ],
 )

@@ -71,7 +71,7 @@ class Filling:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_boxes_are_where_the_network_says(owlv2: Path, shape: tuple[int, int]) -> None:
-    boxes = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half=False)
+    boxes = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)
     wanted = [[4.5, 9.5, 24.5, 39.5], [30, 2, 55, 58]]
     boxes._network = Saying(shape, wanted, [[0.8, 0.1], [0.3, 0.6]])
     found, probabilities = boxes(picture(shape).color)
@@ -80,7 +80,7 @@ def test_boxes_are_where_the_network_says(owlv2: Path, shape: tuple[int, int]) -
 
 
 def test_the_image_lies_in_the_upper_left_of_a_gray_square(owlv2: Path) -> None:
-    boxes = WordBoxes(str(owlv2), "main", ("bed",), CPU, half=False)
+    boxes = WordBoxes(str(owlv2), "main", ("bed",), CPU, half_precision=False)
     seen: list[torch.Tensor] = []
     saying = Saying((32, 64), [[0, 0, 9, 9]], [[0.5]])
     boxes._network = lambda **given: seen.append(given["pixel_values"]) or saying(**given)
@@ -93,7 +93,7 @@ def test_boxes_are_those_of_transformers(owlv2: Path) -> None:
     from transformers import AutoTokenizer, Owlv2ForObjectDetection
 
     color = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3)).astype(np.uint8)
-    found, probabilities = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half=False)(color)
+    found, probabilities = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)(color)
     mean, std = np.array((0.48145466, 0.4578275, 0.40821073)), np.array((0.26862954, 0.26130258, 0.27577711))
     texts = ["a photo of a red chair", "a photo of a bed"]
     tokens = AutoTokenizer.from_pretrained(owlv2)(texts, padding="max_length", max_length=16, return_tensors="pt")
@@ -110,7 +110,7 @@ def test_boxes_are_those_of_transformers(owlv2: Path) -> None:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_masks_are_where_the_boxes_are(sam: Path, shape: tuple[int, int]) -> None:
-    masks = BoxPromptedMasks(str(sam), "main", CPU, half=False)
+    masks = BoxPromptedMasks(str(sam), "main", CPU, half_precision=False)
     frame = picture(shape)
     random = masks(frame.color, np.float32([[5, 5, 30, 30]]))
     assert random.shape == (1, *shape)
@@ -192,6 +192,6 @@ def test_a_tokenizer_of_two_files_is_read_as_owlv2_has_it(tmp_path: Path) -> Non
     (tmp_path / "merges.txt").write_text("#version: 0.2\n")
     special = {"bos_token": "<|startoftext|>", "eos_token": words[end], "unk_token": words[end], "pad_token": "!"}
     (tmp_path / "tokenizer_config.json").write_text(json.dumps({"tokenizer_class": "CLIPTokenizer", **special}))
-    tokens = WordBoxes(str(tmp_path), "main", ["cup"], CPU, half=False)._tokens["input_ids"][0]
+    tokens = WordBoxes(str(tmp_path), "main", ["cup"], CPU, half_precision=False)._tokens["input_ids"][0]
     letters_of = [words[k] for k in tokens if k not in (0, end - 1, end)]
     assert "".join(letters_of).split("</w>") == ["a", "photo", "of", "a", "cup", ""]

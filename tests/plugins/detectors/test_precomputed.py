@@ -86,7 +86,7 @@ def test_a_label_and_a_score_become_a_distribution(tmp_path: Path) -> None:
 )
 def test_spread_says_how_much_the_others_get(tmp_path: Path, spread: float, score: float, own: float) -> None:
     """Never so much that the label is no longer the best."""
-    [row] = detected(tmp_path, entry(score=score), spread=spread).class_probabilities
+    [row] = detected(tmp_path, entry(score=score), class_spread=spread).class_probabilities
     assert row[CHAIR] == pytest.approx(own)
     np.testing.assert_allclose(np.delete(row, CHAIR), (1 - own) / 79, rtol=1e-5, atol=1e-9)
 
@@ -334,7 +334,7 @@ def test_ids_of_coco_need_cocos_labels(tmp_path: Path) -> None:
 
 
 def test_parameters_are_checked(tmp_path: Path) -> None:
-    for wrong in ({"spread": 1.5}, {"score_threshold": -0.1}):
+    for wrong in ({"class_spread": 1.5}, {"score_threshold": -0.1}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             Precomputed(write(tmp_path, entry()), **wrong)
 

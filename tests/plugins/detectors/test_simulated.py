@@ -291,7 +291,7 @@ def test_some_objects_are_missed_nearly_always_and_others_never():
 
 
 def test_ghosts_stay_at_their_places_of_the_world():
-    detector = replace(PERFECT, false_positives=1.0, ghost_share=1.0)
+    detector = replace(PERFECT, false_positives=1.0, recurring_fraction=1.0)
     wall = np.full((120, 160), 2.0, np.float32)
     places, classes = [], []
     for k in range(40):
@@ -311,11 +311,11 @@ def test_ghosts_stay_at_their_places_of_the_world():
 
 
 def test_without_poses_false_detections_are_anywhere():
-    detector = replace(PERFECT, false_positives=1.0, ghost_share=1.0)
+    detector = replace(PERFECT, false_positives=1.0, recurring_fraction=1.0)
     empty = [replace(frame(k), truth=FrameTruth(np.zeros_like(IDS), {})) for k in range(5)]
     found = [detector.detect(one) for one in empty]
     assert sum(map(len, found)) > 0
-    anywhere = replace(detector, ghost_share=0.0)
+    anywhere = replace(detector, recurring_fraction=0.0)
     assert all(same(a, anywhere.detect(one)) for a, one in zip(found, empty, strict=True))
 
 
@@ -373,7 +373,7 @@ def test_no_truth_is_an_error_and_no_objects_are_none():
         {"attach_rate": -0.1},
         {"miss_spread": -1.0},
         {"score_scale": 0.0},
-        {"ghost_share": 2.0},
+        {"recurring_fraction": 2.0},
     ],
 )
 def test_a_wrong_parameter_is_named(parameters):

@@ -57,7 +57,7 @@ def picture(index: int = 0) -> Frame:
 def test_pictures_and_words_are_embedded_as_transformers_does_it(folder: Path) -> None:
     from transformers import AutoModel, AutoTokenizer
 
-    model = ImageTextModel(str(folder), "main", "cpu", half=False)
+    model = ImageTextModel(str(folder), "main", "cpu", half_precision=False)
     crops = np.random.default_rng(0).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
     network = AutoModel.from_pretrained(folder).eval()
     is_clip = network.config.model_type == "clip"
@@ -85,7 +85,7 @@ def test_what_is_good_and_large_enough_is_embedded(siglip: Path) -> None:
     assert np.linalg.norm(found.embeddings, axis=1) == pytest.approx([1, 0, 0])
     plain = Blocks().detect(frame)
     np.testing.assert_array_equal(found.masks, plain.masks)
-    everything = WithEmbeddings(Blocks(), str(siglip), min_pixels=1, min_score=0.0, batch=2, device="cpu")
+    everything = WithEmbeddings(Blocks(), str(siglip), min_pixels=1, min_score=0.0, batch_size=2, device="cpu")
     lengths = np.linalg.norm(everything.detect(frame).embeddings, axis=1)
     assert lengths == pytest.approx([1, 1, 1])
     np.testing.assert_allclose(everything.detect(frame).embeddings[0], found.embeddings[0], atol=1e-5)
@@ -94,7 +94,7 @@ def test_what_is_good_and_large_enough_is_embedded(siglip: Path) -> None:
 
 
 def test_only_every_kth_frame_is_embedded(siglip: Path) -> None:
-    detector = WithEmbeddings(Blocks(), str(siglip), every=3, device="cpu")
+    detector = WithEmbeddings(Blocks(), str(siglip), frame_interval=3, device="cpu")
     assert [detector.detect(picture(k)).embeddings is not None for k in range(7)] == [True, False, False] * 2 + [True]
     assert "index" in detector.reads
 
@@ -105,7 +105,7 @@ def test_what_is_around_an_object_is_faded(siglip: Path) -> None:
     inside = Blocks().detect(plain).masks[0]
     other.color[~inside] = 255 - other.color[~inside]
     for surroundings, same in ((0.0, True), (1.0, False)):
-        detector = WithEmbeddings(Blocks(), str(siglip), surroundings=surroundings, device="cpu")
+        detector = WithEmbeddings(Blocks(), str(siglip), background_contrast=surroundings, device="cpu")
         a, b = (detector.detect(frame).embeddings[0] for frame in (plain, other))
         assert np.allclose(a, b, atol=1e-5) == same
     other.color[inside] = 255 - other.color[inside]
@@ -144,7 +144,7 @@ def test_it_is_told_apart_by_the_inner_detector_and_the_model(siglip: Path, tmp_
 
 
 def test_a_nested_detector_is_chosen_by_name_and_its_faults_say_where(siglip: Path) -> None:
-    chosen = "detector@detector.of=ground_truth"
+    chosen = "detector@detector.detector=ground_truth"
     detector = registered.built("detector", "with_embeddings", chosen, f"detector.model={siglip}", "device=cpu")
     found = detector.detect(CornerRoom()[0])
     assert found.exact
@@ -153,9 +153,9 @@ def test_a_nested_detector_is_chosen_by_name_and_its_faults_say_where(siglip: Pa
     with pytest.raises(
         ConfigError, match=r"detector plugins\.detectors\.with_embeddings\.WithEmbeddings: of: .*min_pixels"
     ):
-        registered.built("detector", "with_embeddings", chosen, "detector.of.min_pixels=0")
+        registered.built("detector", "with_embeddings", chosen, "detector.detector.min_pixels=0")
     with pytest.raises(ConfigError, match="of must be given"):
-        registered.built("detector", "with_embeddings", "~detector.of")
+        registered.built("detector", "with_embeddings", "~detector.detector")
 
 
 @pytest.mark.parametrize(

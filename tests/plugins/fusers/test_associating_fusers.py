@@ -57,8 +57,8 @@ def test_a_weak_detection_updates_but_does_not_create(new_fuser: NewFuser, frame
     [
         ({}, True),
         ({"overlap_rule": OverlapRule.IOU}, False),  # a part shares little of all that is covered
-        ({"class_gate": 0.9}, True),
-        ({"class_gate": 1.0}, False),  # the floor alone keeps distributions from agreeing wholly
+        ({"min_class_agreement": 0.9}, True),
+        ({"min_class_agreement": 1.0}, False),  # the floor alone keeps distributions from agreeing wholly
     ],
 )
 def test_what_must_overlap_and_agree_is_a_parameter(
@@ -134,7 +134,9 @@ def test_a_book_that_is_rarely_found_alone_stays_on_its_table(
     merge_agreement: float, agrees: bool, merged: bool, frames: list[Frame]
 ) -> None:
     """The table's mask covers it in every frame; a part of the table in its place would be merged."""
-    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, merge_agreement=merge_agreement, on_top=0.0)
+    fuser = assemble(
+        BayesianTsdf, voxel_size=0.02, max_depth=4.0, merge_agreement=merge_agreement, occlusion_area_ratio=0.0
+    )
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
     book = whole & (np.arange(CAMERA.width) < u[0] + (u[-1] - u[0]) // 3)
@@ -235,8 +237,8 @@ def test_the_least_area_of_an_instance_does_not_depend_on_the_voxels(new_fuser: 
         {"voxel_size": 0.0},
         {"max_depth": 0.1},
         {"label_band": 9.0},
-        {"overlap": 1.5},
-        {"class_gate": -0.1},
+        {"min_overlap": 1.5},
+        {"min_class_agreement": -0.1},
         {"merge_frames": 0},
         {"merge_agreement": 1.1},
         {"min_confidence": float("nan")},
@@ -262,7 +264,14 @@ def test_a_keyboard_keeps_its_voxels_under_the_masks_of_its_desk(
     lying_on: float, same_class: bool, keeps: bool, frames: list[Frame]
 ) -> None:
     """Once it counts: the desk's mask covers it in frames that do not find it. A part of a desk is the desk's."""
-    fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0, lying_on=lying_on, on_top=0.0, merge_agreement=1.0)
+    fuser = assemble(
+        BayesianTsdf,
+        voxel_size=0.02,
+        max_depth=4.0,
+        support_overlap=lying_on,
+        occlusion_area_ratio=0.0,
+        merge_agreement=1.0,
+    )
     whole = masks_of(frames[0])[0]
     u = np.flatnonzero(whole.any(axis=0))
     keyboard = whole & (np.arange(CAMERA.width) < u[0] + (u[-1] - u[0]) // 3)

@@ -32,7 +32,12 @@ def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame]) -> None:
 
 
 def test_parameters_are_checked() -> None:
-    for wrong in ({"max_weight": 256.0}, {"class_floor": 0.0}, {"absence": float("nan")}, {"on_top": 1.5}):
+    for wrong in (
+        {"max_weight": 256.0},
+        {"class_floor": 0.0},
+        {"absence_likelihood": float("nan")},
+        {"occlusion_area_ratio": 1.5},
+    ):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             assemble(BayesianTsdf, **wrong)
 
@@ -66,7 +71,7 @@ def test_only_what_becomes_an_instance_takes_rows_of_evidence(frames: list[Frame
 @pytest.mark.parametrize(("on_top", "of_the_book"), [(0.25, True), (0.0, False)])
 def test_a_book_stays_on_a_couch_that_is_seen_better(frames: list[Frame], on_top: float, of_the_book: bool) -> None:
     """Half of the frames miss the book, and the couch's mask always covers it."""
-    fuser = new_fuser(on_top=on_top)
+    fuser = new_fuser(occlusion_area_ratio=on_top)
     couch = masks_of(frames[0])[0]
     v, u = np.nonzero(couch)
     rows, columns = np.ogrid[: couch.shape[0], : couch.shape[1]]

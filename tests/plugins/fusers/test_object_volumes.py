@@ -19,7 +19,7 @@ from tests.support.thread_counts import by_one_thread_and_two
 
 BOXES = BoxScene([[(-0.8, 0.2, 0.0, -0.2, 0.8, 0.6)], [(0.3, 0.2, 0.0, 0.9, 0.8, 0.6)]])
 VOXEL = 0.04  # m
-MASK_FUSION = {"overlap_rule": OverlapRule.CLUSTER, "overlap": 0.05, "same_class": True}
+MASK_FUSION = {"overlap_rule": OverlapRule.CLUSTER, "min_overlap": 0.05, "require_same_class": True}
 
 
 def new_fuser(**parameters: object) -> ObjectVolumes:
@@ -325,6 +325,6 @@ def test_a_pixel_out_of_the_image_and_other_classes_are_refused(frames: list[Fra
 
 
 def test_parameters_are_checked() -> None:
-    for wrong in ({"overlap": 1.5}, {"min_existence": -0.1}, {"create_points": 0}, {"label_band": 9.0}):
+    for wrong in ({"min_overlap": 1.5}, {"min_existence": -0.1}, {"create_points": 0}, {"label_band": 9.0}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             assemble(ObjectVolumes, **wrong)

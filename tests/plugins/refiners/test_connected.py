@@ -67,8 +67,8 @@ def test_a_slanted_surface_may_go_on_behind_an_occluder() -> None:
     x = (U - CAMERA.cx) / CAMERA.fx
     slanted = 2.0 / (1 - 0.8 * x)  # z = 2 + 0.8 x z
     pole = (U >= 20) & (U < 30)
-    assert (kept(Connected(gap=0.02), ~pole, np.where(pole, 0.7, slanted)) == ~pole).all()
-    assert not kept(Connected(gap=0.02, steepest=0.1), ~pole, np.where(pole, 0.7, slanted))[:, :20].any()
+    assert (kept(Connected(max_gap=0.02), ~pole, np.where(pole, 0.7, slanted)) == ~pole).all()
+    assert not kept(Connected(max_gap=0.02, max_depth_slope=0.1), ~pole, np.where(pole, 0.7, slanted))[:, :20].any()
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -81,7 +81,7 @@ def test_agrees_with_a_slow_reference(seed: int) -> None:
     depth = np.where(rng.random(depth.shape) < 0.1, 0.0, depth).astype(np.float32)
     frame = frame_of(depth, camera)
     mask = rng.random(depth.shape) < 0.7
-    refiner = Connected(gap=0.06, min_share=0.0 if seed % 2 else 0.2, steepest=1.0)
+    refiner = Connected(max_gap=0.06, min_piece_ratio=0.0 if seed % 2 else 0.2, max_depth_slope=1.0)
     after = refiner.refine(clusters_of([mask], frame), frame)
     assert set(map(tuple, after.pixels.tolist())) == _slowly(refiner, mask & (depth > 0), depth, camera)
 
@@ -95,9 +95,9 @@ def _slowly(refiner: Connected, mask: Bool, depth: Float32, camera: Camera) -> s
             piece, ahead = [start], deque([start])
             while ahead:
                 u, v = ahead.popleft()
-                for near in [(a, b) for a, b in left if max(abs(a - u), abs(b - v)) <= refiner.reach]:
+                for near in [(a, b) for a, b in left if max(abs(a - u), abs(b - v)) <= refiner.connection_radius]:
                     z, other = depth[v, u], depth[near[1], near[0]]
-                    if abs(z - other) < refiner.gap + refiner.gap_per_depth * min(z, other):
+                    if abs(z - other) < refiner.max_gap + refiner.gap_per_depth * min(z, other):
                         left.remove(near)
                         piece.append(near)
                         ahead.append(near)
@@ -105,14 +105,14 @@ def _slowly(refiner: Connected, mask: Bool, depth: Float32, camera: Camera) -> s
     largest = max(pieces, key=len)
     stays = sorted(largest, key=lambda p: (p[1], p[0]))
     for piece in sorted(pieces, key=len, reverse=True):
-        if piece is largest or len(piece) < refiner.min_share * len(largest):
+        if piece is largest or len(piece) < refiner.min_frame_fraction * len(largest):
             continue
         near = 0
         for u, v in piece:
             a, b = min(stays, key=lambda p: (p[0] - u) ** 2 + (p[1] - v) ** 2)
             z, other = depth[v, u], depth[b, a]
             aside = np.hypot(a - u, b - v) / camera.fx
-            allowed = refiner.gap + (refiner.gap_per_depth + refiner.steepest * aside) * min(z, other)
+            allowed = refiner.max_gap + (refiner.gap_per_depth + refiner.max_depth_slope * aside) * min(z, other)
             near += abs(z - other) <= allowed
         if 2 * near > len(piece):
             stays += sorted(piece, key=lambda p: (p[1], p[0]))

@@ -81,7 +81,7 @@ def test_without_whole_segments_it_only_shrinks():
     frame = frame_of(depth)
     mask = shifted(ids == 1, 0, 8)
     grown = image_of(Geometric().refine(lifted(mask[None], frame), frame), 0)
-    shrunk = image_of(Geometric(whole_segments=False).refine(lifted(mask[None], frame), frame), 0)
+    shrunk = image_of(Geometric(grow_to_segments=False).refine(lifted(mask[None], frame), frame), 0)
     np.testing.assert_array_equal(shrunk, grown & mask)
 
 
@@ -126,7 +126,7 @@ def test_nothing_is_added_where_the_pose_is_open():
     frame = frame_of(depth)
     mask = np.zeros((1, *CAMERA.shape), bool)
     mask[0, 40:80, 60] = True
-    refiner = Geometric(cell=1, min_segment=10, min_overlap=0.3)
+    refiner = Geometric(cell_size=1, min_segment=10, min_overlap=0.3)
     before = lifted(mask, frame)
     np.testing.assert_array_equal(refiner.refine(before, frame).pixels, before.pixels)
     mask[0, 40:80, 61] = True
@@ -160,7 +160,7 @@ def test_same_result_with_one_thread_and_with_two():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"cell": 0}, "Geometric.cell must be in"),
+        ({"cell_size": 0}, "Geometric.cell must be in"),
         ({"noise_factor": float("nan")}, "noise_factor .* found nan"),
         ({"max_angle": 90.0}, "Geometric.max_angle"),
         ({"min_overlap": 1.0}, "Geometric.min_overlap"),

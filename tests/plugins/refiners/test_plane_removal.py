@@ -68,13 +68,13 @@ def masks_of(clusters: PointClusters) -> np.ndarray:
 @pytest.mark.parametrize("pitch", [0.0, PITCH, 0.6])
 def test_a_box_on_the_floor_loses_the_floor_and_keeps_its_sides_down_to_the_distance(pitch):
     frame, ids = scene(BOX, pitch=pitch)
-    [left] = masks_of(PlaneRemoval(distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame))
+    [left] = masks_of(PlaneRemoval(plane_distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame))
     np.testing.assert_array_equal(left, (ids == 1) & (heights(frame, pitch) > 0.02))
 
 
 def test_the_next_refiner_learns_where_floor_and_walls_are():
     frame, ids = scene(BOX)
-    refined = PlaneRemoval(distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame)
+    refined = PlaneRemoval(plane_distance=0.02).refine(lifted(frame, bleeding(ids == 1)), frame)
     assert refined.structure is not None
     np.testing.assert_array_equal(refined.structure[ids == 1], heights(frame)[ids == 1] <= 0.02)
     assert refined.structure[ids == 0].mean() > 0.99
@@ -82,7 +82,7 @@ def test_the_next_refiner_learns_where_floor_and_walls_are():
 
 def test_the_noise_of_the_sensor_comes_on_top_of_the_distance():
     """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
-    frame, ids = scene(BOX, noise=0.002)
+    frame, ids = scene(BOX, inverse_depth_noise=0.002)
     bled = bleeding(ids == 1)
     [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
     assert left[bled & (ids == 0)].mean() < 0.01
@@ -113,7 +113,7 @@ def test_a_plane_stays_in_the_cluster_that_holds_most_of_it_and_leaves_the_other
     half = (ids == 1) & (np.cumsum(ids == 1).reshape(ids.shape) <= 0.49 * (ids == 1).sum())
     [left] = masks_of(PlaneRemoval(min_area=0.3).refine(lifted(frame, half), frame))
     assert not left.any()
-    [left] = masks_of(PlaneRemoval(min_area=0.3, max_own=0.4).refine(lifted(frame, half), frame))
+    [left] = masks_of(PlaneRemoval(min_area=0.3, max_cluster_fraction=0.4).refine(lifted(frame, half), frame))
     np.testing.assert_array_equal(left, half)
 
 
@@ -125,7 +125,7 @@ def test_a_cluster_holds_of_a_plane_what_it_holds_of_all_its_strips(share, stays
     frame = Frame(0, 0.0, np.zeros((*CAMERA.shape, 3), np.uint8), depth.astype(np.float32), CAMERA)
     mask = np.ones(CAMERA.shape, bool)
     mask[int(share * 240) :] = False
-    [left] = masks_of(PlaneRemoval(distance=0.02).refine(lifted(frame, mask), frame))
+    [left] = masks_of(PlaneRemoval(plane_distance=0.02).refine(lifted(frame, mask), frame))
     np.testing.assert_array_equal(left, mask & (post | stays))
 
 
@@ -133,9 +133,9 @@ def test_a_screen_before_a_wall_keeps_its_front_and_loses_the_wall():
     """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
-        frame, ids = scene(screen, pitch=0.0, noise=noise)
+        frame, ids = scene(screen, pitch=0.0, inverse_depth_noise=noise)
         bled = bleeding(ids == 1)
-        for refiner in (PlaneRemoval(), PlaneRemoval(min_area=0.2, min_share=0.01)):
+        for refiner in (PlaneRemoval(), PlaneRemoval(min_area=0.2, min_frame_fraction=0.01)):
             [left] = masks_of(refiner.refine(lifted(frame, bled), frame))
             assert left[ids == 1].mean() >= kept
             assert 1 - left[bled & (ids == 0)].mean() >= dropped
@@ -158,13 +158,15 @@ def test_floors_only():
     """With a tilt of 60 degrees the wall counts no longer, the floor does."""
     frame, ids = scene(BOX)
     mask = np.ones(CAMERA.shape, bool)
-    refiner = PlaneRemoval(distance=0.02, max_tilt=60.0, max_own=1.0 - 1e-9)
+    refiner = PlaneRemoval(plane_distance=0.02, max_tilt=60.0, max_cluster_fraction=1.0 - 1e-9)
     others = np.zeros_like(mask)
     others[:, :100] = True
     [left] = masks_of(refiner.refine(lifted(frame, others), frame))
     floor = np.abs(heights(frame)) <= 0.02
     np.testing.assert_array_equal(left, others & ~floor)
-    [left] = masks_of(PlaneRemoval(distance=0.02, max_own=1.0 - 1e-9).refine(lifted(frame, others), frame))
+    [left] = masks_of(
+        PlaneRemoval(plane_distance=0.02, max_cluster_fraction=1.0 - 1e-9).refine(lifted(frame, others), frame)
+    )
     assert left.sum() < 0.01 * others.sum()
     assert ids.any()
 
@@ -181,7 +183,7 @@ def test_a_small_plane_is_not_structure():
     """Of 0.5 m^2, or of a twentieth of the frame, when more is asked."""
     frame, ids = scene(BOX)
     clusters = lifted(frame, bleeding(ids == 1))
-    for strict in (PlaneRemoval(min_area=100.0), PlaneRemoval(min_share=0.9)):
+    for strict in (PlaneRemoval(min_area=100.0), PlaneRemoval(min_frame_fraction=0.9)):
         assert len(strict.refine(clusters, frame).pixels) == len(clusters.pixels)
 
 
@@ -198,9 +200,9 @@ def test_points_of_no_cluster_stay():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"distance": -0.1}, "PlaneRemoval.distance must be in"),
-        ({"max_own": 1.5}, r"PlaneRemoval.max_own must be in \[0, 1\], found 1.5"),
-        ({"noise": float("nan")}, "PlaneRemoval.noise"),
+        ({"plane_distance": -0.1}, "PlaneRemoval.distance must be in"),
+        ({"max_cluster_fraction": 1.5}, r"PlaneRemoval.max_own must be in \[0, 1\], found 1.5"),
+        ({"inverse_depth_noise": float("nan")}, "PlaneRemoval.noise"),
         ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),
     ],
 )

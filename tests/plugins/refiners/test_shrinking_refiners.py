@@ -178,10 +178,10 @@ def test_largest_component_keeps_the_larger_of_two_pieces():
     depth[:, 25:] = 1.2
     mask = np.ones((1, 20, 40), bool)
     frame = frame_of(depth, camera)
-    kept = LargestComponent(gap=0.03, gap_per_depth=0.02).refine(lifted(mask, frame), frame)
+    kept = LargestComponent(max_gap=0.03, gap_per_depth=0.02).refine(lifted(mask, frame), frame)
     assert set(kept.pixels[:, 0].tolist()) == set(range(25))
     assert len(kept.pixels) == 25 * 20
-    joined = LargestComponent(gap=0.03, gap_per_depth=0.2).refine(lifted(mask, frame), frame)
+    joined = LargestComponent(max_gap=0.03, gap_per_depth=0.2).refine(lifted(mask, frame), frame)
     assert len(joined.pixels) == 40 * 20
 
 
@@ -191,7 +191,7 @@ def test_largest_component_bridges_missing_readings(reach, kept):
     depth = np.full((1, 40), 1.0, np.float32)
     depth[0, 20] = 0
     frame = frame_of(depth, camera)
-    refined = LargestComponent(reach=reach).refine(lifted(np.ones((1, 1, 40), bool), frame), frame)
+    refined = LargestComponent(connection_radius=reach).refine(lifted(np.ones((1, 1, 40), bool), frame), frame)
     assert len(refined.pixels) == kept
 
 
@@ -205,7 +205,7 @@ def test_largest_component_is_that_of_scipy():
         mask = rng.random((48, 64)) < 0.42
         pieces, _ = label(mask, structure=np.ones((3, 3)))
         largest = pieces == 1 + np.bincount(pieces[mask] - 1).argmax()
-        refined = LargestComponent(reach=1).refine(lifted(mask[None], frame), frame)
+        refined = LargestComponent(connection_radius=1).refine(lifted(mask[None], frame), frame)
         found = np.zeros_like(mask)
         found[refined.pixels[:, 1], refined.pixels[:, 0]] = True
         np.testing.assert_array_equal(found, largest)
@@ -229,7 +229,7 @@ def test_largest_component_is_that_of_all_pairs(reach, density):
         near &= np.abs(z - z[:, None]) < 0.03 + 0.02 * np.minimum(z, z[:, None])
         _, piece = connected_components(near, directed=False)
         largest = np.bincount(piece).argmax()  # pieces are numbered in the order of their first points
-        refined = LargestComponent(reach=reach).refine(before, frame)
+        refined = LargestComponent(connection_radius=reach).refine(before, frame)
         np.testing.assert_array_equal(refined.pixels, before.pixels[piece == largest])
 
 
@@ -240,7 +240,7 @@ def test_largest_component_is_that_of_all_pairs(reach, density):
         (GmmEm, {"std_floor": float("nan")}, "std_floor .* found nan"),
         (GmmEm, {"min_posterior": 1.0}, "min_posterior"),
         (KMeans, {"background_centers": 0}, "KMeans.background_centers"),
-        (LargestComponent, {"reach": 0}, "LargestComponent.reach"),
+        (LargestComponent, {"connection_radius": 0}, "LargestComponent.reach"),
     ],
 )
 def test_parameters_are_checked(make, parameters, message):

@@ -62,14 +62,14 @@ def wall() -> list[Frame]:
 
 
 def test_colour_holds_on_to_a_flat_wall(wall: list[Frame]) -> None:
-    poses, _ = run(VoxelHashingIcp(finest=1.0), wall)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), wall)
     assert not any(p.lost for p in poses)
     assert drift(poses[-1], wall[-1]) < 0.01
 
 
 @pytest.mark.parametrize("min_information", [VoxelHashingIcp.min_information, 0.0], ids=["default", "unchecked"])
 def test_geometry_alone_slides_along_it_or_says_so(min_information: float, wall: list[Frame]) -> None:
-    poses, _ = run(VoxelHashingIcp(finest=1.0, color_weight=0.0, min_information=min_information), wall)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0, min_information=min_information), wall)
     assert any(p.lost for p in poses) or drift(poses[-1], wall[-1]) > 0.1
 
 
@@ -241,7 +241,7 @@ def test_a_blank_wall_that_fills_the_view_is_told(spheres: list[tuple[np.ndarray
     shown = [corner.frame(T, k) for k, T in enumerate([*there, *there[::-1]])]
     wall_only = [bool((corner.render(CAMERA, f.T_world_camera)[2] == 1).all()) for f in shown]
     assert sum(wall_only) >= 20
-    poses, scene = run(VoxelHashingIcp(finest=1.0), shown)
+    poses, scene = run(VoxelHashingIcp(finest_scale=1.0), shown)
     errors = drifts(poses, shown)
     assert all(p.lost for p, blank in zip(poses, wall_only, strict=True) if blank)
     assert np.nanmax(errors) < WRONG

@@ -43,7 +43,7 @@ def drift(pose: Pose, frame: Frame) -> tuple[float, float]:
 @pytest.mark.parametrize("color_weight", [0.0, 0.1])
 def test_a_known_motion_is_recovered(color_weight: float) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40))]
-    poses, _ = run(VoxelHashingIcp(finest=1.0, color_weight=color_weight), frames)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=color_weight), frames)
     assert not any(pose.lost for pose in poses)
     worst = max(drift(pose, frame) for pose, frame in zip(poses, frames, strict=True))
     assert worst[0] < 0.004, "a fifth of a voxel"
@@ -54,17 +54,17 @@ def test_colour_holds_what_geometry_does_not() -> None:
     """Facing one textured wall, geometry alone cannot see sideways motion; with colour it is seen."""
     wall = Scene(planes=[(np.array([0.0, 0.0, -1.0]), -1.5)], contrast=1.0)
     frames = [wall.frame(T, k) for k, T in enumerate(walk(20))]
-    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.01
-    alone, _ = run(VoxelHashingIcp(finest=1.0, color_weight=0.0), frames)
+    alone, _ = run(VoxelHashingIcp(finest_scale=1.0, color_weight=0.0), frames)
     assert any(pose.lost for pose in alone), "and alone it says that the motion is not determined"
 
 
 def test_lost_frames_are_told_and_tracking_resumes() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(30))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[10:14]]
-    poses, _ = run(VoxelHashingIcp(finest=1.0), frames[:10] + covered + frames[14:])
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames[:10] + covered + frames[14:])
     assert [pose.lost for pose in poses] == [False] * 10 + [True] * 4 + [False] * 16
     assert "no depth" in poses[10].reason
     assert drift(poses[-1], frames[-1])[0] < 0.006
@@ -75,9 +75,9 @@ def test_a_jump_is_found_by_keyframes_or_lost_and_not_integrated() -> None:
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
     frames.append(room().frame(away, 20))
-    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[-1].lost or drift(poses[-1], frames[-1])[0] < 0.03
-    poses, scene = run(VoxelHashingIcp(finest=1.0, relocalize=False), frames)
+    poses, scene = run(VoxelHashingIcp(finest_scale=1.0, relocalize=False), frames)
     assert poses[-1].lost
     assert np.array_equal(poses[-1].T_world_camera, poses[-2].T_world_camera)
     assert np.median(room().distance(scene.mesh().vertices.astype(float))) < 0.004
@@ -135,14 +135,14 @@ def test_garbage_is_lost() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(5))]
     rng = np.random.default_rng(0)
     garbage = dataclasses.replace(frames[-1], depth=rng.uniform(0.5, 4, frames[-1].depth.shape).astype(np.float32))
-    poses, _ = run(VoxelHashingIcp(finest=1.0), [*frames[:4], garbage])
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), [*frames[:4], garbage])
     assert poses[-1].lost
 
 
 def test_a_video_that_begins_covered_is_tracked_from_its_first_reading() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     covered = [dataclasses.replace(f, depth=np.zeros_like(f.depth)) for f in frames[:3]]
-    poses, _ = run(VoxelHashingIcp(finest=1.0), covered + frames[3:])
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), covered + frames[3:])
     assert [pose.lost for pose in poses] == [True] * 3 + [False] * 5
     assert drift(poses[-1], frames[-1])[0] < 0.004
 
@@ -152,7 +152,7 @@ def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
     camera = Camera(*size, 131.0, 131.0, 80.0, 60.5)
     frames = [room().frame(T, k, camera) for k, T in enumerate(walk(10))]
     for finest in (1.0, 0.5):
-        poses, _ = run(VoxelHashingIcp(finest=finest), frames)
+        poses, _ = run(VoxelHashingIcp(finest_scale=finest), frames)
         assert not any(pose.lost for pose in poses)
         assert drift(poses[-1], frames[-1])[0] < 0.006
 
@@ -160,12 +160,12 @@ def test_images_of_odd_sizes_are_tracked(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("finest", [0.3, 0.75, 2.0])
 def test_the_finest_resolution_is_a_power_of_a_half(finest: float) -> None:
     with pytest.raises(ConfigError, match=r"VoxelHashingIcp\.finest"):
-        VoxelHashingIcp(finest=finest)
+        VoxelHashingIcp(finest_scale=finest)
 
 
 def test_the_map_is_seen_from_where_a_steady_motion_leads(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(6))]
-    tracker = VoxelHashingIcp(finest=1.0)
+    tracker = VoxelHashingIcp(finest_scale=1.0)
     poses, scene = run(tracker, frames[:5])
     seen_from = []
     render = scene.render_near
@@ -178,8 +178,8 @@ def test_the_map_is_seen_from_where_a_steady_motion_leads(monkeypatch: pytest.Mo
 @pytest.mark.parametrize("bound", [{"max_step": 0.002}, {"max_turn": 0.001}])
 def test_a_step_beyond_what_is_plausible_is_lost(bound: dict[str, float]) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(2)[:1] + walk(60)[4:5])]
-    assert not any(pose.lost for pose in run(VoxelHashingIcp(finest=1.0), frames)[0])
-    poses, _ = run(VoxelHashingIcp(finest=1.0, **bound), frames)
+    assert not any(pose.lost for pose in run(VoxelHashingIcp(finest_scale=1.0), frames)[0])
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0, **bound), frames)
     assert poses[1].lost
     assert "not plausible" in poses[1].reason
     assert np.array_equal(poses[1].T_world_camera, poses[0].T_world_camera)
@@ -195,7 +195,7 @@ def spoilt_beginnings() -> dict[str, np.ndarray]:
 def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(8))]
     frames[0] = dataclasses.replace(frames[0], depth=spoilt_beginnings()[name])
-    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert poses[0].lost
     assert poses[0].reason
     assert not any(pose.lost for pose in poses[1:])
@@ -204,7 +204,7 @@ def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str)
 
 def test_poses_are_not_copied_from_the_truth_while_nothing_can_be_mapped() -> None:
     far = [dataclasses.replace(f, depth=100 * f.depth) for f in (room().frame(T, k) for k, T in enumerate(walk(4)))]
-    poses, scene = run(VoxelHashingIcp(finest=1.0), far)
+    poses, scene = run(VoxelHashingIcp(finest_scale=1.0), far)
     assert scene.voxel_count == 0
     assert all(pose.lost for pose in poses)
     assert poses[-1].reason == "0.0% of the pixels have a depth that is mapped, 0.2 to 4 m"
@@ -215,7 +215,7 @@ def test_a_thing_taken_away_leaves_no_ghost_that_tracking_is_lost_by() -> None:
     planes = room().planes
     with_ball, without = (Scene(planes, spheres, contrast=0.0) for spheres in ([(np.array([0, 0.1, 1.3]), 0.2)], []))
     frames = [(with_ball if k < 10 else without).frame(T, k) for k, T in enumerate(walk(30)[:16])]
-    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
     assert drift(poses[-1], frames[-1])[0] < 0.006
 
@@ -224,7 +224,7 @@ def test_the_motion_of_a_jump_is_not_expected_to_go_on() -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(20))]
     away = walk(1)[0].copy()
     away[:3, 3] += (0.0, 0.0, -1.2)
-    tracker = VoxelHashingIcp(finest=1.0)
+    tracker = VoxelHashingIcp(finest_scale=1.0)
     poses, _ = run(tracker, [*frames, room().frame(away, 20)])
     assert not poses[-1].lost
     assert np.array_equal(tracker._T_last_next, np.eye(4))
@@ -234,10 +234,16 @@ def test_images_too_small_for_the_levels_are_refused_in_one_line() -> None:
     camera = Camera(30, 23, 25.0, 25.0, 14.5, 11.0)
     frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
     with pytest.raises(DataError, match=r"30x23 px are too small for tracker\.finest=0\.5"):
-        VoxelHashingIcp(finest=0.5).track(frame, BayesianTsdf().scene)
+        VoxelHashingIcp(finest_scale=0.5).track(frame, BayesianTsdf().scene)
 
 
-ONE_STEP = {"finest": 1.0, "relocalize": False, "iterations_coarse": 0, "iterations_middle": 0, "iterations_fine": 1}
+ONE_STEP = {
+    "finest_scale": 1.0,
+    "relocalize": False,
+    "iterations_coarse": 0,
+    "iterations_middle": 0,
+    "iterations_fine": 1,
+}
 
 
 def test_a_pose_is_trusted_for_where_the_last_step_has_led() -> None:
@@ -273,7 +279,7 @@ def test_less_is_enough_where_the_prediction_leads_once_it_has_been_right_for_a_
     """A camera that moves 1 cm a frame, of whose points never more than 85 % agree with the map."""
     frames = [room().frame(walk(1)[0], k) for k in range(2 * STEADY + 6)]
     ends = iter(moved(0.01 * k) for k in range(1, len(frames)))
-    tracker = VoxelHashingIcp(finest=1.0, relocalize=False)
+    tracker = VoxelHashingIcp(finest_scale=1.0, relocalize=False)
     fuser = assemble(BayesianTsdf, voxel_size=0.02)
     fuser.fuse(frames[0], tracker.track(dataclasses.replace(frames[0], T_world_camera=None), fuser.scene), NOTHING)
     perfect = [True] * STEADY + [False] * (len(frames) - STEADY - 1)
@@ -292,7 +298,7 @@ def test_less_is_enough_where_the_prediction_leads_once_it_has_been_right_for_a_
 
 def test_features_are_asked_until_the_prediction_has_been_right_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40)[: STEADY + 4])]
-    tracker, asked = VoxelHashingIcp(finest=1.0), []
+    tracker, asked = VoxelHashingIcp(finest_scale=1.0), []
     search = tracker._told_by_features
     monkeypatch.setattr(tracker, "_told_by_features", lambda seen: asked.append(seen.frame.index) or search(seen))
     poses, _ = run(tracker, frames)
@@ -303,7 +309,7 @@ def test_features_are_asked_until_the_prediction_has_been_right_for_a_while(monk
 def test_a_pose_that_features_contradict_is_not_trusted(monkeypatch: pytest.MonkeyPatch) -> None:
     """All points agree with the map, but features tell a place 30 cm away, from where alignment leads nowhere."""
     frames = [room().frame(walk(1)[0], k) for k in range(2)]
-    tracker = VoxelHashingIcp(finest=1.0)
+    tracker = VoxelHashingIcp(finest_scale=1.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     fuser.fuse(frames[0], tracker.track(frames[0], fuser.scene), NOTHING)
     elsewhere = AbsolutePose(walk(1)[0] @ moved(0.3), np.ones(50, np.bool_))
@@ -322,7 +328,7 @@ def test_without_relocalization_a_doubt_does_not_end_the_run(moving: bool) -> No
     for frame in hidden:
         frame.depth[:, :80] = rng.uniform(0.5, 4, (120, 80))
     last = frames[11:] if moving else [room().frame(T, 11 + k) for k, T in enumerate(there[7:])]
-    poses, _ = run(VoxelHashingIcp(finest=1.0, relocalize=False), [*frames[:7], *hidden, *last])
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0, relocalize=False), [*frames[:7], *hidden, *last])
     assert all(pose.lost for pose in poses[7:11])
     assert not any(pose.lost for pose in poses[11:])
     assert drift(poses[-1], last[-1])[0] < 0.006
@@ -345,10 +351,10 @@ def test_depth_in_coarse_steps_is_tracked_without_its_normals(monkeypatch: pytes
         return alignment
 
     monkeypatch.setattr(VoxelHashingIcp, "_align", recorded)
-    poses, _ = run(VoxelHashingIcp(finest=1.0), frames)
+    poses, _ = run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert not any(pose.lost for pose in poses)
     assert max(drift(pose, frame)[0] for pose, frame in zip(poses, frames, strict=True)) < 0.0392, "a step"
     without_normals, matched[:] = np.mean(matched), []
     monkeypatch.setattr(voxel_hashing_icp, "is_coarse", lambda *_, **__: False)
-    run(VoxelHashingIcp(finest=1.0), frames)
+    run(VoxelHashingIcp(finest_scale=1.0), frames)
     assert np.mean(matched) < 0.9 * without_normals, "normals of steps do not match those of the surface"

@@ -91,7 +91,7 @@ def entities(file: Path) -> set[str]:
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of six frames, of which 2 cannot be read and 4 is lost."""
     directory = tmp_path_factory.mktemp("run")
-    viewer = RerunViewer(every=1, stride=1, mesh_every=0.1, min_confidence=0.1)
+    viewer = RerunViewer(frame_interval=1, stride=1, mesh_interval=0.1, min_confidence=0.1)
     pipeline(viewer).run_to_any_end(CornerRoom(unreadable=2), directory)
     return directory / "recording.rrd"
 
@@ -166,7 +166,7 @@ def test_who_watches_changes_nothing(tmp_path: Path) -> None:
     """To the byte, with a viewer that looks at the map after every frame."""
     maps = {}
     for name in ("none", "rerun"):
-        viewer = build_viewer(name, "viewer.mesh_every=0.1") if name == "rerun" else build_viewer(name)
+        viewer = build_viewer(name, "viewer.mesh_interval=0.1") if name == "rerun" else build_viewer(name)
         (tmp_path / name).mkdir()
         result = pipeline(viewer).run_to_any_end(CornerRoom(frames=12), tmp_path / name)
         result.scene.save(tmp_path / name / "map.npz")
@@ -245,8 +245,8 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("parameter", "said"),
     [
-        ("every=0", r"every must be in \[1, 1e\+06\], found 0"),
-        ("mesh_every=nan", "mesh_every must be in"),
+        ("frame_interval=0", r"every must be in \[1, 1e\+06\], found 0"),
+        ("mesh_interval=nan", "mesh_every must be in"),
         ("memory_limit=lots", "memory_limit must be like 2GB or 25%, found lots"),
         ("mode=WINDOWS", "mode"),
         ("port=80", "port must be in"),

@@ -91,7 +91,7 @@ def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path)
 
 def test_a_column_is_a_sequence(tmp_path: Path) -> None:
     """Names with zeros in front stay names; what the table looks like is in no directory's name."""
-    done = start(tmp_path, "experiment=fake_scenes", "table.over=[seed]")
+    done = start(tmp_path, "experiment=fake_scenes", "table.average_over=[seed]")
     assert done.returncode == 0, done.stderr
     lines = [" ".join(line.split()) for line in done.stdout.splitlines()]
     assert "| system | poses | 011 | 078 | mean |" in lines
@@ -150,7 +150,7 @@ def test_the_row_is_what_its_overrides_say() -> None:
 def test_the_recorded_flat_wins_over_the_rooms() -> None:
     config, choices = composed(["experiment=ablation_fuser_replica", "row=label_count"])
     assert (choices["dataset"], choices["detector"], choices["fuser"]) == ("rgbd_folder", "maskrcnn2go", "label_count")
-    assert (config.dataset.share, config.dataset.stride, config.fuser.voxel_size) == (0.85, 1, 0.05)
+    assert (config.dataset.frame_fraction, config.dataset.stride, config.fuser.voxel_size) == (0.85, 1, 0.05)
     assert config.fuser.storage == "EXACT"
 
 
@@ -163,7 +163,7 @@ def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
         HydraConfig.instance().set_config(asked)
         assert asked.hydra.sweep.dir.endswith(f"/{experiment}_scenenn")
     assert asked.hydra.runtime.choices.detector == "mask_rcnn"
-    assert asked.dataset.frame_truth is False
+    assert asked.dataset.frame_ground_truth is False
     sequences = asked.hydra.sweeper.params["dataset.scene"].split(",")
     assert set(sequences) <= set(read_published("table3").sequences)
     assert len(sequences) == (5 if experiment in ("table1_runtime", "figure3_stage_times") else 10)
@@ -173,7 +173,7 @@ def test_one_word_measures_on_the_real_scenenn(experiment: str) -> None:
 def test_an_experiment_runs_in_the_rooms(experiment: str) -> None:
     with initialize_config_dir(str(CONF), version_base="1.3"):
         config = compose("config", overrides=[f"experiment={experiment}"], return_hydra_config=True)
-    assert (config.hydra.runtime.choices.detector, config.dataset.frame_truth) == ("simulated_yolo11n", True)
+    assert (config.hydra.runtime.choices.detector, config.dataset.frame_ground_truth) == ("simulated_yolo11n", True)
     assert config.sequences.all.split(",") == list(SCENES)
     assert not set(SCENES) & set(read_published("table3").sequences)
     assert set(config.hydra.sweeper.params["dataset.scene"].split(",")) <= set(config.sequences.all.split(","))
@@ -200,7 +200,11 @@ def test_variants_that_are_to_rank_alike_are_the_same_in_all_places() -> None:
         )
         HydraConfig.instance().set_config(asked)
         assert asked.hydra.sweep.dir.endswith("/ranks_scannet_rf_detr_seg")
-    assert (asked.dataset.share, asked.fuser.voxel_size, asked.hydra.sweeper.params.seed) == (0.85, 0.02, "0,1,2,3")
+    assert (asked.dataset.frame_fraction, asked.fuser.voxel_size, asked.hydra.sweeper.params.seed) == (
+        0.85,
+        0.02,
+        "0,1,2,3",
+    )
 
 
 def test_the_command_line_wins_over_the_experiment() -> None:
@@ -253,7 +257,7 @@ def test_what_an_experiment_compares_its_runs_for_changes_no_result() -> None:
         "rows": {"a": []},
         "sequences": {"all": "b"},
         "resume": True,
-        "table": {"over": ["seed"]},
+        "table": {"average_over": ["seed"]},
         "figure": {"zoom": True},
     }
     assert config_hash({"seed": 1}) == config_hash({"seed": 1} | told)

@@ -75,7 +75,7 @@ def test_a_run_that_is_killed_at_any_moment_loses_nothing(tmp_path: Path) -> Non
             assert {"trajectory.txt", "timings.csv", "instances.json", "mesh.ply", "map.npz"} <= there, told
             assert status == 128 + number or "metrics.json" in there, told
             assert not list(place.glob(".*.partial*")), told
-    assert end(begin(tmp_path, *arguments, "resume=true"))[0] == 0
+    assert end(begin(tmp_path, *arguments, "skip_completed=true"))[0] == 0
     assert end(begin(tmp_path, *SHORT, f"hydra.run.dir={undisturbed}"))[0] == 0
     assert whole_files(place) == whole_files(undisturbed)
     assert not list(place.glob(".*.partial*"))

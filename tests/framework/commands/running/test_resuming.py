@@ -44,7 +44,7 @@ def test_it_is_the_map_of_one_run_to_the_byte(tmp_path: Path, room: CornerRoom, 
     stages = (*GIVEN, f"fuser={fuser}")
     first, _ = mapped([room[k] for k in range(3)], *stages)
     before = put_away(first, tmp_path / "first")
-    continued, _ = mapped([room[k] for k in range(3, len(room))], *stages, f"map={before}")
+    continued, _ = mapped([room[k] for k in range(3, len(room))], *stages, f"resume_from={before}")
     whole, _ = mapped(room, *stages)
     continued.scene.save(tmp_path / "continued.npz")
     whole.scene.save(tmp_path / "whole.npz")
@@ -54,7 +54,7 @@ def test_it_is_the_map_of_one_run_to_the_byte(tmp_path: Path, room: CornerRoom, 
 def test_frames_of_another_recording_count_on(tmp_path: Path, room: CornerRoom) -> None:
     """Both number their frames from 0: an object that both show was seen in the frames of both."""
     first, _ = mapped(room, *GIVEN)
-    again, _ = mapped(room, *GIVEN, f"map={put_away(first, tmp_path / 'first')}")
+    again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
     for key, instance in first.instances().items():
         assert again.instances()[key].observations == 2 * instance.observations
         assert again.instances()[key].first_frame == instance.first_frame
@@ -72,7 +72,7 @@ def check_halves(tmp_path: Path, recording: Recording) -> None:
     first, in_first = mapped([recording[k] for k in range(half)], *TRACKED)
     put_away(first, tmp_path / "first")
     continued, in_second = mapped(
-        [recording[k] for k in range(half, len(recording))], *TRACKED, f"map={tmp_path / 'first'}"
+        [recording[k] for k in range(half, len(recording))], *TRACKED, f"resume_from={tmp_path / 'first'}"
     )
     assert not any(pose.lost for pose in [*poses, *in_first, *in_second])
     assert ate_mm(recording, [*in_first, *in_second]) < ate_mm(recording, poses) + 5
@@ -92,7 +92,7 @@ def test_a_recording_of_another_place_leaves_the_map_as_it_was(tmp_path: Path, s
     stages = (*TRACKED, f"tracker={tracker}")
     desk, _ = mapped([DESK[k] for k in range(0, 30, 2)], *stages)
     before = put_away(desk, tmp_path / "desk")
-    elsewhere, poses = mapped(RgbdFolder(shared_data / "redkitchen", stride=30), *stages, f"map={before}")
+    elsewhere, poses = mapped(RgbdFolder(shared_data / "redkitchen", stride=30), *stages, f"resume_from={before}")
     assert all(pose.lost for pose in poses)
     assert len(poses) == 10
     elsewhere.scene.save(tmp_path / "after.npz")
@@ -104,7 +104,7 @@ def test_a_lost_camera_enters_the_map_when_it_sees_what_is_there(tmp_path: Path)
     before = put_away(desk, tmp_path / "desk")
     black = replace(DESK[5], color=np.zeros_like(DESK[5].color))
     empty = replace(DESK[5], depth=np.zeros_like(DESK[5].depth))
-    _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"map={before}")
+    _, poses = mapped([black, empty, DESK[11], DESK[12]], *TRACKED, f"resume_from={before}")
     assert [pose.lost for pose in poses] == [True, True, False, False]
 
 
@@ -123,14 +123,14 @@ def test_what_cannot_go_on_says_so(tmp_path: Path, room: CornerRoom, overrides: 
     first, _ = mapped([room[0]], *GIVEN)
     before = put_away(first, tmp_path / "first")
     with pytest.raises(ConfigError, match=said):
-        Mapper(*GIVEN, *overrides, f"map={before}")
+        Mapper(*GIVEN, *overrides, f"resume_from={before}")
 
 
 def test_a_map_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"map: there is no .*map\.npz: expected the directory of a run"):
-        Mapper(*GIVEN, f"map={tmp_path}")
+        Mapper(*GIVEN, f"resume_from={tmp_path}")
     with pytest.raises(ConfigError, match="map must be a path"):
-        Mapper(*GIVEN, "map=7")
+        Mapper(*GIVEN, "resume_from=7")
 
 
 def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
@@ -167,7 +167,7 @@ def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> Non
 
 def test_a_map_with_views_of_two_recordings_is_stored_and_read(tmp_path: Path, room: CornerRoom) -> None:
     first, _ = mapped(room, *GIVEN)
-    again, _ = mapped(room, *GIVEN, f"map={put_away(first, tmp_path / 'first')}")
+    again, _ = mapped(room, *GIVEN, f"resume_from={put_away(first, tmp_path / 'first')}")
     again.scene.save(tmp_path / "again.npz")
     assert list(load_map(tmp_path / "again.npz").instances()) == list(again.instances())
 
@@ -176,7 +176,7 @@ def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
     """Without true poses: those of the second recording are of the first one's world all the same."""
     unposed = [replace(DESK[k], T_world_camera=None) for k in range(40)]
     first, poses = mapped(unposed[:25], *TRACKED)
-    own, in_its_world = mapped(unposed[20:], *TRACKED, f"world={put_away(first, tmp_path / 'first')}")
+    own, in_its_world = mapped(unposed[20:], *TRACKED, f"localize_in={put_away(first, tmp_path / 'first')}")
     assert not any(pose.lost for pose in in_its_world)
     for k in range(5):
         apart = inverse(poses[20 + k].T_world_camera) @ in_its_world[k].T_world_camera
@@ -185,6 +185,6 @@ def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
     alone, _ = mapped(unposed[20:], *TRACKED)
     assert own.scene.voxel_count == pytest.approx(alone.scene.voxel_count, rel=0.05)
     with pytest.raises(ConfigError, match="map and world exclude each other"):
-        Mapper(*TRACKED, f"world={tmp_path / 'first'}", f"map={tmp_path / 'first'}")
+        Mapper(*TRACKED, f"localize_in={tmp_path / 'first'}", f"resume_from={tmp_path / 'first'}")
     with pytest.raises(DataError, match="world: there is no"):
-        Mapper(*TRACKED, f"world={tmp_path}")
+        Mapper(*TRACKED, f"localize_in={tmp_path}")

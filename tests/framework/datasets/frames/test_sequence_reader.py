@@ -25,34 +25,34 @@ def test_a_start_behind_the_end_says_how_many_frames_there_are():
 
 
 def test_a_share_is_a_seeded_subset_in_order():
-    first = choose_frames(100, 10, 90, 2, share=0.85, seed=3)
+    first = choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=3)
     assert len(first) == 34  # of 40
     assert list(first) == sorted(set(first))
     assert set(first) < set(range(10, 90, 2))
-    assert first == choose_frames(100, 10, 90, 2, share=0.85, seed=3)
-    assert first != choose_frames(100, 10, 90, 2, share=0.85, seed=4)
+    assert first == choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=3)
+    assert first != choose_frames(100, 10, 90, 2, frame_fraction=0.85, seed=4)
     assert all(type(index) is int for index in first)  # frame numbers go into JSON
 
 
 def test_a_share_is_uniform():
     """Each of 20 frames is in half of the subsets of half of them: 500 +- 5 standard deviations of 1000."""
-    taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, share=0.5, seed=seed)]
+    taken = [index for seed in range(1000) for index in choose_frames(20, 0, -1, 1, frame_fraction=0.5, seed=seed)]
     counts = [taken.count(index) for index in range(20)]
     assert min(counts) > 420
     assert max(counts) < 580
 
 
 def test_the_whole_share_is_all_frames_and_the_least_is_one():
-    assert list(choose_frames(7, 1, -1, 2, share=1.0, seed=9)) == [1, 3, 5]
-    assert len(choose_frames(7, 0, -1, 1, share=1e-9)) == 1
+    assert list(choose_frames(7, 1, -1, 2, frame_fraction=1.0, seed=9)) == [1, 3, 5]
+    assert len(choose_frames(7, 0, -1, 1, frame_fraction=1e-9)) == 1
 
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.001, float("nan")])
 def test_an_impossible_share_names_its_parameter(share):
-    with pytest.raises(ConfigError, match=r"dataset.share must be in \(0, 1\]"):
+    with pytest.raises(ConfigError, match=r"dataset.frame_fraction must be in \(0, 1\]"):
         check_selection(0, -1, 1, share)
 
 
 def test_a_negative_seed_is_told():
     with pytest.raises(ConfigError, match="seed must be 0 or positive, found -1"):
-        choose_frames(7, 0, -1, 1, share=0.5, seed=-1)
+        choose_frames(7, 0, -1, 1, frame_fraction=0.5, seed=-1)

@@ -231,7 +231,9 @@ def test_a_folder_that_is_no_scan_says_what_is_missing(tmp_path: Path) -> None:
 def test_truth_is_the_labelled_mesh(tmp_path: Path, write: Writer) -> None:
     write(tmp_path / SCENE, shots())
     write_labels(tmp_path / SCENE)
-    sequence = opened("scannet", f"dataset.root={tmp_path}", f"dataset.scene={SCENE}", "dataset.frame_truth=true")
+    sequence = opened(
+        "scannet", f"dataset.root={tmp_path}", f"dataset.scene={SCENE}", "dataset.frame_ground_truth=true"
+    )
     assert sequence.annotation == "ScanNet v2"
     truth = sequence.scene_truth()
     assert truth is not None
@@ -286,8 +288,8 @@ def test_truth_without_all_of_its_files_is_none_and_said(tmp_path: Path, caplog:
     assert sequence.scene_truth() is None
     assert sequence.annotation == ""
     assert f"no true instances: {tmp_path}/{SCENE}/{SCENE}.aggregation.json is missing" in caplog.text
-    with pytest.raises(DataError, match=r"dataset\.frame_truth needs a labelled mesh"):
-        ScanNet(tmp_path, SCENE, frame_truth=True)
+    with pytest.raises(DataError, match=r"dataset\.frame_ground_truth needs a labelled mesh"):
+        ScanNet(tmp_path, SCENE, frame_ground_truth=True)
 
 
 # Damaged files

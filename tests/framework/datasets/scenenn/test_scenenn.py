@@ -125,7 +125,7 @@ def test_a_label_without_a_text_or_of_an_unknown_class_is_not_evaluated(root: Pa
 
 
 def test_true_masks_are_those_of_the_mesh_seen_from_the_true_pose(root: Path) -> None:
-    frame = SceneNN(root, "016", frame_truth=True)[1]
+    frame = SceneNN(root, "016", frame_ground_truth=True)[1]
     assert frame.truth is not None
     u = np.arange(CAMERA.width)
     x = (u - CAMERA.cx) / CAMERA.fx * WALL + 0.1  # in the world, on the wall
@@ -196,8 +196,8 @@ def test_without_a_labelled_mesh_there_is_no_truth(root: Path) -> None:
     sequence = SceneNN(root, "016")
     assert sequence.scene_truth() is None
     assert sequence.annotation == ""
-    with pytest.raises(DataError, match=r"frame_truth needs .*016\.ply and \.xml"):
-        SceneNN(root, "016", frame_truth=True)
+    with pytest.raises(DataError, match=r"frame_ground_truth needs .*016\.ply and \.xml"):
+        SceneNN(root, "016", frame_ground_truth=True)
 
 
 def test_a_mesh_without_labels_is_named(root: Path) -> None:

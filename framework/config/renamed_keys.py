@@ -1,0 +1,66 @@
+"""Config keys that were renamed before 0.1.0, for errors that name the new key."""
+
+from __future__ import annotations
+
+RENAMED = {
+    "ahead": "prefetch",
+    "map": "resume_from",
+    "resume": "skip_completed",
+    "world": "localize_in",
+    "dataset.frame_truth": "dataset.frame_ground_truth",
+    "dataset.max_difference": "dataset.max_time_difference",
+    "dataset.share": "dataset.frame_fraction",
+    "dataset.truth_voxel": "dataset.ground_truth_spacing",
+    "detector.batch": "detector.batch_size",
+    "detector.black": "detector.black_level",
+    "detector.every": "detector.frame_interval",
+    "detector.ghost_share": "detector.recurring_fraction",
+    "detector.half": "detector.half_precision",
+    "detector.of": "detector.detector",
+    "detector.significance": "detector.min_foreground_fraction",
+    "detector.spread": "detector.class_spread",
+    "detector.surroundings": "detector.background_contrast",
+    "detector.white": "detector.white_level",
+    "fuser.absence": "fuser.absence_likelihood",
+    "fuser.class_gate": "fuser.min_class_agreement",
+    "fuser.lying_on": "fuser.support_overlap",
+    "fuser.on_top": "fuser.occlusion_area_ratio",
+    "fuser.overlap": "fuser.min_overlap",
+    "fuser.same_class": "fuser.require_same_class",
+    "fuser.split": "fuser.split_instances",
+    "refiner.cell": "refiner.cell_size",
+    "refiner.closing": "refiner.closing_radius",
+    "refiner.distance": "refiner.plane_distance",
+    "refiner.gap": "refiner.max_gap",
+    "refiner.max_behind": "refiner.max_behind_ratio",
+    "refiner.max_own": "refiner.max_cluster_fraction",
+    "refiner.min_share": "refiner.min_frame_fraction (plane_removal) or refiner.min_piece_ratio (connected)",
+    "refiner.noise": "refiner.inverse_depth_noise",
+    "refiner.reach": "refiner.connection_radius",
+    "refiner.steepest": "refiner.max_depth_slope",
+    "refiner.whole_segments": "refiner.grow_to_segments",
+    "refiner.window": "refiner.window_radius",
+    "table.across": "table.columns_by",
+    "table.base": "table.baseline",
+    "table.by": "table.group_by",
+    "table.over": "table.average_over",
+    "tracker.candidates": "tracker.relocalization_candidates",
+    "tracker.finest": "tracker.finest_scale",
+    "tracker.max_behind": "tracker.max_occluded",
+    "viewer.every": "viewer.frame_interval",
+    "viewer.mesh_every": "viewer.mesh_interval",
+    "viewer.region": "viewer.region_size",
+}
+"""New name of each old key. Keys of a refiner in a chain (`refiner.links.NAME.KEY`) are listed as `refiner.KEY`."""
+
+
+def new_name(key: str) -> str | None:
+    """Return the new name of a dotted key, None if it was not renamed."""
+    parts = key.split(".")
+    return RENAMED.get(key) or (RENAMED.get(f"{parts[0]}.{parts[-1]}") if len(parts) > 2 else None)
+
+
+def rename_hint(key: str) -> str:
+    """Return the end of an error for an unknown key: its new name, or an empty string."""
+    found = new_name(key)
+    return f"{key} was renamed: set {found}" if found else ""
