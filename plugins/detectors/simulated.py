@@ -42,7 +42,7 @@ LARGEST_ATTACHED = 2.0  # times the object's size: larger things are not taken f
 GHOST_SIZES = (0.2, 1.2)  # m, sides of false detections at places of the room, drawn evenly on a logarithmic scale
 SHARES = (
     *("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate", "split_rate"),
-    *("confusion_consistency", "ghost_share"),
+    *("confusion_consistency", "recurring_fraction"),
 )
 
 

@@ -112,7 +112,7 @@ def test_the_defaults_of_a_training_and_of_a_table_stand_in_their_classes() -> N
 
 @pytest.mark.parametrize("name", registered.names("dataset", RGBDSequence))
 def test_every_recording_can_be_cut(name: str) -> None:
-    assert {"start", "stop", "stride", "share"} <= set(registered.composed("dataset", name).dataset)
+    assert {"start", "stop", "stride", "frame_fraction"} <= set(registered.composed("dataset", name).dataset)
 
 
 def test_the_main_config_reads_its_groups_in_the_order_that_lets_an_experiment_win() -> None:

@@ -57,7 +57,7 @@ class Recording(RGBDSequence):
     stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
     stride: int = 1  # take every stride-th frame
     frame_fraction: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
-    seed: int = 0  # of the share
+    seed: int = 0  # of the random selection
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
     pose_reading: PoseReading = field(default_factory=PoseReading)
     depth_reading: DepthReading = field(default_factory=DepthReading)
@@ -157,7 +157,7 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
     return [replace(recorded, timestamp=k / FRAME_RATE) for k, recorded in enumerate(frames)]
 
 
-def check_selection(start: int, stop: int, stride: int, share: float = 1.0) -> None:
+def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:
     """Raises ConfigError unless the parameters can choose frames at all."""
     if start < 0:
         raise ConfigError(f"dataset.start must be 0 or positive, found {start}")
@@ -167,24 +167,28 @@ def check_selection(start: int, stop: int, stride: int, share: float = 1.0) -> N
         )
     if stride < 1:
         raise ConfigError(f"dataset.stride must be at least 1, found {stride}")
-    if not 0 < share <= 1:  # NaN is neither
-        raise ConfigError(f"dataset.share must be in (0, 1], found {share}")
+    if not 0 < frame_fraction <= 1:  # NaN is neither
+        raise ConfigError(f"dataset.frame_fraction must be in (0, 1], found {frame_fraction}")
 
 
-def choose_frames(count: int, start: int, stop: int, stride: int, share: float = 1.0, seed: int = 0) -> Sequence[int]:
-    """The frame numbers chosen of `count` frames, ascending: as a Python slice chooses, and of those a random share.
+def choose_frames(
+    count: int, start: int, stop: int, stride: int, frame_fraction: float = 1.0, seed: int = 0
+) -> Sequence[int]:
+    """The frame numbers chosen of `count` frames, ascending: as a Python slice chooses, and of those a random fraction.
 
-    The same `seed` takes the same share, of at least one frame. Raises ConfigError when no frame is left.
+    The same `seed` selects the same frames, at least one. Raises ConfigError when no frame is left.
     """
-    check_selection(start, stop, stride, share)
+    check_selection(start, stop, stride, frame_fraction)
     if start >= count:
         raise ConfigError(f"dataset.start is {start}, but the sequence has only {count} frames (0 to {count - 1})")
     if seed < 0:
         raise ConfigError(f"seed must be 0 or positive, found {seed}")
     chosen = range(start, count if stop == TO_THE_END else min(stop, count), stride)
-    if share == 1:
+    if frame_fraction == 1:
         return chosen
-    kept = np.random.default_rng([seed, _STREAM]).permutation(len(chosen))[: max(1, round(share * len(chosen)))]
+    kept = np.random.default_rng([seed, _STREAM]).permutation(len(chosen))[
+        : max(1, round(frame_fraction * len(chosen)))
+    ]
     return tuple(chosen[k] for k in np.sort(kept).tolist())
 
 

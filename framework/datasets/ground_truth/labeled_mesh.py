@@ -70,7 +70,9 @@ class LabeledRecording(Recording):
     Truth is all of the mesh, whatever frames are chosen.
     """
 
-    frame_truth: bool = False  # whether frames have the true instances: the mesh is rendered for detectors that ask
+    frame_ground_truth: bool = (
+        False  # whether frames have the true instances: the mesh is rendered for detectors that ask
+    )
 
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None
@@ -78,7 +80,7 @@ class LabeledRecording(Recording):
 
     def truth_in(self, index: int) -> FrameTruth | None:
         T_world_camera = self.contents.frames[index].T_world_camera
-        if self.mesh is None or not self.frame_truth or T_world_camera is None:
+        if self.mesh is None or not self.frame_ground_truth or T_world_camera is None:
             return None
         return self.mesh.seen_by(self.camera, T_world_camera)
 

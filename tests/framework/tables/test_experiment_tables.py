@@ -306,7 +306,7 @@ def test_an_older_record_of_the_same_run_is_counted(sweep: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "said"),
-    [("table: [", "cannot be read"), ("table: {columns: [], over: [seed]}", "table.columns must name")],
+    [("table: [", "cannot be read"), ("table: {columns: [], average_over: [seed]}", "table.columns must name")],
 )
 def test_a_broken_experiment_is_one_line(sweep: Path, content: str, said: str) -> None:
     (sweep / "multirun.yaml").write_text(content)

@@ -105,7 +105,7 @@ def _slowly(refiner: Connected, mask: Bool, depth: Float32, camera: Camera) -> s
     largest = max(pieces, key=len)
     stays = sorted(largest, key=lambda p: (p[1], p[0]))
     for piece in sorted(pieces, key=len, reverse=True):
-        if piece is largest or len(piece) < refiner.min_frame_fraction * len(largest):
+        if piece is largest or len(piece) < refiner.min_piece_ratio * len(largest):
             continue
         near = 0
         for u, v in piece:

@@ -160,7 +160,7 @@ def test_same_result_with_one_thread_and_with_two():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"cell_size": 0}, "Geometric.cell must be in"),
+        ({"cell_size": 0}, "Geometric.cell_size must be in"),
         ({"noise_factor": float("nan")}, "noise_factor .* found nan"),
         ({"max_angle": 90.0}, "Geometric.max_angle"),
         ({"min_overlap": 1.0}, "Geometric.min_overlap"),

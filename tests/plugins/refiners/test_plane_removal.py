@@ -82,7 +82,7 @@ def test_the_next_refiner_learns_where_floor_and_walls_are():
 
 def test_the_noise_of_the_sensor_comes_on_top_of_the_distance():
     """A Kinect at 3 m: 99 % of the floor and the wall leave, and the box stays from 6 cm above the floor."""
-    frame, ids = scene(BOX, inverse_depth_noise=0.002)
+    frame, ids = scene(BOX, noise=0.002)
     bled = bleeding(ids == 1)
     [left] = masks_of(PlaneRemoval().refine(lifted(frame, bled), frame))
     assert left[bled & (ids == 0)].mean() < 0.01
@@ -133,7 +133,7 @@ def test_a_screen_before_a_wall_keeps_its_front_and_loses_the_wall():
     """8 cm before the wall, 1.2 m x 0.7 m, in Kinect noise; even with planes this small: the wall is behind it."""
     screen = (-0.6, -0.4, 3.85), (0.6, 0.3, 3.92)
     for noise, kept, dropped in ((0.0, 1.0, 1.0), (0.001, 0.99, 0.99)):
-        frame, ids = scene(screen, pitch=0.0, inverse_depth_noise=noise)
+        frame, ids = scene(screen, pitch=0.0, noise=noise)
         bled = bleeding(ids == 1)
         for refiner in (PlaneRemoval(), PlaneRemoval(min_area=0.2, min_frame_fraction=0.01)):
             [left] = masks_of(refiner.refine(lifted(frame, bled), frame))
@@ -200,9 +200,9 @@ def test_points_of_no_cluster_stay():
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"plane_distance": -0.1}, "PlaneRemoval.distance must be in"),
-        ({"max_cluster_fraction": 1.5}, r"PlaneRemoval.max_own must be in \[0, 1\], found 1.5"),
-        ({"inverse_depth_noise": float("nan")}, "PlaneRemoval.noise"),
+        ({"plane_distance": -0.1}, "PlaneRemoval.plane_distance must be in"),
+        ({"max_cluster_fraction": 1.5}, r"PlaneRemoval.max_cluster_fraction must be in \[0, 1\], found 1.5"),
+        ({"inverse_depth_noise": float("nan")}, "PlaneRemoval.inverse_depth_noise"),
         ({"max_tilt": 200.0}, "PlaneRemoval.max_tilt"),
     ],
 )

@@ -240,7 +240,7 @@ def test_largest_component_is_that_of_all_pairs(reach, density):
         (GmmEm, {"std_floor": float("nan")}, "std_floor .* found nan"),
         (GmmEm, {"min_posterior": 1.0}, "min_posterior"),
         (KMeans, {"background_centers": 0}, "KMeans.background_centers"),
-        (LargestComponent, {"connection_radius": 0}, "LargestComponent.reach"),
+        (LargestComponent, {"connection_radius": 0}, "LargestComponent.connection_radius"),
     ],
 )
 def test_parameters_are_checked(make, parameters, message):
