@@ -190,3 +190,16 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
     rows[used] = np.minimum((1 - own) / max(classes - 1, 1), own)[:, None]
     rows[np.flatnonzero(used), column[used]] = own
     return rows
+
+
+def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:
+    """Rows (N, C) of 0 and 1 with what the scores (N,) lack to 1 taken from the label and given evenly to the others.
+
+    The label gets 1 - spread * (1 - score), but not less than its even share. spread in [0, 1]: with 1 the label's
+    probability is its score, with 0 the label is certain.
+    """
+    c = one_hot.shape[1]
+    if c == 1:
+        return one_hot
+    own = np.maximum(1 - spread * (1 - scores.astype(np.float64)), 1 / c)[:, None]
+    return np.asarray(np.where(one_hot > 0, own, (1 - own) / (c - 1)), np.float32)

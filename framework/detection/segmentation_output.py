@@ -13,8 +13,7 @@ import numpy as np
 
 from framework.data import Float32
 from framework.detection.candidates import Candidates, check_scores, corners, described
-from framework.detection.runtimes.export_metadata import ExportMetadata
-from framework.detection.runtimes.network_outputs import Outputs
+from framework.detection.runtimes.onnx_network import ExportMetadata, Outputs
 from framework.errors import DataError
 
 SURELY_CORNERS = 0.9  # share of the cells whose third and fourth number are not below the first two

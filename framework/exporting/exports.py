@@ -11,14 +11,12 @@ from typing import Any, TypeVar
 
 from framework.config.validation import require
 from framework.errors import ConfigError, DataError
-from framework.exporting.coloring import Coloring
 from framework.exporting.floor_plan import write_floor_plan
 from framework.exporting.geojson import write_geojson
 from framework.exporting.glb import glb
 from framework.exporting.mesh_files import write_parts_obj, write_parts_ply
-from framework.exporting.object_meshes import Part, object_parts, parts
-from framework.exporting.occupancy import plan
-from framework.exporting.ros_map import write_ros_map
+from framework.exporting.object_meshes import Coloring, Part, object_parts, parts
+from framework.exporting.occupancy import plan, write_ros_map
 from framework.exporting.scene_graph import write_scene_graph
 from framework.exporting.upright_room import UprightRoom, read_room
 from framework.exporting.usd import Collision, check_usd, write_usd

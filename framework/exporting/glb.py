@@ -14,8 +14,7 @@ import numpy as np
 import trimesh
 
 from framework.data import Float32, Float64, Int32, UInt8, UInt16
-from framework.exporting.coloring import Coloring, linear, part_colors
-from framework.exporting.object_meshes import Part
+from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.rendering.surface import Surface
 
 T_GLTF_ROOM = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

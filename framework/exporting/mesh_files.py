@@ -10,8 +10,7 @@ import numpy as np
 import trimesh
 
 from framework.data import InstanceMesh
-from framework.exporting.coloring import Coloring, part_colors
-from framework.exporting.object_meshes import Part
+from framework.exporting.object_meshes import Coloring, Part, part_colors
 from framework.exporting.submeshes import joined
 from framework.files.atomic_write import written_whole
 from framework.geometry import transform

@@ -22,8 +22,7 @@ from scipy.spatial import ConvexHull, QhullError
 
 from framework.data import Float32, Int32, UInt8
 from framework.errors import DataError
-from framework.exporting.coloring import Coloring, linear, part_colors
-from framework.exporting.object_meshes import Part
+from framework.exporting.object_meshes import Coloring, Part, linear, part_colors
 from framework.files.atomic_write import written_whole
 
 MISSING = "USD files need the package usd-core: pip install instancemap[usd]"

@@ -10,14 +10,14 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 
 import numba
 
 from framework.data import Detections, Float64, Frame, Pose
 from framework.errors import in_one_line
 from framework.interfaces import SceneMap
-from framework.live_view.rate_limit import Pace
 from framework.live_view.updates import Drawing, FrameNote, FrameUpdate, MapSnapshot
 
 log = logging.getLogger(__name__)
@@ -136,3 +136,24 @@ class Background:
         with self._lock:
             self._failed = True
             self._notes, self._faults, self._picture, self._snapshot = [], [], None, None
+
+
+class Pace:
+    """At most once in `every` seconds, and so seldom that it takes at most `share` of the time, by `clock`."""
+
+    def __init__(self, every: float, share: float, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.every = every  # s
+        self.share = share  # in (0, 1]
+        self.clock = clock  # s; time.thread_time counts what the calling thread computes, and not what it waits
+        self._next = 0.0  # s, by time.perf_counter
+
+    def due(self) -> bool:
+        return time.perf_counter() >= self._next
+
+    @contextmanager
+    def kept(self) -> Iterator[None]:
+        """Around doing it."""
+        began, before = time.perf_counter(), self.clock()
+        self._next = began + self.every
+        yield
+        self._next = began + max(self.every, (self.clock() - before) / self.share)

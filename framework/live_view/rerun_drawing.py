@@ -14,9 +14,8 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float32, Float64, Frame, InstanceMesh, Int32, Pose, UInt8
 from framework.live_view import rerun_layout as at
-from framework.live_view.instance_colors import InstanceColors
+from framework.live_view.instance_colors import InstanceColors, seen_instances
 from framework.live_view.mesh_regions import MeshRegions
-from framework.live_view.seen_instances import seen_instances
 from framework.live_view.updates import FrameNote, FrameUpdate, MapSnapshot
 from framework.mapping.instances.instance_list import box_around, vertices_by_id
 

@@ -79,7 +79,7 @@ def search(scene: Map, question: Question, run: Path | None = None) -> Answer:
 
 def _embedded(question: Question, space: str, run: Path | None) -> Float32:
     """The question's words (D,) in a map's space."""
-    from framework.detection.embeddings.image_text import ImageTextModel
+    from framework.detection.hub.image_text import ImageTextModel
 
     name, revision = _model_of(run) if question.model is None else (question.model, "main")
     opened = ImageTextModel(name, revision, "cpu", half=False)

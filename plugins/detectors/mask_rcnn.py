@@ -12,9 +12,8 @@ from torch import Tensor
 
 from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, MOST_PROPOSALS, check_count, require
 from framework.data import Detections, Float32, Frame, Int32
-from framework.detection.mask_rcnn.batch_norm_folding import fuse_batch_norms
 from framework.detection.mask_rcnn.checkpoint import domain_of_network, read_network
-from framework.detection.mask_rcnn.network import select
+from framework.detection.mask_rcnn.network import fuse_batch_norms, select
 from framework.detection.mask_rcnn.published_weights import find_network
 from framework.detection.masks.binary_masks import paste_masks, without_duplicates
 from framework.detection.masks.boxes import to_original_image

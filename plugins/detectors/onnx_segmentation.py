@@ -8,7 +8,7 @@ from pathlib import Path
 
 from framework.config.validation import MOST_DETECTIONS, check_count, require
 from framework.data import Detections, Frame
-from framework.detection.class_distributions import spread_rest
+from framework.detection.candidates import spread_rest
 from framework.detection.masks.binary_masks import without_duplicates
 from framework.detection.masks.letterbox import Placement
 from framework.detection.masks.prototype_masks import masks_from_prototypes

@@ -13,7 +13,7 @@ import numpy as np
 
 from framework.config.validation import check_bounds
 from framework.data import Bool, Detections, Float32, Frame
-from framework.detection.class_distributions import spread_rest
+from framework.detection.candidates import spread_rest
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.stored.coco_results import CategoryIds, read_results
 from framework.detection.stored.fingerprint import fingerprint

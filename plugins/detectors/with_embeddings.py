@@ -9,8 +9,7 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Detections, Float32, Frame, UInt8
 from framework.detection.domain import domain_of
-from framework.detection.embeddings.crops import square_crops
-from framework.detection.embeddings.image_text import ImageTextModel
+from framework.detection.hub.image_text import ImageTextModel, square_crops
 from framework.detection.stored.cache import FRAME_FIELDS, ReadsFields, identity_of
 from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector

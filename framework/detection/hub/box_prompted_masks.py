@@ -8,8 +8,8 @@ import torch
 from torch.nn import functional
 
 from framework.data import Bool, Float32, UInt8
-from framework.detection.hub.hub_model import find_model
-from framework.detection.hub.transformers_parts import imported_transformers, network_pixels, read_part
+from framework.detection.hub.hub_model import find_model, imported_transformers, read_part
+from framework.detection.hub.image_text import network_pixels
 from framework.errors import ConfigError, DataError
 
 IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)

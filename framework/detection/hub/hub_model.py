@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from framework.detection.mask_rcnn.published_weights import OFFLINE
-from framework.detection.runtimes.network_outputs import one_line
-from framework.errors import DataError
+from framework.detection.runtimes.onnx_network import one_line
+from framework.errors import ConfigError, DataError, in_one_line
 from framework.files.atomic_write import check_regular
 from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
@@ -142,3 +142,20 @@ def _check(path: Path, published: Any) -> None:
         f"detector.model: {path.name} is not what was published: its sha256 is not {published.lfs.sha256}; it was"
         " deleted: try again"
     )
+
+
+def imported_transformers() -> Any:
+    """The library. Raises ConfigError, naming the extra, where it is not installed."""
+    try:
+        import transformers
+    except ImportError as error:
+        raise ConfigError("the package transformers is not installed: pip install instancemap[transformers]") from error
+    return transformers
+
+
+def read_part(parameter: str, folder: Path, what: str, auto_class: Any) -> Any:
+    """A part of a model in a folder. Raises DataError, naming the parameter, for one that cannot be read."""
+    try:
+        return auto_class.from_pretrained(str(folder), local_files_only=True)
+    except Exception as error:  # whatever transformers, tokenizers and safetensors raise on foreign files
+        raise DataError(f"{parameter}: {what} could not be read from {folder}: {in_one_line(error)}") from error

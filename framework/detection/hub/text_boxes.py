@@ -9,9 +9,8 @@ import numpy as np
 import torch
 
 from framework.data import Float32, UInt8
-from framework.detection.embeddings.image_text import CLIP_MEAN, CLIP_STD
-from framework.detection.hub.hub_model import TOKENIZER, find_model
-from framework.detection.hub.transformers_parts import imported_transformers, network_pixels, read_part
+from framework.detection.hub.hub_model import TOKENIZER, find_model, imported_transformers, read_part
+from framework.detection.hub.image_text import CLIP_MEAN, CLIP_STD, network_pixels
 from framework.errors import ConfigError, DataError
 
 PROMPT = "a photo of a {}"  # Minderer et al. 2023

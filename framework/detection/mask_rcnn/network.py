@@ -11,11 +11,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from framework.data import Float32, Int32
 from framework.detection.mask_rcnn.resnet import ResNet, ResNetShape
@@ -292,3 +294,16 @@ def _anchors(side: float, architecture: Architecture) -> Float32:
 def _best(scores: Float32, n: int) -> Int32:
     """The indices of the n best scores, best first, ties in the order of the input."""
     return np.asarray(np.argsort(-scores, kind="stable")[:n], np.int32)
+
+
+def fuse_batch_norms(network: nn.Module) -> None:
+    """Replaces, in place, each nn.BatchNorm2d by nothing, and scales the convolution that it follows.
+
+    It follows the convolution that was registered right before it, as in every network here. Only for a network that
+    is ready to run (`eval`): in training, normalization depends on the batch.
+    """
+    for module in network.modules():
+        for (name, layer), (next_name, next_layer) in pairwise(list(module.named_children())):
+            if isinstance(layer, nn.Conv2d) and isinstance(next_layer, nn.BatchNorm2d):
+                setattr(module, name, fuse_conv_bn_eval(layer, next_layer))
+                setattr(module, next_name, nn.Identity())

@@ -9,8 +9,7 @@ import numpy as np
 from framework.config.validation import LONGEST_SIDE, require
 from framework.data import UInt8
 from framework.detection.masks.letterbox import Letterbox, Placement, network_input
-from framework.detection.runtimes.network_outputs import Outputs
-from framework.detection.runtimes.onnx_network import OnnxNetwork
+from framework.detection.runtimes.onnx_network import OnnxNetwork, Outputs
 
 
 class ImageNetwork:

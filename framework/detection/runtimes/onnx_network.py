@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import ast
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
-from framework.data import Array
-from framework.detection.hub.weights_file import checked_hash, find_file
-from framework.detection.runtimes.export_metadata import ExportMetadata
-from framework.detection.runtimes.network_outputs import Outputs, finite_outputs, one_line
-from framework.errors import ConfigError, DataError
+from framework.data import Array, Float32
+from framework.errors import ConfigError, DataError, in_one_line
+from framework.files.hashing import path_hash
+from framework.files.search_paths import candidates
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
@@ -130,3 +131,79 @@ def _described(tensor: NodeArg) -> str:
 def _shape(tensor: NodeArg) -> Shape:
     """With 0 for any: such a dimension has a name, or none."""
     return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)
+
+
+def find_file(path: Path, parameter: str = "detector.weights") -> Path:
+    """The file `path` of a parameter. A relative one is tried from the working folder, then from the project's."""
+    for candidate in candidates(path):
+        if candidate.is_file():
+            return candidate
+    looked = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
+    raise DataError(f"{parameter}: there is no file {looked}; put the network there, or name another")
+
+
+def checked_hash(path: Path, sha256: str) -> str:
+    """The SHA-256 (hex) of a file. Raises DataError when it cannot be read, or is not `sha256`; "" = whatever it is."""
+    try:
+        found = path_hash(path)
+    except OSError as error:
+        raise DataError(f"detector.weights: {path} could not be read: {error.strerror}") from error
+    if sha256 and found != sha256.lower():
+        raise DataError(f"detector.weights: {path} has the sha256 {found}, expected {sha256}")
+    return found
+
+
+@dataclass(frozen=True)
+class ExportMetadata:
+    """Of a file that says nothing, or says it otherwise, all is empty."""
+
+    names: tuple[str, ...] = ()  # of the classes, in the order of the scores
+    image_size: tuple[int, int] = (0, 0)  # (height, width) px that it was exported for, 0 = not said
+    author: str = ""
+
+    @classmethod
+    def parse(cls, texts: Mapping[str, str]) -> ExportMetadata:
+        """From the file's own pairs, whose values are Python's or JSON's literals."""
+        return cls(_names(texts.get("names", "")), _size(texts.get("imgsz", "")), texts.get("author", ""))
+
+
+def _names(text: str) -> tuple[str, ...]:
+    """{0: "person", ...}, with numbers or numerals as keys."""
+    names = _literal(text)
+    if not isinstance(names, dict):
+        return ()
+    by_number = {int(key): str(name) for key, name in names.items() if str(key).isdecimal()}
+    return tuple(by_number[k] for k in range(len(names))) if set(by_number) == set(range(len(names))) else ()
+
+
+def _size(text: str) -> tuple[int, int]:
+    """[height, width], or one number for both."""
+    sides = _literal(text)
+    height, width = sides if isinstance(sides, list) and len(sides) == 2 else (sides, sides)
+    if isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0:
+        return height, width
+    return 0, 0
+
+
+def _literal(text: str) -> object:
+    try:
+        return ast.literal_eval(text)
+    except (ValueError, SyntaxError, MemoryError, RecursionError):
+        return None
+
+
+Outputs = dict[str, Float32]
+
+
+def finite_outputs(path: Path, named: Iterable[tuple[str, Array]]) -> Outputs:
+    """The outputs by name in float32. Raises DataError when one holds numbers that are not finite."""
+    outputs = {name: np.asarray(array, np.float32) for name, array in named}
+    for name, array in outputs.items():
+        if not np.isfinite(array).all():
+            raise DataError(f"{path}: the output {name} holds values that are not finite")
+    return outputs
+
+
+def one_line(error: Exception) -> str:
+    """The beginning of what a library's exception says, for a message: some add a whole trace."""
+    return in_one_line(error)[:300]

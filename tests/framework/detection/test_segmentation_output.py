@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from framework.detection.runtimes.export_metadata import ExportMetadata
+from framework.detection.runtimes.onnx_network import ExportMetadata
 from framework.detection.segmentation_output import BoxKind, recognise
 from framework.errors import DataError
 

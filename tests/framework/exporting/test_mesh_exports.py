@@ -21,11 +21,10 @@ from PIL import ImageColor
 
 from framework.data import Box
 from framework.errors import DataError
-from framework.exporting.coloring import Coloring, linear
 from framework.exporting.decimation import decimated
 from framework.exporting.exports import Chosen, ExportFormat, export
 from framework.exporting.glb import glb
-from framework.exporting.object_meshes import parts
+from framework.exporting.object_meshes import Coloring, linear, parts
 from framework.exporting.surface_points import surface_points
 from framework.exporting.upright_room import UprightRoom, facing, objects_of, read_room
 from framework.exporting.usd import Collision, convex_hull

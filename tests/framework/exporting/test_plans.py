@@ -15,10 +15,9 @@ from PIL import Image
 from framework.errors import DataError
 from framework.exporting import occupancy, scene_graph
 from framework.exporting.exports import Chosen, ExportFormat, export
-from framework.exporting.occupancy import Plan, looked_through, plan
+from framework.exporting.occupancy import FREE, OCCUPIED, UNKNOWN, Plan, levels, looked_through, plan
 from framework.exporting.relations import relations
 from framework.exporting.rooms import rooms
-from framework.exporting.ros_map import FREE, OCCUPIED, UNKNOWN, levels
 from framework.exporting.surface_points import middles, surface_points
 from framework.exporting.upright_room import UprightRoom, read_room
 from framework.rendering.viewpoint import looking

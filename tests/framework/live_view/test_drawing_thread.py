@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from framework.data import Pose
-from framework.live_view.drawing_thread import Background
+from framework.live_view import drawing_thread
+from framework.live_view.drawing_thread import Background, Pace
 from framework.live_view.updates import FrameNote, FrameUpdate, MapSnapshot
 from framework.pipeline import Pipeline
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, GridMap, KeepAll, SphereDetector
@@ -152,3 +153,36 @@ def test_what_came_last_is_drawn_although_no_frame_follows(room: CornerRoom) -> 
         time.sleep(0.05)
     assert [note.index for note in book.notes] == list(range(6))
     background.end()
+
+
+class Clock:
+    now = 100.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr(drawing_thread.time, "perf_counter", lambda: clock.now)
+    return clock
+
+
+def did(paced: Pace, clock: Clock, seconds: float) -> None:
+    with paced.kept():
+        clock.now += seconds
+
+
+@pytest.mark.parametrize(("seconds", "next_after"), [(0.001, 1.0), (0.2, 4.0)])
+def test_it_waits_for_its_time_and_for_its_share(clock: Clock, seconds: float, next_after: float) -> None:
+    paced = Pace(1.0, 0.05, lambda: clock.now)
+    assert paced.due()
+    did(paced, clock, seconds)
+    clock.now = 100 + next_after - 0.01
+    assert not paced.due()
+    clock.now += 0.02
+    assert paced.due()
+
+
+def test_it_is_not_due_while_it_is_done(clock: Clock) -> None:
+    paced = Pace(1.0, 0.05, lambda: clock.now)
+    with paced.kept():
+        assert not paced.due()

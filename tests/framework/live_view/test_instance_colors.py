@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.live_view.instance_colors import InstanceColors
+from framework.data import Frame, InstanceMesh
+from framework.geometry import back_project, transform
+from framework.live_view.instance_colors import InstanceColors, seen_instances
 from framework.rendering.palette import instance_colors
-from tests.framework.live_view.test_seen_instances import room_mesh
+from tests.support.scenes.corner_room import CAMERA, CLASSES, CornerRoom, look, pose_at
 
 
 def test_those_that_come_later_change_no_colour() -> None:
@@ -29,3 +31,39 @@ def test_a_mesh_is_painted_where_instances_are() -> None:
         of = mesh.instance_ids == key
         gray = mesh.colors[of].mean(axis=1, keepdims=True)
         np.testing.assert_allclose(painted[of], 0.4 * gray + 0.6 * colors[key], atol=1.01)
+
+
+def room_mesh() -> InstanceMesh:
+    """The first frame's readings as vertices, of the spheres 1 and 2 and of the room."""
+    depth, _, color, ids = look(CAMERA, pose_at(0))
+    v, u = np.nonzero(depth > 0)
+    points = back_project(CAMERA, np.stack([u, v], 1).astype(np.int32), depth[v, u])
+    vertices = np.asarray(transform(pose_at(0), points), np.float32)
+    labels = ids[v, u].astype(np.int32)
+    return InstanceMesh(vertices, np.zeros((0, 3), np.int32), color[v, u], labels, labels - 1, CLASSES)
+
+
+def masks_of(frame: Frame) -> np.ndarray:
+    ids = look(CAMERA, pose_at(frame.index))[3]
+    return np.stack([ids == 2, ids == 1, ids == 0, np.zeros_like(ids, bool)])
+
+
+def test_masks_have_the_instances_that_are_seen_there() -> None:
+    frame = CornerRoom()[5]
+    found = seen_instances(masks_of(frame), frame, pose_at(5), room_mesh())
+    assert found.tolist() == [2, 1, 0, 0]
+
+
+def test_what_lies_behind_what_is_seen_does_not_count() -> None:
+    frame = CornerRoom()[5]
+    near = Frame(5, 0.0, frame.color, np.full(frame.depth.shape, 0.5, np.float32), CAMERA)
+    assert seen_instances(masks_of(frame), near, pose_at(5), room_mesh()).tolist() == [0, 0, 0, 0]
+
+
+def test_an_empty_map_and_no_masks_are_taken() -> None:
+    frame, mesh = CornerRoom()[0], room_mesh()
+    nothing = InstanceMesh(
+        mesh.vertices[:0], mesh.triangles, mesh.colors[:0], mesh.instance_ids[:0], mesh.class_ids[:0], CLASSES
+    )
+    assert seen_instances(masks_of(frame), frame, pose_at(0), nothing).tolist() == [0, 0, 0, 0]
+    assert seen_instances(masks_of(frame)[:0], frame, pose_at(0), mesh).tolist() == []

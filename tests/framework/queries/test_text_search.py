@@ -14,7 +14,7 @@ import pytest
 import instancemap
 from framework.api import query
 from framework.commands.results.query import main
-from framework.detection.embeddings.image_text import ImageTextModel
+from framework.detection.hub.image_text import ImageTextModel
 from framework.errors import ConfigError, DataError
 from framework.interfaces import MapFuser
 from framework.queries.map_queries import Map

@@ -17,8 +17,7 @@ from framework.datasets.rgbd_folder import RgbdFolder
 from framework.errors import ConfigError
 from framework.geometry import exp_se3, inverse, rotation_angle
 from framework.tracking.features import FeatureExtractor, Features
-from framework.tracking.keyframes import Keyframes
-from framework.tracking.visual_words import VisualWords, similarity
+from framework.tracking.keyframes import Keyframes, VisualWords, similarity
 from tests.support.scenes.papered_room import CAMERA, papered_frame
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data"

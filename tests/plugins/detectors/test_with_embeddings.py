@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from framework.data import Camera, Detections, Frame
-from framework.detection.embeddings.crops import square_crops
-from framework.detection.embeddings.image_text import ImageTextModel
+from framework.detection.hub.image_text import ImageTextModel, square_crops
 from framework.detection.stored.cache import identity_of
 from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from onnx import TensorProto, helper, numpy_helper
 
-from framework.detection.hub.weights_file import find_file
-from framework.detection.runtimes.onnx_network import OnnxNetwork
+from framework.detection.runtimes.onnx_network import ExportMetadata, OnnxNetwork, find_file
 from framework.errors import ConfigError, DataError
 from tests.support.networks.tiny_networks import constant_network, doubling_network, save
 
@@ -172,3 +171,30 @@ def test_numbers_that_are_not_finite_are_an_error(tmp_path):
     network(np.ones((4, 4, 3), np.float32))
     with pytest.raises(DataError, match="the output y holds values that are not finite"):
         network(np.zeros((4, 4, 3), np.float32))
+
+
+def test_an_export_of_ultralytics():
+    texts = {"names": "{0: 'person', 1: 'dog'}", "imgsz": "[480, 640]", "author": "Ultralytics", "stride": "32"}
+    assert ExportMetadata.parse(texts) == ExportMetadata(("person", "dog"), (480, 640), "Ultralytics")
+    assert ExportMetadata.parse({"names": '{"1": "dog", "0": "person"}', "imgsz": "640"}) == ExportMetadata(
+        ("person", "dog"), (640, 640)
+    )
+
+
+OTHER = (
+    "",
+    "person",
+    "[",
+    "{0: 'a', 2: 'b'}",
+    "{'x': 'a'}",
+    "['a']",
+    "[1, 2, 3]",
+    "[0, 0]",
+    "[-1, 5]",
+    "__import__('os')",
+)
+
+
+@pytest.mark.parametrize("text", OTHER)
+def test_other_texts_say_nothing(text):
+    assert ExportMetadata.parse({"names": text, "imgsz": text}) == ExportMetadata()

@@ -3,7 +3,7 @@
 import torch
 from torch import nn
 
-from framework.detection.mask_rcnn.batch_norm_folding import fuse_batch_norms
+from framework.detection.mask_rcnn.network import fuse_batch_norms
 from tests.support.networks.tiny_mask_rcnn import tiny_network
 
 

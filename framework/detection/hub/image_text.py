@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from framework.data import Float32, UInt8
-from framework.detection.hub.hub_model import CONFIG, PREPROCESSING, TOKENIZER, find_model
-from framework.detection.hub.transformers_parts import imported_transformers, read_part
+from framework.data import Bool, Float32, UInt8
+from framework.detection.hub.hub_model import (
+    CONFIG,
+    PREPROCESSING,
+    TOKENIZER,
+    find_model,
+    imported_transformers,
+    read_part,
+)
+from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.runtimes.device import torch_device
 from framework.errors import ConfigError, DataError
 from framework.files.hashing import path_hash
@@ -134,3 +142,46 @@ def _space(folder: Path, model: str) -> str:
     weights = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("pytorch_model*.bin"))
     hashes = "".join(path_hash(path) for path in [folder / CONFIG, *weights])
     return f"{folder.name}@{hashlib.sha256(hashes.encode()).hexdigest()[:HASH_DIGITS]}"
+
+
+GRAY = 128
+
+
+def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
+    """One picture (side, side, 4) for each of the masks (N, H, W) of the image `color` (H, W, 3): RGB, and 255 inside.
+
+    A picture is the square around the mask's middle whose side is `context` times the longer side of the mask's box, so
+    that nothing is distorted; what lies beyond the image is black. What is around the object keeps the share
+    `surroundings` of its difference from gray. Shrinking averages. An empty mask gives black.
+    """
+    crops = np.zeros((len(masks), side, side, 4), np.uint8)
+    for k, box in enumerate(tight_boxes(masks)):
+        if not masks[k].any():
+            continue
+        with_mask = np.dstack([color, masks[k].view(np.uint8) * np.uint8(255)])
+        crops[k] = _square_crop(with_mask, box, side, context, surroundings)
+    return crops
+
+
+def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
+    """The square (side, side, 4) around a box x1 y1 x2 y2 of pixels inside, of an image whose fourth channel is 255
+    on the object.
+    """
+    height, width = image.shape[:2]
+    x1, y1, x2, y2 = (int(value) for value in box)
+    wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px
+    left, top = (x1 + x2 + 1 - wide) // 2, (y1 + y2 + 1 - wide) // 2
+    square = np.zeros((wide, wide, image.shape[2]), np.uint8)
+    u1, v1, u2, v2 = max(left, 0), max(top, 0), min(left + wide, width), min(top + wide, height)
+    square[v1 - top : v2 - top, u1 - left : u2 - left] = image[v1:v2, u1:u2]
+    if surroundings < 1:
+        around = square[..., 3] == 0
+        square[around, :3] = np.round(GRAY + surroundings * (square[around, :3].astype(np.float32) - GRAY))
+    shrinks = side < wide
+    return np.asarray(cv2.resize(square, (side, side), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
+
+
+def network_pixels(image: UInt8, mean: Sequence[float], std: Sequence[float], device: torch.device) -> torch.Tensor:
+    """The input (1, 3, H, W) of an image (H, W, 3) RGB: shares of 255, less the mean, by the standard deviation."""
+    pixels = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(2, 0, 1)[None].float() / 255
+    return (pixels - torch.tensor(mean, device=device)[:, None, None]) / torch.tensor(std, device=device)[:, None, None]
