@@ -27,13 +27,23 @@ demo: $(INSTALLED) ## map a real desk, leave the record in outputs/demo
 	@$(BIN)/python -m framework hydra.run.dir=$(DEMO)
 	@page="$$($(BIN)/python -m framework report $(DEMO))"; echo "report: $$page"
 
-.PHONY: test
-test: $(INSTALLED_DEV) ## lint, check types, run the tests
+PYTEST = $(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --quiet
+
+.PHONY: check
+check: $(INSTALLED_DEV) ## lint, check types, run the unit tests
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
 	$(BIN)/python -m framework compile --all
-	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 4 --dist loadfile --no-loadscope-reorder --quiet
+	$(PYTEST) -m unit
+
+.PHONY: test
+test: check ## make check, then the integration tests
+	$(PYTEST) -m integration
+
+.PHONY: acceptance
+acceptance: $(INSTALLED_DEV) ## measure missing or outdated acceptance lines; LINE=name measures one
+	$(BIN)/python -m tests.acceptance $(LINE)
 
 .PHONY: docs
 docs: $(INSTALLED_DEV) ## build the pages of docs/ into outputs/docs

@@ -30,6 +30,28 @@ if hasattr(signal, "SIGHUP") and signal.getsignal(signal.SIGHUP) is signal.SIG_I
     signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 
+LANES = ("unit", "integration", "acceptance")
+INTEGRATION_FIXTURES = {"shared", "shared_data", "benchmark"}
+SLOW_UNIT_TEST = 2.0  # s
+
+
+@pytest.hookimpl(tryfirst=True)  # before -m deselects
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark every test that has no lane: integration if it uses real data or benchmarks, else unit."""
+    for item in items:
+        if not any(item.get_closest_marker(lane) for lane in LANES):
+            fixtures = INTEGRATION_FIXTURES & set(getattr(item, "fixturenames", ()))
+            item.add_marker("integration" if fixtures else "unit")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """List unit tests that are too slow for their lane."""
+    reports = [report for report in terminalreporter.stats.get("passed", []) if "unit" in report.keywords]
+    for report in sorted(reports, key=lambda report: -report.duration):
+        if report.duration > SLOW_UNIT_TEST:
+            terminalreporter.write_line(f"slow unit test: {report.duration:.1f} s {report.nodeid}")
+
+
 @pytest.fixture(autouse=True)
 def seeded() -> None:
     """The same random numbers in every test, whichever tests run before it."""

@@ -29,6 +29,8 @@ from tests.support import registered
 from tests.support.scenes.analytic_scene import Scene
 from tests.support.scenes.corner_room import CornerRoom, pose_at
 
+pytestmark = pytest.mark.integration
+
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
 
 

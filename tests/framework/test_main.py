@@ -18,6 +18,8 @@ from framework.__main__ import COMMANDS, leave_working_folder, main, module_of
 from framework.files.search_paths import CONF
 from framework.runs.provenance import config_hash
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[2]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
 RECORD = {"config.yaml", "metrics.json", "instances.json", "mesh.ply", "trajectory.txt", "timings.csv", "map.npz"}

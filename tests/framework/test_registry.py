@@ -23,6 +23,8 @@ from framework.errors import ConfigError, DataError
 from framework.interfaces import Detector, PoseTracker, RGBDSequence, RGBDVideo
 from framework.registry import GROUPS, STAGES, assemble, build, find_class, parameter_fields
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[2]
 HERE = "build_targets"
 

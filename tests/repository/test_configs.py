@@ -28,6 +28,8 @@ from framework.tables.comparison import TableChoice
 from framework.training.trainer import Schedule
 from tests.support import registered
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.mark.parametrize(("stage", "name"), registered.OPTIONS)
 def test_every_option_composes_and_builds(stage: str, name: str, ready: Callable[..., object]) -> None:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import pytest
+
 from framework.config.composition import composed
 from framework.files.search_paths import PROJECT_ROOT
 from framework.interfaces import RGBDSequence
 from framework.registry import build
 from instancemap import Mapper
+
+pytestmark = pytest.mark.integration
 
 DESK = PROJECT_ROOT / "data" / "desk"
 

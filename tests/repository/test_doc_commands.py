@@ -17,6 +17,8 @@ from framework import __main__ as main
 from tests.repository.test_readme import BENCHMARKS, COMMANDS, OWN_DATA, OWN_PLUGIN, RUNNABLE
 from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 
+pytestmark = pytest.mark.integration
+
 EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # in test_readme.py
 ACME = block("python", "class AcmeSearchPath")
 CONTRACT = block("python", "class TestMyRefiner")

@@ -21,6 +21,8 @@ from framework.files.search_paths import CONF
 from framework.registry import GROUPS
 from tests.support.doc_pages import CHECKOUT, DOCS, PAGES
 
+pytestmark = pytest.mark.integration
+
 LINKING = {
     **PAGES,
     **{

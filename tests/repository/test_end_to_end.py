@@ -14,6 +14,8 @@ from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.refiners.gmm_em import GmmEm
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def sequence() -> Synthetic:

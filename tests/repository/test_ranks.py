@@ -22,6 +22,8 @@ from framework.runs.provenance import config_hash
 from framework.tables.comparison import ComparisonTable
 from tests.support.doc_pages import CHECKOUT, LINES
 
+pytestmark = pytest.mark.integration
+
 SCRIPT = CHECKOUT / "docs" / "results" / "ranks.py"
 COMMAND = "python docs/results/ranks.py "
 

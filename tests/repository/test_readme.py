@@ -29,6 +29,8 @@ from tests.support import option_files
 from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
+pytestmark = pytest.mark.integration
+
 COMMANDS = {  # by the main config that they compose
     line: "config" if "=" in words[3] or words[3] == "-m" else words[3].replace("-", "_")
     for line in LINES

@@ -25,6 +25,8 @@ from framework.testing.viewer import ViewerContract
 from tests.support import option_files, registered
 from tests.support.cores import all_cores
 
+pytestmark = pytest.mark.integration
+
 Ready = Callable[[str, str], Any]
 
 

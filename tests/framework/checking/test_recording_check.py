@@ -30,6 +30,8 @@ from framework.geometry import inverse
 from framework.interfaces import RGBDSequence
 from tests.support.recordings.damaged import write_damaged
 
+pytestmark = pytest.mark.integration
+
 FARTHEST = 5.0  # m, that is mapped
 DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")
 

@@ -13,6 +13,8 @@ import pytest
 from framework.commands.command_line import directory_name, print_for_directories
 from framework.errors import DataError
 
+pytestmark = pytest.mark.integration
+
 
 def test_overrides_become_one_directory() -> None:
     assert directory_name("dataset.root=../a/b,seed=1") == "dataset.root=.._a_b,seed=1"

@@ -21,6 +21,8 @@ from framework.compilation.catalog import DEFAULT, OTHERS, Kernel, compile_all, 
 from framework.errors import DataError
 from framework.mapping.voxels.voxel_grid import Grid
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 LINES = [line for line in catalog.LIST.read_text().splitlines() if line and not line.startswith("#")]
 

@@ -18,6 +18,8 @@ from framework.interfaces import Detector
 from framework.registry import build
 from tests.support.recordings.damaged_files import EXAMPLES, damaged
 
+pytestmark = pytest.mark.integration
+
 OPTION = b"""\
 defaults:
   - _self_

@@ -32,6 +32,8 @@ from plugins.trackers.trajectory_file import TrajectoryFile
 from tests.framework.datasets.scenenn.test_oni import played
 from tests.support.scenes.corner_room import GridFuser, KeepAll
 
+pytestmark = pytest.mark.integration
+
 VGA = (480, 640)
 KINECT = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # OpenNI's
 KITCHEN = "redkitchen/seq-01"

@@ -20,6 +20,8 @@ from framework.detection.mask_rcnn.published_weights import PUBLISHED
 from framework.doctor import isolated, machine, networks, packages
 from framework.doctor.check_result import Check, Status, anonymous, run_checks
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 CHECKS = (networks.included, networks.published, networks.hugging_face)
 HUB_VARIABLES = ("HF_HOME", "HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE", "INSTANCEMAP_OFFLINE", "TRANSFORMERS_OFFLINE")

@@ -16,6 +16,8 @@ import pytest
 from framework.errors import DataError
 from framework.files.directory_lock import HOLDER, is_locked, locked, new_directory
 
+pytestmark = pytest.mark.integration
+
 
 def test_the_second_is_told_who_has_it(tmp_path: Path) -> None:
     place = tmp_path / "new" / "sweep"

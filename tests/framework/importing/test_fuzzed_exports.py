@@ -25,6 +25,8 @@ from tests.support.recordings.phone_exports import (
     write_stray_scanner,
 )
 
+pytestmark = pytest.mark.integration
+
 FRAMES = room_frames(2)
 TOKENS = (b", nan", b"null", b"\0", b"1e999", b"[", b"}", b"-1")
 WRITERS: dict[str, tuple[str, Callable[..., None]]] = {

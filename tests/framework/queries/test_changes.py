@@ -24,6 +24,8 @@ from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 from framework.synthetic.surfaces import assemble
 
+pytestmark = pytest.mark.integration
+
 GIVEN = ("tracker=ground_truth", "fuser.voxel_size=0.025")
 
 

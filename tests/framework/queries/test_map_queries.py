@@ -15,6 +15,8 @@ from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError
 from tests.support.scenes.corner_room import CornerRoom
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
 

@@ -16,6 +16,8 @@ from framework.commands.results.report import write_reports
 from framework.config import composition
 from tests.support.reported_run import FAKES, rename_class, write_run
 
+pytestmark = pytest.mark.integration
+
 CHROMIUM = "/usr/bin/chromium"
 FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 HOSTILE = "<img src=x onerror=alert(1)>"

@@ -19,7 +19,7 @@ from framework.runs.provenance import config_hash
 from tests.support.reported_run import write_run
 from tests.support.scenes.corner_room import pose_at
 
-pytestmark = pytest.mark.usefixtures("fakes_registered")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 
 
 @pytest.fixture(scope="module")

@@ -39,6 +39,8 @@ from tests.support.scenes.corner_room import (
     pose_at,
 )
 
+pytestmark = pytest.mark.integration
+
 CONFIG = OmegaConf.create({"seed": 3, "debug": False, "fuser": {"voxel_size": 0.01, "seed": "${seed}"}})
 CHOICES = {"dataset": "fake", "detector": "simulated"}
 

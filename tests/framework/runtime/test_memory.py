@@ -18,7 +18,10 @@ from framework.runtime import memory
 from framework.runtime.memory import PAGE, SMALL, PagesAhead
 
 ROWS = 6 * PAGE // 1024
-pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="pages are asked for on Linux")
+pytestmark = [
+    pytest.mark.integration,
+    pytest.mark.skipif(sys.platform != "linux", reason="pages are asked for on Linux"),
+]
 
 
 @pytest.fixture

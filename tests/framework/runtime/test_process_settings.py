@@ -19,6 +19,8 @@ from framework.evaluation import instances
 from framework.runtime.process_settings import Settings, available_cores
 from framework.synthetic.ray_caster import RayCaster
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 
 

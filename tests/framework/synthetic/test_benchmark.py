@@ -25,6 +25,8 @@ from framework.synthetic.layout import CONTACT, WALK_RADIUS, arrange, strew
 from framework.synthetic.textures import Texture
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
+pytestmark = pytest.mark.integration
+
 SEEDS = range(3)
 ROOMS = [
     *("living_chairs", "bedroom", "books", "couches", "office"),

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from framework.data import Camera
 from framework.rendering.rasterizer import NO_TRIANGLE
@@ -15,6 +16,8 @@ from framework.synthetic.shading import EDGE_SAMPLES, EDGE_STEP, WHITE
 from framework.synthetic.surfaces import assemble
 from framework.synthetic.textures import Material, Texture, surface_color
 from framework.synthetic.walk import look
+
+pytestmark = pytest.mark.integration
 
 CAMERA = Camera(64, 48, 50.0, 55.0, 30.7, 22.9)
 GREY = Material(Texture.PAINT, (0.7, 0.7, 0.7), (0.7, 0.7, 0.7))

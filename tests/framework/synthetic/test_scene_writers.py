@@ -17,6 +17,8 @@ from framework.synthetic.furniture.groups import toilet_group
 from framework.synthetic.scene_writers import FRAMES_AT_ONCE, _choose, _Scene, write_scenes
 from framework.synthetic.scenenn_scene import GENERATION, BenchmarkSettings, SceneNNScene, frame_files, trajectory_file
 
+pytestmark = pytest.mark.integration
+
 SPEC = SceneSpec("bathroom", (toilet_group,), {"toilet": 1})
 SPECS = {"007": SPEC, "008": SPEC}
 RECORDING = BenchmarkSettings(seed=1, frames=FRAMES_AT_ONCE + 2, width=64)

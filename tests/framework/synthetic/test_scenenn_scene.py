@@ -34,6 +34,8 @@ from framework.synthetic.scenenn_scene import (
 )
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO, SPACES
 
+pytestmark = pytest.mark.integration
+
 SPEC = SceneSpec("bathroom", (toilet_group, lambda rng: chair_row(rng, 2)), {"toilet": 1, "chair": 2})
 RECORDING = BenchmarkSettings(seed=3, frames=9, width=160)
 SHOWN = (0, 4, 8)

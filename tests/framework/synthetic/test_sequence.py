@@ -17,6 +17,8 @@ from framework.geometry import back_project, inverse, project, rotation_angle, t
 from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 
+pytestmark = pytest.mark.integration
+
 SMALL = {"kind": RoomKind.BEDROOM, "width": 160, "height": 120}
 
 

@@ -18,6 +18,8 @@ from framework.synthetic.scenenn_scene import BenchmarkSettings
 from framework.tables.experiment_tables import write_tables
 from framework.tables.layouts import head
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 TABLE = {"average_over": ["seed"], "baseline": "chain", "columns": ["instances.ap50", "stage_ms.refine.median"]}
 ROWS = {"identity": ["refiner=identity"], "chain": [], "none_yet": ["refiner=none_yet"]}

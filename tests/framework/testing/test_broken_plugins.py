@@ -25,6 +25,8 @@ from framework.testing.tracker import TrackerContract
 from framework.testing.viewer import ViewerContract
 from tests.support.scenes.corner_room import CornerRoom, GridFuser, SphereDetector
 
+pytestmark = pytest.mark.integration
+
 
 class Forgetful(SphereDetector):
     """Finds less every time."""

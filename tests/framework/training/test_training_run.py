@@ -16,6 +16,8 @@ from framework.training.train import HELD_OUT, NETWORK, PRECISION, architecture,
 from framework.training.trainer import CHECKPOINT, CURVE, HISTORY
 from tests.support.tiny_rooms import PICTURES, write_room
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 ROOMS = CHECKOUT / "plugins" / "detectors" / "mask_rcnn_rooms.safetensors"
 

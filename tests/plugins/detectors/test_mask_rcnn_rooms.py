@@ -16,6 +16,8 @@ from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
 from tests.support import registered
 
+pytestmark = pytest.mark.integration
+
 ROOMS = 2_000_000  # neither trained on nor held out in training
 MOST_BYTES = 20 << 20
 

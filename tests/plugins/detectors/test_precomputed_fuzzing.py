@@ -20,6 +20,8 @@ from framework.errors import DataError
 from plugins.detectors.precomputed import Precomputed
 from tests.support.recordings.damaged_files import EXAMPLES, changed_json, check, damaged
 
+pytestmark = pytest.mark.integration
+
 CAMERA = Camera(8, 6, 8.0, 8.0, 3.5, 2.5)
 FRAME = Frame(0, 0.0, np.zeros((6, 8, 3), np.uint8), np.ones((6, 8), np.float32), CAMERA)
 RUNS = {"image_id": 0, "category_name": "cup", "score": 0.5, "segmentation": {"size": [6, 8], "counts": [10, 6, 32]}}

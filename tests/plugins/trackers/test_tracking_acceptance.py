@@ -25,6 +25,8 @@ from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from plugins.trackers.voxel_hashing_icp import VoxelHashingIcp
 from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, pose
 
+pytestmark = pytest.mark.acceptance
+
 VOXEL = 0.02  # m, of the small images here
 WRONG = 0.04  # m, two voxels: a pose farther off than this, and not reported as lost, is a lie
 

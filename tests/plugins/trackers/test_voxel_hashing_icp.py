@@ -21,6 +21,8 @@ from plugins.trackers.voxel_hashing_icp import STEADY, Alignment, VoxelHashingIc
 from tests.support.scenes.analytic_scene import CAMERA, NOTHING, Scene, room, walk
 from tests.support.scenes.papered_room import papered_frame
 
+pytestmark = pytest.mark.integration
+
 
 def run(tracker: VoxelHashingIcp, frames: list[Frame]) -> tuple[list[Pose], SceneMap]:
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)

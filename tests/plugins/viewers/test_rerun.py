@@ -36,6 +36,8 @@ pytest.importorskip("rerun", reason="rerun-sdk, of the extra viewer, is not inst
 from pyarrow.types import is_temporal
 from rerun.chunk import RrdReader
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 STAGES = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]

@@ -15,6 +15,8 @@ from framework.commands.installation.compile import compile_named
 from framework.compilation.catalog import DEFAULT, listed
 from framework.errors import ConfigError
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 
 

@@ -14,6 +14,8 @@ from plugins.detectors.mask_rcnn import MaskRCNNDetector
 from tests.framework.detection.mask_rcnn.test_detectron2_checkpoint import synthetic_state
 from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network
 
+pytestmark = pytest.mark.integration
+
 
 def command(monkeypatch, *arguments):
     monkeypatch.setattr(sys, "argv", ["convert_weights", *map(str, arguments)])

@@ -22,6 +22,8 @@ from framework.errors import ConfigError
 from framework.registry import GROUPS
 from tests.support import option_files
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 EXAMPLE = CHECKOUT / "examples" / "instancemap-depth-median"
 SITE = Path(sysconfig.get_paths()["purelib"])

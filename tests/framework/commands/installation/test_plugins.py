@@ -13,6 +13,8 @@ from framework.commands.installation.plugins import Option, Parameter, describe,
 from framework.config import composition
 from framework.registry import GROUPS, STAGES
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 
 PACKAGE = {

@@ -13,6 +13,8 @@ from framework.geometry import inverse
 from tests.framework.checking.test_recording_check import DESK
 from tests.support.recordings.damaged import write_damaged
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 
 

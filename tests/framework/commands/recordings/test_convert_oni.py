@@ -13,6 +13,8 @@ from framework.errors import DataError
 from tests.framework.datasets.scenenn.test_oni import colors, depths, played, recording
 from tests.support.recordings.oni_file import OniFile
 
+pytestmark = pytest.mark.integration
+
 FRAMES = [OniFrame(c, d, 1000 * k + 7, 1000 * k) for k, (c, d) in enumerate(zip(colors(), depths(), strict=True))]
 
 

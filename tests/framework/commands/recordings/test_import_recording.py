@@ -18,6 +18,8 @@ from framework.registry import build
 from tests.support.recordings.phone_exports import room_frames, seen_by_phone, write_stray_scanner
 from tests.support.scenes.corner_room import look
 
+pytestmark = pytest.mark.integration
+
 
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: object) -> None:
     monkeypatch.setattr(sys, "argv", ["import", *map(str, arguments)])

@@ -11,6 +11,8 @@ from framework.commands.recordings import synthesize
 from framework.synthetic.benchmark import SCENES
 from framework.synthetic.scenenn_scene import BenchmarkSettings
 
+pytestmark = pytest.mark.integration
+
 
 def run(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     monkeypatch.setattr(sys, "argv", ["synthesize", *arguments])

@@ -23,7 +23,7 @@ from framework.runs.provenance import config_hash
 from tests.support import reported_run
 from tests.support.scenes.corner_room import CornerRoom
 
-pytestmark = pytest.mark.usefixtures("fakes_registered")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 CHECKOUT = Path(__file__).resolve().parents[4]
 CONFIG = reported_run.CONFIG | {
     "dataset": reported_run.CONFIG["dataset"] | {"frames": 4},

@@ -14,6 +14,8 @@ from framework.commands.results import export
 from framework.errors import ConfigError
 from tests.support.scenes.exported_room import ExportedRoom
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:

@@ -19,7 +19,7 @@ from framework.reporting.run_page import RunReport
 from tests.support.reported_run import rename_class, write_run
 from tests.support.scenes.corner_room import CornerRoom
 
-pytestmark = pytest.mark.usefixtures("fakes_registered")
+pytestmark = [pytest.mark.integration, pytest.mark.usefixtures("fakes_registered")]
 
 
 @pytest.fixture(scope="module")

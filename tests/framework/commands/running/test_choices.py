@@ -5,6 +5,8 @@ import pytest
 from framework.commands.running.choices import MANY, checked_sweep, single_run
 from framework.errors import ConfigError
 
+pytestmark = pytest.mark.integration
+
 ROWS = ("ours", "voxblox_pp", "label_count")
 
 

@@ -12,6 +12,8 @@ import pytest
 
 from tests.framework.commands.running.test_sweep import CHECKOUT, PLACE, begin, begun, end, recorded, wait_until
 
+pytestmark = pytest.mark.acceptance
+
 THREE = ("row=half", "seed=1,2,3", "dataset.slow_s=0.7")  # of four frames each
 TABLES = ("table.md", "table.tex", "table.csv")
 

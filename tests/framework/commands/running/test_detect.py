@@ -16,6 +16,8 @@ from framework.errors import DataError
 from plugins.detectors.precomputed import Precomputed
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 
 

@@ -24,6 +24,8 @@ from framework.runs.provenance import config_hash
 from framework.synthetic.benchmark import SCENES
 from framework.tables.published import read_published
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAKES = CHECKOUT / "tests" / "support" / "fake_conf"
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

@@ -23,6 +23,8 @@ from framework.runs.timings_file import read_timings
 from tests.framework.commands.running.test_run import begin, end, wait_for
 from tests.support.scenes.corner_room import GridMap
 
+pytestmark = pytest.mark.acceptance
+
 KILLS = int(os.environ.get("INSTANCEMAP_KILLS", "6"))
 SHORT = ("dataset.frames=20", "fuser.slow_s=0.02", "fuser.slow_save_s=0.3", "fuser.note=note")
 LONGEST_WAIT_S = 1.2  # from any of the moments below; mapping takes half a second here, and the record another

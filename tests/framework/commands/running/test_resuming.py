@@ -20,6 +20,8 @@ from framework.geometry import inverse, rotation_angle
 from framework.tracking.keyframes_file import read_places, write_places
 from tests.support.scenes.corner_room import CornerRoom
 
+pytestmark = pytest.mark.integration
+
 GIVEN = ("detector=ground_truth", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
 TRACKED = ("detector=none", "fuser.voxel_size=0.02")
 DESK = TumRgbd(Path("data/desk"), scene="rgbd_dataset_freiburg1_rpy")

@@ -18,6 +18,8 @@ import pytest
 from framework.files.directory_lock import locked
 from framework.runs.stored_runs import MAPPED
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAKES = [f"{stage}=fake" for stage in ("dataset", "detector", "tracker", "refiner", "fuser")]
 SMALL = ("trajectory.txt", "timings.csv", "instances.json")

@@ -15,6 +15,8 @@ from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError, FrameError
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 
 

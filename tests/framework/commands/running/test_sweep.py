@@ -24,6 +24,8 @@ from framework.files.search_paths import CONF
 from framework.runs.provenance import config_hash
 from framework.runs.run_directory import MAPPED
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 FAILED = "error: a run failed: dataset tests.support.scenes.corner_room.CornerRoom: frames"
 PLACE = Path("outputs") / "fake_ablation"

@@ -24,6 +24,8 @@ from framework.files.image_files import read_color, read_uint16
 from framework.files.ply import read_ply
 from tests.support.recordings.damaged_files import EXAMPLES, check, damaged
 
+pytestmark = pytest.mark.integration
+
 PLACE = re.compile(r"(line|byte) \d+")
 
 PLY_HEADER = b"""ply

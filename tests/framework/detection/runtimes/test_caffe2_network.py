@@ -17,6 +17,8 @@ from framework.detection.runtimes.caffe2_network import (
 )
 from framework.errors import DataError
 
+pytestmark = pytest.mark.integration
+
 in_integers = pytest.mark.skipif(not has_int8_kernels(), reason="torch has no 8-bit convolutions for this processor")
 
 

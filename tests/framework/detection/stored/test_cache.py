@@ -41,6 +41,8 @@ from plugins.detectors.simulated import SimulatedDetector
 from tests.support import registered
 from tests.support.scenes.corner_room import CAMERA, CLASSES, CornerRoom, SphereDetector
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[4]
 FIELDS = ("masks", "boxes", "scores", "class_probabilities")
 

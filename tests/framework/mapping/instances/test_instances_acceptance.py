@@ -1,12 +1,15 @@
 """What the default refiner and fuser make of exact scenes: objects that touch come apart, one object stays one."""
 
 import numpy as np
+import pytest
 
 from framework.data import Detections, Frame, Pose
 from framework.interfaces import MapFuser
 from framework.refinement.lifting import lift
 from tests.support.registered import built
 from tests.support.scenes.box_scene import BoxScene, bled, chair, detected, look_from, table
+
+pytestmark = pytest.mark.acceptance
 
 VOXEL = 0.02  # m
 CHAIR, TABLE, COUCH = 0, 1, 2

@@ -13,6 +13,8 @@ from framework.mapping.voxels.voxel_grid import VoxelGrid
 from tests.support.one_pixel import COVERED, FLOOR, UNITS, blank, distribution, measured, voted
 from tests.support.thread_counts import by_one_thread_and_two
 
+pytestmark = pytest.mark.integration
+
 
 def with_voxels(count: int) -> EvidenceRows:
     """Labels of a map from before, of so many voxels, whose slots hold anything."""

@@ -24,6 +24,8 @@ from tests.support.recordings.damaged_files import EXAMPLES, LARGE, changed_json
 from tests.support.scenes.analytic_scene import room, walk
 from tests.support.true_masks import fuse_masks, masks_of
 
+pytestmark = pytest.mark.integration
+
 SLOWEST = 5.0  # s of this process: others may keep the machine busy
 CAMERA = Camera(24, 18, 20.0, 20.0, 11.5, 8.5)
 KINDS = ("bayesian_tsdf", "words", "exact", "last_write", "object_volumes", "open3d_vbg", "semantic_components")

@@ -20,6 +20,8 @@ from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
 from tests.support.scenes.analytic_scene import room, walk
 
+pytestmark = pytest.mark.integration
+
 VOXEL = 0.05  # m
 BAND = 0.5  # m
 MESH_ARRAYS = ("vertices", "triangles", "colors", "instance_ids", "class_ids")

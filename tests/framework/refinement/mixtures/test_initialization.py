@@ -5,9 +5,12 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+import pytest
 
 from framework.refinement.mixtures.initialization import START_ITERATIONS, start_labels
 from framework.refinement.neighborhood import Neighborhoods
+
+pytestmark = pytest.mark.integration
 
 
 def around(counts: list[tuple[int, int]]) -> tuple[Neighborhoods, np.ndarray]:

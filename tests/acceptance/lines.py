@@ -1,0 +1,148 @@
+"""The acceptance lines. Each function returns its value and if the value is within the bound."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import venv
+from pathlib import Path
+from typing import Any
+
+from tests.acceptance.runner import CHECKOUT, Measured, line
+
+SHARED = CHECKOUT.parent / "shared" / "data"
+PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
+MOST_LINES = 49_000
+
+
+def mapped(*overrides: str) -> dict[str, Any]:
+    """Map a sequence and return its metrics."""
+    with tempfile.TemporaryDirectory() as directory:
+        command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directory}/run"]
+        subprocess.run(command, cwd=CHECKOUT, check=True)
+        metrics: dict[str, Any] = json.loads(Path(directory, "run", "metrics.json").read_text())
+        return metrics
+
+
+def failures(*arguments: str, **variables: str) -> Measured:
+    """Run tests; the value is the exit status of pytest, which is 0 if all pass."""
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:xdist", *arguments]
+    status = subprocess.run(command, cwd=CHECKOUT, env=os.environ | variables, check=False).returncode
+    return status, status == 0
+
+
+def folder(scene: str) -> tuple[str, str]:
+    return "dataset=rgbd_folder", f"dataset.root={SHARED / scene}"
+
+
+RPY = ("dataset=tum_rgbd", f"dataset.root={SHARED / 'tum_fr1_rpy_a' / 'rgbd_dataset_freiburg1_rpy'}", "detector=none")
+
+
+def ate_mm(bound: float, *overrides: str) -> Measured:
+    value = 1e3 * mapped(*overrides)["trajectory.ate_rmse_m"]
+    return value, value <= bound
+
+
+def lost_frames(*overrides: str) -> Measured:
+    value = mapped(*overrides)["frames_lost"]
+    return value, value == 0
+
+
+def ap50(bound: float, scene: str) -> Measured:
+    value = mapped(*folder(scene), "tracker=ground_truth")["instances.ap50"]
+    return value, value >= bound
+
+
+@line("ATE <= 15 mm, 300 frames", *PIPELINE)
+def kitchen_ate() -> Measured:
+    return ate_mm(15, *folder("redkitchen"), "detector=none")
+
+
+@line("0 frames, 300 frames", *PIPELINE)
+def kitchen_lost_frames() -> Measured:
+    return lost_frames(*folder("redkitchen"), "detector=none")
+
+
+@line("ATE <= 40 mm", *PIPELINE)
+def freiburg1_rpy_ate() -> Measured:
+    return ate_mm(40, *RPY)
+
+
+@line("0 frames", *PIPELINE)
+def freiburg1_rpy_lost_frames() -> Measured:
+    return lost_frames(*RPY)
+
+
+@line("AP50 >= 0.8, given poses", *PIPELINE)
+def replica_floor2_ap50() -> Measured:
+    return ap50(0.8, "replica_floor2")
+
+
+@line("AP50 >= 0.6, given poses", *PIPELINE)
+def kitchen_ap50() -> Measured:
+    return ap50(0.6, "redkitchen")
+
+
+@line("whole loop >= 6 times as fast as Open3D, kitchen, 1 cm", *PIPELINE, "tests/benchmarks")
+def speed_ratio() -> Measured:
+    with tempfile.TemporaryDirectory() as directory:
+        report = Path(directory, "benchmark.json")
+        chosen = "test_slam_beside_open3d and redkitchen and 1cm"
+        failures("tests/benchmarks/test_slam.py", "-k", chosen, f"--benchmark-json={report}")
+        info = json.loads(report.read_text())["benchmarks"][0]["extra_info"]
+    ours, theirs = info["whole loop, ms (ours, Open3D)"]
+    return theirs / ours, theirs / ours >= 6
+
+
+@line("exit status 0, 2,000 cases a test", *PIPELINE, "tests")
+def fuzzing() -> Measured:
+    return failures("tests", "-k", "fuzz", INSTANCEMAP_FUZZ="2000")
+
+
+@line("exit status 0, 30 kills", *PIPELINE, "tests/framework/commands/running")
+def random_kills() -> Measured:
+    return failures("tests/framework/commands/running/test_random_kills.py", INSTANCEMAP_KILLS="30")
+
+
+@line("exit status 0", *PIPELINE, "tests")
+def long_tests() -> Measured:
+    return failures("-m", "acceptance", "tests")
+
+
+@line(
+    "0 failing commands, fresh virtual environment", "framework", "plugins", "conf", "instancemap.py", "pyproject.toml"
+)
+def wheel() -> Measured:
+    """Install the wheel in a new environment and use it from an empty folder."""
+    with tempfile.TemporaryDirectory() as directory:
+        wheels, environment, empty = (Path(directory, name) for name in ("wheels", "environment", "empty"))
+        empty.mkdir()
+        build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", str(wheels), str(CHECKOUT)]
+        subprocess.run(build, check=True)
+        venv.create(environment, with_pip=True)
+        programs = environment / "bin"
+        install = [str(programs / "python"), "-m", "pip", "install", "-q", *map(str, wheels.glob("*.whl"))]
+        subprocess.run(install, check=True)
+        alone = {key: value for key, value in os.environ.items() if key != "PYTHONPATH"}
+        commands = (
+            ["--version"],
+            ["hydra.run.dir=outputs/desk"],
+            ["report", "outputs/desk"],
+            ["new-plugin", "refiner", "my_refiner"],
+        )
+        statuses = [
+            subprocess.run([str(programs / "instancemap"), *words], cwd=empty, env=alone, check=False).returncode
+            for words in commands
+        ]
+    failed = sum(status != 0 for status in statuses)
+    return failed, failed == 0
+
+
+@line("<= 49,000 lines of framework/ and plugins/", "framework", "plugins")
+def line_count() -> Measured:
+    files = [path for package in ("framework", "plugins") for path in (CHECKOUT / package).rglob("*.py")]
+    count = sum(len(path.read_bytes().splitlines()) for path in files)
+    return count, count <= MOST_LINES

@@ -1,0 +1,98 @@
+"""Registered acceptance lines, and the page with their latest values: docs/results/acceptance.md."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from datetime import date
+from pathlib import Path
+
+CHECKOUT = Path(__file__).resolve().parents[2]
+PAGE = CHECKOUT / "docs" / "results" / "acceptance.md"
+COLUMNS = ("line", "value", "bound", "date", "commit", "machine", "minutes")
+HEADER = """# Acceptance
+
+`make acceptance` measures the lines that are missing or whose code has changed since the measured commit.
+`make acceptance LINE=NAME` measures one line. `tests/acceptance/lines.py` defines the lines.
+
+"""
+Measured = tuple[float, bool]  # the value, and if it is within the bound
+
+
+@dataclass(frozen=True)
+class Line:
+    """One acceptance criterion."""
+
+    name: str
+    bound: str  # with unit, for the page
+    paths: Sequence[str]  # the code that the value depends on, relative to the checkout
+    measure: Callable[[], Measured]
+
+
+LINES: dict[str, Line] = {}
+
+
+def line(bound: str, *paths: str) -> Callable[[Callable[[], Measured]], Callable[[], Measured]]:
+    """Register a function as the acceptance line of its name."""
+
+    def register(measure: Callable[[], Measured]) -> Callable[[], Measured]:
+        LINES[measure.__name__] = Line(measure.__name__, bound, paths, measure)
+        return measure
+
+    return register
+
+
+def read_rows(page: Path = PAGE) -> dict[str, list[str]]:
+    """Return the cells of each measured line, by name."""
+    if not page.exists():
+        return {}
+    rows = [
+        [cell.strip() for cell in text.strip("|").split("|")] for text in page.read_text().splitlines() if "|" in text
+    ]
+    return {row[0]: row for row in rows[2:] if len(row) == len(COLUMNS)}
+
+
+def write_rows(rows: dict[str, list[str]], page: Path = PAGE) -> None:
+    table = [COLUMNS, ["---"] * len(COLUMNS), *(rows[name] for name in sorted(rows))]
+    page.write_text(HEADER + "".join(f"| {' | '.join(row)} |\n" for row in table))
+
+
+def is_current(row: Sequence[str], paths: Sequence[str]) -> bool:
+    """Return True if the code of the line is the same as at the measured commit."""
+    commit = row[COLUMNS.index("commit")]
+    if commit.endswith("+"):  # measured with uncommitted changes
+        return False
+    return not _git("diff", "--name-only", commit, "--", *paths, missing="unknown commit")
+
+
+def measure(chosen: Line) -> list[str]:
+    """Measure a line and return its row."""
+    commit = _git("rev-parse", "--short", "HEAD") + "+" * bool(_git("status", "--porcelain", "--", *chosen.paths))
+    begin = time.monotonic()
+    value, met = chosen.measure()
+    minutes = (time.monotonic() - begin) / 60
+    shown = f"{value:.6g}" if met else f"{value:.6g} (missed)"
+    return [chosen.name, shown, chosen.bound, str(date.today()), commit, _machine(), f"{minutes:.1f}"]
+
+
+def run(names: Sequence[str]) -> bool:
+    """Measure the named lines, or all that are missing or outdated. Return True if all meet their bounds."""
+    rows = read_rows()
+    for name in names or [k for k, known in LINES.items() if k not in rows or not is_current(rows[k], known.paths)]:
+        rows[name] = measure(LINES[name])
+        write_rows({known: row for known, row in rows.items() if known in LINES})
+        print(" | ".join(rows[name]), flush=True)
+    return not any("(missed)" in rows[name][1] for name in names or rows)
+
+
+def _git(*arguments: str, missing: str = "") -> str:
+    done = subprocess.run(["git", "-C", str(CHECKOUT), *arguments], capture_output=True, text=True, check=False)
+    return done.stdout.strip() if done.returncode == 0 else missing
+
+
+def _machine() -> str:
+    cpu = next((text for text in Path("/proc/cpuinfo").read_text().splitlines() if text.startswith("model name")), "")
+    return f"{os.cpu_count()} cores, {cpu.partition(':')[2].strip() or 'unknown CPU'}"
