@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import subprocess
@@ -18,8 +19,9 @@ PIPELINE = ("framework", "plugins", "conf", "tests/acceptance")
 MOST_LINES = 49_000
 
 
+@functools.cache
 def mapped(*overrides: str) -> dict[str, Any]:
-    """Map a sequence and return its metrics."""
+    """Map a sequence and return its metrics. Lines that share a run in one process map it once."""
     with tempfile.TemporaryDirectory() as directory:
         command = [sys.executable, "-m", "framework", *overrides, f"hydra.run.dir={directory}/run"]
         subprocess.run(command, cwd=CHECKOUT, check=True)
