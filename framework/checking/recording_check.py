@@ -65,7 +65,10 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
     count = len(sequence)
     chosen = [int(k) for k in np.unique(np.linspace(0, count - 1, LOOKED_AT).round())]
     frames, unreadable = _read(sequence, chosen)
-    findings = [_readable(unreadable, chosen)] if unreadable else []
+    findings = []
+    if unreadable:
+        text = f"{len(unreadable)} of {len(chosen)} cannot be read; the first: {unreadable[0]}"
+        findings.append(Finding(Verdict.NOTE, "frames", text))
     of_depth, median_depth = _depth(frames, farthest, _scale_of(sequence))
     edges = EdgeComparison(sequence, _with_neighbours(chosen, count))
     by_delay = edges.by_delay()
@@ -191,11 +194,6 @@ def _read(sequence: RGBDSequence, chosen: Sequence[int]) -> tuple[list[Frame], l
     if not frames:
         raise DataError(f"none of the {len(chosen)} frames that were looked at can be read; the first: {faults[0]}")
     return frames, faults
-
-
-def _readable(faults: Sequence[FrameError], chosen: Sequence[int]) -> Finding:
-    text = f"{len(faults)} of {len(chosen)} cannot be read; the first: {faults[0]}"
-    return Finding(Verdict.NOTE, "frames", text)
 
 
 def _depth(frames: Sequence[Frame], farthest: float, scale: float) -> tuple[Finding, float]:

@@ -55,7 +55,7 @@ class SevenScenes(Recording):
 def _recorded(folder: Path, number: int) -> RecordedFrame:
     stem = f"frame-{number:06d}"
     files = StoredImages.of_files(folder / f"{stem}.color.png", folder / f"{stem}.depth.png")
-    images = replace(files, depth=lambda: _color_camera_depth(files.depth()))
+    images = replace(files, depth=lambda: register(files.depth()))
     return RecordedFrame.posed(images, number / FRAME_RATE, lambda: _color_pose(folder / f"{stem}.pose.txt"))
 
 
@@ -66,16 +66,14 @@ def _color_pose(path: Path) -> Float64:
     return read_matrix(path).pose() @ T_depthcamera_camera
 
 
-def _color_camera_depth(raw: UInt16) -> UInt16:
-    """The registered image; one of another size unchanged, so that the reader rejects it by its size."""
-    return register(raw) if raw.shape == DEPTH_CAMERA.shape else raw
-
-
 def register(raw: UInt16) -> UInt16:
     """The depth camera's readings (H, W) mm as the colour camera sees them, the nearest one in each pixel.
 
-    The colour camera sees more than the depth camera: the border has no reading, and the image shrinks without holes.
+    An image of another size is returned as it is, so that the reader rejects its size. The colour camera sees more than
+    the depth camera: the border has no reading, and the image shrinks without holes.
     """
+    if raw.shape != DEPTH_CAMERA.shape:
+        return raw
     registered = np.zeros(COLOR_CAMERA.shape, np.uint16)
     ratio = COLOR_CAMERA.fx / DEPTH_CAMERA.fx
     _move(

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from framework.data import Bool, Float64, Int32
+from framework.data import Bool, Int32
 from framework.rendering.palette import INK, PAPER
 
 MIN_PIXELS = 60  # an object that shows less gets no name in the picture
@@ -113,7 +113,7 @@ def _place_beside(
         if distance >= least or not _is_free(box, boxes, others.shape):
             continue
         line = np.linspace((u, v), _nearest_point(box, u, v), SAMPLES)
-        if any(_is_in(other, line).any() for other in boxes):
+        if any(((line >= other[:2]) & (line <= other[2:])).all(axis=1).any() for other in boxes):
             continue
         columns, rows = np.rint(line).astype(int).T
         cost = distance + COVERING * objects[_pixels(box)].mean() + CROSSING * others[rows, columns].mean()
@@ -143,11 +143,6 @@ def _is_free(box: Box, taken: Sequence[Box], shape: tuple[int, ...]) -> bool:
     left, top, right, bottom = box
     inside = left >= 0 and top >= 0 and right <= shape[1] - 1 and bottom <= shape[0] - 1
     return inside and not any(left < o[2] and o[0] < right and top < o[3] and o[1] < bottom for o in taken)
-
-
-def _is_in(box: Box, points: Float64) -> Bool:
-    """(N,) which of the points (N, 2) lie in the box."""
-    return np.asarray(((points >= box[:2]) & (points <= box[2:])).all(axis=1))
 
 
 def _nearest_point(box: Box, u: float, v: float) -> tuple[float, float]:

@@ -11,10 +11,10 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import asdict
 from functools import partial
 from multiprocessing.connection import wait as wait_for_end
@@ -111,7 +111,7 @@ class _Scene:
         frames = [index for index, pair in enumerate(files) if not all(path.exists() for path in pair)]
         self.missing = len(frames)
         chunks = (frames[at : at + FRAMES_AT_ONCE] for at in range(0, len(frames), FRAMES_AT_ONCE))
-        self._left = [_write_truth, *(partial(_write_frames, frames=chunk) for chunk in chunks)]
+        self._left = [SceneNNScene.write_truth, *(partial(SceneNNScene.write_frames, frames=chunk) for chunk in chunks)]
 
     @property
     def ready(self) -> int:
@@ -125,7 +125,7 @@ class _Scene:
         if self._left:
             return self._left.pop(0)
         self._complete = True
-        return _write_walk
+        return SceneNNScene.write_walk
 
 
 def _choose(scenes: list[_Scene], last: _Scene | None) -> _Scene | None:
@@ -145,22 +145,6 @@ def _result(future: Future[int], folder: Path) -> int:
             f"a process that wrote {folder} was ended from outside, perhaps for want of memory; run the same command "
             "again: it goes on from here"
         ) from error
-
-
-def _write_frames(scene: SceneNNScene, frames: Sequence[int]) -> int:
-    for index in frames:
-        scene.write_frame(index)
-    return len(frames)
-
-
-def _write_truth(scene: SceneNNScene) -> int:
-    scene.write_truth()
-    return 0
-
-
-def _write_walk(scene: SceneNNScene) -> int:
-    scene.write_walk()
-    return 0
 
 
 def _begin_process() -> None:
@@ -184,17 +168,11 @@ _in_memory: list[SceneNNScene] = []  # of this process: the scene that it wrote 
 
 def _write(folder: Path, spec: SceneSpec, recording: BenchmarkSettings, piece: Piece) -> int:
     """Writes a piece of the scene, in one of the processes."""
-    with _interruptible():
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
         if not _in_memory or _in_memory[0].folder != folder:
             _in_memory.clear()
             _in_memory.append(SceneNNScene(folder, spec, recording))
         return piece(_in_memory[0])
-
-
-@contextmanager
-def _interruptible() -> Iterator[None]:
-    signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
     finally:
         signal.signal(signal.SIGINT, signal.SIG_IGN)

@@ -6,6 +6,7 @@ SceneNN's world is y-up and the room is z-up, so everything that is written is t
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -120,6 +121,12 @@ class SceneNNScene:
         self.labels = ids.astype(np.int32)  # (N + 1,) what each instance id of the room is called in the files
         self.colors = scene.rng.integers(64, 256, (len(ids), 3))  # RGB, of each
 
+    def write_frames(self, frames: Sequence[int]) -> int:
+        """Color and depth of some frames; returns their number."""
+        for index in frames:
+            self.write_frame(index)
+        return len(frames)
+
     def write_frame(self, index: int) -> None:
         """Colour and depth of frame `index`, counted from 0."""
         T_world_camera = self.path.pose(index)
@@ -133,8 +140,8 @@ class SceneNNScene:
         _write_png(depth_file, np.rint(1000 * depth).astype(np.uint16))
         _write_png(color_file, cv2.cvtColor(color, cv2.COLOR_RGB2BGR))
 
-    def write_truth(self) -> None:
-        """The labelled mesh and what its labels mean. As in SceneNN's, what is never read is not in it."""
+    def write_truth(self) -> int:
+        """The labelled mesh and what its labels mean, and no frame; what is never read is not in it."""
         frames, name = self.recording.frames, self.folder.name
         every = -(-frames // TRUTH_VIEWS)
         views = (self.path.pose(index) for index in range(0, frames, every))
@@ -143,6 +150,7 @@ class SceneNNScene:
         vertices = transform(T_YUP_ZUP, mesh.vertices)
         write_ply(self.folder / f"{name}.ply", vertices, mesh.triangles, {"label": self.labels[mesh.instance_ids]})
         write_annotation(self.folder / f"{name}.xml", self._annotated(vertices, mesh.instance_ids))
+        return 0
 
     def _annotated(self, vertices: Float32, instance_ids: Int32) -> list[Annotated]:
         """The objects of which the mesh shows something, by label; `vertices` (V, 3) m are y-up."""
@@ -166,7 +174,7 @@ class SceneNNScene:
             )
         return sorted(annotated, key=lambda one: one.id)
 
-    def write_walk(self) -> None:
+    def write_walk(self) -> int:
         """The timestamps and the trajectory, which come last: where the trajectory is, the scene is complete."""
         frames = range(self.recording.frames)
         with written_whole(self.folder / "timestamp.txt") as temporary:
@@ -174,6 +182,7 @@ class SceneNNScene:
             temporary.write_text("".join(f"{k} {time} {time}\n" for k, time in enumerate(times, start=1)))
         poses = {index: T_YUP_ZUP @ self.path.pose(index) for index in frames}
         write_trajectory_log(trajectory_file(self.folder), poses)
+        return 0
 
 
 def frame_files(folder: Path, index: int) -> tuple[Path, Path]:

@@ -7,7 +7,7 @@ import math
 import re
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
@@ -201,7 +201,9 @@ def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     if not folder.is_dir():
         raise DataError(f"the folder {folder} is missing")
     files: dict[int, Path] = {}
-    for path in _images(folder, suffixes):
+    for path in sorted(folder.iterdir()):
+        if path.suffix.lower() not in suffixes or path.name.startswith("."):
+            continue
         number = number_of(path)
         if number is None:
             raise DataError(f"{path}: the file name must end in the frame's number, like 000000{path.suffix}")
@@ -238,12 +240,6 @@ def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[in
             continue
         return width, height
     raise DataError(f"no image can be read: {faults[0]}")
-
-
-def _images(folder: Path, suffixes: Sequence[str]) -> Iterator[Path]:
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() in suffixes and not path.name.startswith("."):
-            yield path
 
 
 def number_of(path: Path) -> int | None:

@@ -58,7 +58,7 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     names are in no table.
     """
     ply = read_ply(mesh)
-    segments = _read_segments(segs)
+    segments = _whole_numbers(f"{segs}: segIndices", _read_list(segs, "segIndices"))
     if len(segments) != len(ply.vertices):
         raise DataError(f"{segs} has {len(segments)} segIndices, but {mesh.name} {len(ply.vertices)} vertices")
     present, segment_of_vertex = np.unique(segments, return_inverse=True)
@@ -173,11 +173,6 @@ def _positions(path: Path, group: SegGroup, present: Int64) -> Int64:
     if len(absent):
         raise DataError(f"{path}: object {group.object_id} has segment {absent[0]}, which no vertex is in")
     return np.searchsorted(present, group.segments)
-
-
-def _read_segments(path: Path) -> Int64:
-    """The segment (V,) of each vertex."""
-    return _whole_numbers(f"{path}: segIndices", _read_list(path, "segIndices"))
 
 
 def _group(where: str, group: Any) -> SegGroup:

@@ -25,8 +25,10 @@ def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
     when a key is missing, there twice, or its value is no finite number, positive for focal lengths and sizes.
     """
     values: dict[str, float] = {}
-    for number, line in enumerate(_lines(path), start=1):
-        key, *found = re.split(r"\s*[=:]\s*|\s+", re.split("[#;]", line)[0].strip(), maxsplit=1)
+    lines = read_bytes(path, LARGEST_FILE).removeprefix(BOM_UTF8).splitlines()
+    for number, line in enumerate(lines, start=1):
+        content = re.split("[#;]", line.decode("latin-1"))[0].strip()
+        key, *found = re.split(r"\s*[=:]\s*|\s+", content, maxsplit=1)
         key = key.lower()
         if key not in POSITIVE and key not in KEYS:
             continue
@@ -52,11 +54,6 @@ def write_intrinsics(path: Path, camera: Camera) -> None:
     values = sizes | {key: getattr(camera, key) for key in KEYS}
     with written_whole(path) as temporary:
         temporary.write_text("".join(f"{key} {value!r}\n" for key, value in values.items()), encoding="ascii")
-
-
-def _lines(path: Path) -> list[str]:
-    content = read_bytes(path, LARGEST_FILE).removeprefix(BOM_UTF8)
-    return [line.decode("latin-1") for line in content.splitlines()]
 
 
 def _number(text: str) -> float | None:

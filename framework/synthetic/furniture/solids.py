@@ -206,7 +206,8 @@ def tube(points: Sequence[tuple[float, float, float]], radius: float, segments: 
     path = _spline(np.asarray(points, np.float64))
     tangents = np.gradient(path, axis=0)
     tangents /= np.linalg.norm(tangents, axis=1, keepdims=True)
-    aside = np.cross(tangents, _least_aligned(tangents))
+    # one coordinate axis that is far from parallel to all tangents, so that the rod does not twist
+    aside = np.cross(tangents, np.eye(3)[np.abs(tangents).max(axis=0).argmin()])
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     other = np.cross(tangents, aside)
     angle = np.linspace(0, 2 * np.pi, segments + 1)
@@ -216,11 +217,6 @@ def tube(points: Sequence[tuple[float, float, float]], radius: float, segments: 
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     texture = np.stack(np.broadcast_arrays(length[:, None], radius * angle[None], 0.0), axis=-1).reshape(-1, 3)
     return Solid(vertices, radial.reshape(-1, 3), triangles, texture)
-
-
-def _least_aligned(tangents: Float64) -> Float64:
-    """One coordinate axis that is far from parallel to all tangents, so that the rod does not twist."""
-    return np.asarray(np.eye(3)[np.abs(tangents).max(axis=0).argmin()])
 
 
 def _spline(points: Float64) -> Float64:
