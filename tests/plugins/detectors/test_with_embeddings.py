@@ -56,7 +56,7 @@ def picture(index: int = 0) -> Frame:
 def test_pictures_and_words_are_embedded_as_transformers_does_it(folder: Path) -> None:
     from transformers import AutoModel, AutoTokenizer
 
-    model = ImageTextModel(str(folder), "main", "cpu", half_precision=False)
+    model = ImageTextModel(str(folder), "main", "cpu", half=False)
     crops = np.random.default_rng(0).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
     network = AutoModel.from_pretrained(folder).eval()
     is_clip = network.config.model_type == "clip"
@@ -150,7 +150,7 @@ def test_a_nested_detector_is_chosen_by_name_and_its_faults_say_where(siglip: Pa
     assert found.embeddings is not None
     assert found.embeddings.any(axis=1).sum() >= 1
     with pytest.raises(
-        ConfigError, match=r"detector plugins\.detectors\.with_embeddings\.WithEmbeddings: of: .*min_pixels"
+        ConfigError, match=r"detector plugins\.detectors\.with_embeddings\.WithEmbeddings: detector: .*min_pixels"
     ):
         registered.built("detector", "with_embeddings", chosen, "detector.detector.min_pixels=0")
     with pytest.raises(ConfigError, match="of must be given"):
