@@ -28,7 +28,8 @@ def main() -> None:
     sections = examine()
     errors = sum(check.status is Status.ERROR for checks in sections.values() for check in checks)
     print(_as_json(sections) if options.json else _as_text(sections, errors), flush=True)
-    sys.exit(1 if errors else 0)
+    if errors:
+        sys.exit(1)
 
 
 def examine() -> dict[str, list[Check]]:
