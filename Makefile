@@ -9,6 +9,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed # its time says for which pyproject.toml the environment was made
 INSTALLED_DEV := $(VENV)/.installed-dev # likewise with what tests, linter and type checker need
 DEMO := outputs/demo
+TESTED_EXTRAS := joblib,onnx,phone,ray,ros,slurm,transformers,usd,viewer
 
 IN_RANGE := import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))
 
@@ -74,6 +75,7 @@ $(INSTALLED): pyproject.toml
 	@$(MAKE) --no-print-directory system-libraries
 	@$(BIN)/python -m pip --version >/dev/null 2>&1 || "$(or $(PYTHON),python3)" -m venv $(VENV)
 	@echo "installing the libraries into $(VENV)"
+	@$(PIP_INSTALL) 'pip>=25.1' # reads dependency groups
 	@$(PIP_INSTALL) 'torch==2.13.0'
 	@$(PIP_INSTALL) --editable .
 	@touch $(INSTALLED)
@@ -81,7 +83,7 @@ $(INSTALLED): pyproject.toml
 $(INSTALLED_DEV): $(INSTALLED)
 	@$(MAKE) --no-print-directory browser
 	@echo "installing what the tests need"
-	@$(PIP_INSTALL) --editable '.[dev]'
+	@$(PIP_INSTALL) --group dev --editable '.[$(TESTED_EXTRAS)]'
 	@touch $(INSTALLED_DEV)
 
 # What is missing of: Python with venv, git (for the commit in the run records), Open3D's shared libraries.

@@ -32,7 +32,7 @@ pixel centres at integers; instance 0 = none. Every fault that is yours to mend 
 
 Stages of your own are dataclasses that implement Detector, PoseTracker, ClusterRefiner or MapFuser. They go together
 as `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or are chosen by name once a YAML registers them
-(CONTRIBUTING.md says how).
+(CONTRIBUTING.md says how). Plugins import only `instancemap`, and their tests `instancemap.testing`.
 """
 
 from importlib.util import find_spec
@@ -48,4 +48,48 @@ if _found is None or str(_own) not in [str(Path(place).resolve()) for place in _
 
 from framework import __version__
 from framework.api import *
-from framework.api import __all__
+from framework.api import __all__ as _api
+from framework.config.validation import check_bounds
+from framework.data import Bool, Float32, Float64, FrameTruth, Int32, Int64, SceneTruth, SurfaceView, UInt8
+from framework.datasets.frames.sequence_reader import TO_THE_END, choose_frames
+from framework.files.search_paths import folder_of
+from framework.geometry import back_project, exp_se3, inverse, project, transform
+from framework.mapping.instance_map import InstanceMap
+from framework.mapping.instances.association import Association
+from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
+from framework.mapping.labels.pixel_lists import list_points_by_pixel
+from framework.refinement.selection import keep_points
+from framework.registry import assemble
+
+__all__ = [
+    *_api,
+    "TO_THE_END",
+    "Association",
+    "Bool",
+    "Combine",
+    "Float32",
+    "Float64",
+    "FrameTruth",
+    "InstanceMap",
+    "Int32",
+    "Int64",
+    "LabelRule",
+    "LabeledVoxels",
+    "SceneTruth",
+    "SurfaceView",
+    "UInt8",
+    "assemble",
+    "back_project",
+    "check_bounds",
+    "choose_frames",
+    "exp_se3",
+    "folder_of",
+    "inverse",
+    "keep_points",
+    "list_points_by_pixel",
+    "project",
+    "transform",
+    "vote_for_best",
+]
+__path__ = [str(_own / "testing" / "public")]  # the folder of the submodule instancemap.testing

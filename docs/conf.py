@@ -45,4 +45,7 @@ autodoc_type_aliases = {
 }
 
 nitpicky = True
-nitpick_ignore_regex = [("py:.*", r"(?!(framework|plugins|instancemap)\.).*")]  # other libraries: nothing is fetched
+nitpick_ignore_regex = [
+    ("py:.*", r"(?!(framework|plugins|instancemap)\.).*"),  # other libraries: nothing is fetched
+    ("py:class", r"framework\.(mapping\..*|registry\.Plugin)"),  # types that plugins only pass on
+]

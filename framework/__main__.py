@@ -10,6 +10,8 @@ from importlib import import_module
 from io import TextIOWrapper
 from pathlib import Path
 
+import framework
+
 COMMANDS = {
     "tables": "run records below a folder become tables: Markdown, LaTeX, CSV",
     "figures": "run records below a folder become the paper's figures",
@@ -82,17 +84,18 @@ def module_of(command: str) -> str:
 
 
 def leave_working_folder(arguments: list[str]) -> None:
-    """Takes the working folder from where modules are looked for, in which `python -m` puts it first.
+    """Remove the working folder from the module search path: it may be a run directory from someone else.
 
-    It may be a record that somebody sent. With --config-dir, which registers modules of one's own, it comes last.
+    With --config-dir, which registers plugins of the user's own, append it. `python -P` keeps it out in any case.
     """
     try:
         here = str(Path.cwd())
     except FileNotFoundError:
         sys.exit("error: the working folder has been removed; change to another one")
-    if sys.flags.safe_path or sys.path[0] not in ("", here) or Path(here) == Path(__file__).resolve().parents[1]:
+    if sys.flags.safe_path or Path(here) == Path(__file__).resolve().parents[1]:
         return
-    del sys.path[0]
+    if sys.path[0] in ("", here):  # of `python -m`
+        del sys.path[0]
     if any(word.startswith(("--config-d", "-cd")) for word in arguments):
         sys.path.append(here)
 
@@ -132,6 +135,9 @@ def main() -> None:
         except OSError as error:
             drop_output()
             sys.exit(f"error: the help could not be written: {error.strerror}")
+        return
+    if word == "--version":
+        print(f"instancemap {framework.__version__}")
         return
     if word in COMMANDS:
         sys.argv[:2] = [f"{program} {word}"]

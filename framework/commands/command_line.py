@@ -16,11 +16,12 @@ from pathlib import Path
 
 from hydra.conf import HydraConf
 from hydra.core.hydra_config import HydraConfig
+from hydra.core.plugins import Plugins
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.config.composition import add_config_dir, one_line
+from framework.config.composition import InstalledConfigs, add_config_dir, one_line
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
 from framework.runtime.signals import Interrupted
 
@@ -135,6 +136,7 @@ class Jobs:
         with one_line_errors():
             for folder in filter(Path.is_dir, _config_dirs(sys.argv[1:])):  # Hydra says where one is missing
                 add_config_dir(folder)  # for what is done when Hydra has ended, such as a sweep's figure
+            Plugins.instance().register(InstalledConfigs)
             command()
         if self.status:
             sys.exit(self.status)

@@ -2,20 +2,25 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
 from difflib import get_close_matches
+from functools import cache
+from importlib.metadata import entry_points
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from hydra import compose, initialize_config_dir
 from hydra._internal.core_plugins import file_config_source
 from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.config_search_path import SearchPathQuery
+from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.plugins import Plugins
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult
+from hydra.plugins.search_path_plugin import SearchPathPlugin
 from omegaconf import DictConfig, ListConfig
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
@@ -24,6 +29,8 @@ from framework.errors import ConfigError, DataError, printable
 from framework.files.atomic_write import read_text
 from framework.files.search_paths import CONF
 from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
+
+log = logging.getLogger(__name__)
 
 
 def composed(*overrides: str, name: str = "config") -> DictConfig:
@@ -46,6 +53,34 @@ def add_config_dir(folder: Path) -> None:
     if not folder.is_dir():
         raise ConfigError(f"--config-dir: there is no folder {folder}")
     _added.append(folder.resolve())
+
+
+@cache
+def installed_config_dirs() -> dict[Path, str]:
+    """Return the config folders of the entry points `instancemap.configs`, each with the name of its package.
+
+    The value of an entry point is the dotted path of a folder. Nothing is imported.
+    """
+    folders = {}
+    for entry in entry_points(group="instancemap.configs"):
+        package, *parts = entry.value.split(".")
+        spec = find_spec(package)
+        places = [Path(place, *parts) for place in (spec and spec.submodule_search_locations) or ()]
+        folder = next(filter(Path.is_dir, places), None)
+        name = entry.dist.name if entry.dist else entry.name
+        if folder is None:
+            log.warning("%s: expected the folder %s of its entry point instancemap.configs", name, entry.value)
+        else:
+            folders[folder.resolve()] = name
+    return folders
+
+
+class InstalledConfigs(SearchPathPlugin):
+    """Adds the config folders of installed packages to the runs of this process, once registered with Hydra."""
+
+    def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        for folder, package in installed_config_dirs().items():
+            search_path.append(provider=package, path=f"file://{folder}")
 
 
 class FileConfigSource(file_config_source.FileConfigSource):
@@ -78,12 +113,13 @@ def config_directory() -> Iterator[None]:
     try:
         with initialize_config_dir(str(CONF), version_base="1.3"):
             loader: Any = GlobalHydra.instance().config_loader()
-            for folder in _added:
-                before = SearchPathQuery(
-                    provider="schema"
-                )  # which must stay the last, as Hydra's own --config-dir does it
-                loader.get_search_path().prepend(provider="command-line", path=f"file://{folder}", anchor=before)
-            if _added:
+            known = {element.path for element in loader.get_search_path().get_path()}
+            folders = installed_config_dirs() | dict.fromkeys(_added, "command-line")
+            before = SearchPathQuery(provider="schema")  # which must stay the last, as Hydra's own --config-dir does it
+            for folder, provider in folders.items():
+                if f"file://{folder}" not in known:
+                    loader.get_search_path().prepend(provider=provider, path=f"file://{folder}", anchor=before)
+            if folders:
                 loader.repository.initialize_sources(loader.get_search_path())
             yield
     finally:

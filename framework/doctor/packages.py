@@ -15,7 +15,6 @@ from packaging.utils import canonicalize_name
 from framework.doctor.check_result import Check, Status
 
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
-DEVELOPERS = ("dev", "docs", "evaluation-oracle")  # extras that users do not need
 
 
 @cache
@@ -69,8 +68,7 @@ def libraries(answers: Mapping[str, Mapping[str, Any]]) -> Iterator[Check]:
 def extras() -> Iterator[Check]:
     """Check every extra that users can install."""
     for name, lines in declared()[2].items():
-        if name not in DEVELOPERS:
-            yield extra(name, lines)
+        yield extra(name, lines)
 
 
 def extra(name: str, lines: Sequence[Requirement]) -> Check:

@@ -13,7 +13,10 @@ CONF = _PACKAGE / "conf" if (_PACKAGE / "conf").is_dir() else PROJECT_ROOT / "co
 def candidates(path: Path) -> tuple[Path, ...]:
     """The path, `~` resolved; of a relative one, where it would be in the working, then in the project folder."""
     path = expanded(path)
-    return (path,) if path.is_absolute() else tuple(dict.fromkeys((Path.cwd() / path, PROJECT_ROOT / path)))
+    if path.is_absolute():
+        return (path,)
+    packaged = [_PACKAGE.joinpath(*path.parts[1:])] if path.parts[:1] == ("data",) else []  # a wheel's framework/desk
+    return tuple(dict.fromkeys((Path.cwd() / path, PROJECT_ROOT / path, *packaged)))
 
 
 def folder_of(path: Path) -> Path:

@@ -108,15 +108,15 @@ def test_a_working_folder_that_is_gone_is_one_line(tmp_path: Path, monkeypatch: 
 def test_modules_are_not_looked_for_in_the_working_folder(
     options: list[str], at: int | None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With --config-dir, which registers some of one's own, there too, but last."""
+    """With --config-dir, of `python -m framework` and of the console script, they are, but last."""
     monkeypatch.chdir(tmp_path)
     for first in ("", str(tmp_path)):
         monkeypatch.setattr(sys, "path", [first, "/elsewhere"])
         leave_working_folder(["detector=x", *options])
         assert sys.path == (["/elsewhere"] if at is None else ["/elsewhere", str(tmp_path)])
     monkeypatch.setattr(sys, "path", ["/usr/bin", "/elsewhere"])  # as the console script has it
-    leave_working_folder([])
-    assert sys.path == ["/usr/bin", "/elsewhere"]
+    leave_working_folder(options)
+    assert sys.path == ["/usr/bin", "/elsewhere", *([] if at is None else [str(tmp_path)])]
     monkeypatch.chdir(CHECKOUT)
     monkeypatch.setattr(sys, "path", [str(CHECKOUT)])
     leave_working_folder([])

@@ -20,6 +20,7 @@ from framework.reporting.markup import SCRIPTS, STYLE
 from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go
 from tests.support import registered
 
+DESK = PROJECT_ROOT / "data" / "desk"
 WEIGHTS = Path("plugins/detectors/maskrcnn2go_int8")
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))
 OF_RENDERED_ROOMS = {"synthetic"}
@@ -111,13 +112,14 @@ def test_the_shipped_weights_are_the_published_ones() -> None:
 
 
 def test_the_wheel_has_networks_and_configs_where_an_installed_run_looks(tmp_path: Path) -> None:
-    wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling, of the extra dev, is not installed")
+    wheel = pytest.importorskip("hatchling.builders.wheel", reason="hatchling is missing: pip install --group test")
     [built] = wheel.WheelBuilder(str(PROJECT_ROOT)).build(directory=str(tmp_path), versions=["standard"])
     with zipfile.ZipFile(built) as archive:
         names = set(archive.namelist())
         for name, expected in SHA256.items():
             assert hashlib.sha256(archive.read(f"{WEIGHTS}/{name}")).hexdigest() == expected
     assert {f"{WEIGHTS}/LICENSE", "plugins/detectors/maskrcnn2go.md", "framework/conf/config.yaml"} <= names
+    assert {f"framework/desk/{path.relative_to(DESK)}" for path in DESK.rglob("*") if path.is_file()} <= names
     assert any(name.endswith(f"licenses/{WEIGHTS}/LICENSE") for name in names)
     assert "plugins/detectors/mask_rcnn_rooms.safetensors" in names
     assert {f"framework/reporting/assets/{name}" for name in (*SCRIPTS, STYLE, "page.html", "three.LICENSE")} <= names

@@ -11,7 +11,6 @@ import tomllib
 from typing import Any
 
 import pytest
-from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
 
 from framework import __main__ as main
 from tests.repository.test_readme import BENCHMARKS, COMMANDS, OWN_DATA, OWN_PLUGIN, RUNNABLE
@@ -20,7 +19,6 @@ from tests.support.doc_pages import CHECKOUT, LINES, PAGES, block, blocks
 pytestmark = pytest.mark.integration
 
 EXECUTED = ["for frame in sequence", "for frame in frames:", "class ColorBlobs"]  # in test_readme.py
-ACME = block("python", "class AcmeSearchPath")
 CONTRACT = block("python", "class TestMyRefiner")
 PARSED = [line for line in LINES if line.startswith("python -m framework ") and line.split()[3] in main.COMMANDS]
 
@@ -58,7 +56,6 @@ def test_nothing_is_shown_that_no_test_runs() -> None:
     }
     assert not [line for line in LINES if line.split()[0] in OURS and line not in looked_at]
     scripts = {
-        ACME,
         CONTRACT,
         *OWN_DATA,
         *blocks("python", "docs/python.md"),
@@ -72,14 +69,6 @@ def test_what_is_installed_by_name_is_there() -> None:
     named = {extra for text in PAGES.values() for extra in re.findall(r"instancemap\[([\w,-]+)\]", text)}
     assert len(named) > 8
     assert not named - set(extras)
-
-
-def test_a_package_registers_its_options() -> None:
-    names: dict[str, Any] = {}
-    exec(ACME, names)
-    path = ConfigSearchPathImpl()
-    names["AcmeSearchPath"]().manipulate_search_path(path)
-    assert [(element.provider, element.path) for element in path.get_path()] == [("acme", "pkg://acme.conf")]
 
 
 def test_a_contract_is_inherited() -> None:

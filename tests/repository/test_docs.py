@@ -61,7 +61,7 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The pages as HTML."""
     missing = [name for name in ("sphinx", "furo", "myst_parser") if find_spec(name) is None]
     if missing:
-        pytest.skip(f"{', '.join(missing)}: not installed, pip install instancemap[docs]")
+        pytest.skip(f"{', '.join(missing)}: not installed, pip install --group docs")
     place = tmp_path_factory.mktemp("docs")
     command = ["-m", "sphinx", "-W", "--keep-going", "-n", "-q", "-d", str(place / "doctrees"), str(DOCS)]
     done = subprocess.run(

@@ -5,10 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from framework.config.validation import check_bounds
-from framework.data import Frame, PointClusters
-from framework.interfaces import ClusterRefiner
-from framework.refinement.selection import keep_points
+from instancemap import ClusterRefiner, Frame, PointClusters, check_bounds, keep_points
 
 
 @dataclass

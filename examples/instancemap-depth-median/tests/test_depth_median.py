@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from framework.errors import ConfigError
-from framework.testing.corner_room import bleeding_clusters, exact_clusters, frame_at
-from framework.testing.option import OptionContract
-from framework.testing.refiner import RefinerContract
+from instancemap import ConfigError
+from instancemap.testing import OptionContract, RefinerContract, bleeding_clusters, exact_clusters, frame_at
 
 from instancemap_depth_median.depth_median import DepthMedian
 

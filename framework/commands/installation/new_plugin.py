@@ -30,8 +30,6 @@ PLACES = {  # of each template in the new repository; the first ones are those o
     "option.yaml": "$package/conf/$stage/$name.yaml",
     "test.py": "tests/test_$name.py",
     "init.py": "$package/__init__.py",
-    "conftest.py": "tests/conftest.py",
-    "search_path.py": "hydra_plugins/${package}_search_path.py",
     "pyproject.toml": "pyproject.toml",
     "README.md": "README.md",
     "LICENSE": "LICENSE",

@@ -1,7 +1,6 @@
 """`python -m framework plugins [STAGE [NAME]]`: what is registered for each stage, with documentation and parameters.
 
-The options come from Hydra's own search path, so those of installed third-party packages are listed like any other, and
-with --config-dir those of a folder, too.
+Options of installed packages (entry point `instancemap.configs`) and of --config-dir are listed, too.
 """
 
 from __future__ import annotations
@@ -10,7 +9,6 @@ import argparse
 import atexit
 import dataclasses
 import gc
-import importlib.resources
 import inspect
 import re
 import textwrap
@@ -138,9 +136,6 @@ def _default(field: dataclasses.Field[Any]) -> object:
 def _text(source: str, name: str) -> str:
     """The YAML as it was written: Hydra's configs have lost the comments."""
     scheme, _, root = source.partition("://")
-    if scheme == "pkg":
-        package, _, folder = root.replace("/", ".").partition(".")
-        return importlib.resources.files(package).joinpath(*folder.split("."), *name.split("/")).read_text()
     return Path(root, name).read_text() if scheme == "file" else ""
 
 

@@ -68,7 +68,7 @@ def test_doctor_json_lists_every_section(tmp_path: Path) -> None:
     assert done.returncode == any(check["status"] == "error" for check in checks)
     assert list(found["Libraries"]) == [Requirement(line).name for line in PROJECT["dependencies"]]
     assert {check["status"] for check in found["Libraries"].values()} == {"ok"}
-    assert set(found["Extras (optional)"]) == PROJECT["optional-dependencies"].keys() - packages.DEVELOPERS
+    assert set(found["Extras (optional)"]) == PROJECT["optional-dependencies"].keys()
     for check in checks:
         assert check["status"] in ("ok", "missing", "error")
         assert "\n" not in check["detail"] + check["fix"]

@@ -33,7 +33,7 @@ PLACE_OF = """id => {
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright, of the extra dev, is not installed")
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is missing: pip install --group test")
     if not Path(CHROMIUM).exists():
         pytest.skip(f"{CHROMIUM} is not there")
     with playwright.sync_playwright() as driver:

@@ -16,11 +16,12 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
+import framework
 from framework.commands.installation.new_plugin import LONGEST_NAME, check_name, files_of, write_repository
-from framework.doctor.packages import DEVELOPERS
 from framework.errors import ConfigError
 from framework.registry import GROUPS
 from tests.support import option_files
+from tests.support.doc_pages import blocks
 
 pytestmark = pytest.mark.integration
 
@@ -180,7 +181,16 @@ def test_an_installed_package_examines_itself_and_writes_plugins(place: Path) ->
     found = {section["title"]: {check["name"]: check for check in section["checks"]} for section in sections}
     project = tomllib.loads((CHECKOUT / "pyproject.toml").read_text())["project"]
     assert set(found["Libraries"]) == {Requirement(line).name for line in project["dependencies"]}
-    assert set(found["Extras (optional)"]) == project["optional-dependencies"].keys() - DEVELOPERS
+    assert set(found["Extras (optional)"]) == project["optional-dependencies"].keys()
     assert found["InstanceMap"]["commit"]["detail"] == "no checkout"
     assert "written: instancemap-other" in run(place, "instancemap", "new-plugin", "tracker", "other")
     assert (place / "instancemap-other" / "instancemap_other" / "other.py").exists()
+
+
+def test_installed_package_maps_the_desk(place: Path) -> None:
+    """The command without a dataset, and the Python example of the README, each on a few frames."""
+    assert run(place, "instancemap", "--version") == f"instancemap {framework.__version__}\n"
+    run(place, "instancemap", "dataset.stop=3", "hydra.run.dir=desk")
+    assert json.loads((place / "desk" / "metrics.json").read_text())["frames"] == 3
+    run(place, "python", "-c", blocks("python", "README.md")[0].replace("stop=14", "stop=3"))
+    assert (place / "desk.npz").exists()

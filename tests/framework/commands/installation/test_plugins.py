@@ -25,8 +25,10 @@ PACKAGE = {
         [project]
         name = "acme-detectors"
         version = "1.0"
+        [project.entry-points."instancemap.configs"]
+        acme = "acme.conf"
         [tool.setuptools]
-        packages = ["acme", "hydra_plugins"]
+        packages = ["acme"]
         [tool.setuptools.package-data]
         acme = ["conf/**/*.yaml"]
     """,
@@ -34,9 +36,7 @@ PACKAGE = {
     "acme/everything.py": '''
         from dataclasses import dataclass
         import numpy as np
-        from framework.data import Detections, Frame
-        from framework.errors import ConfigError
-        from framework.interfaces import Detector
+        from instancemap import ConfigError, Detections, Detector, Frame
 
         @dataclass
         class Everything(Detector):
@@ -92,14 +92,6 @@ PACKAGE = {
     "acme/conf/detector/acme_orphan.yaml": """
         defaults: [acme_nobody, _self_]
     """,
-    "hydra_plugins/acme_search_path.py": """
-        from hydra.core.config_search_path import ConfigSearchPath
-        from hydra.plugins.search_path_plugin import SearchPathPlugin
-
-        class AcmeSearchPath(SearchPathPlugin):
-            def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-                search_path.append(provider="acme", path="pkg://acme.conf")
-    """,
 }
 
 
@@ -128,20 +120,20 @@ def test_an_installed_package_is_listed(environment: dict[str, str], tmp_path: P
     done = run(environment, tmp_path, "framework", "plugins", "detector")
     assert done.returncode == 0, done.stderr
     lines = done.stdout.splitlines()
-    at = lines.index("  acme_everything  [from acme]")
+    at = lines.index("  acme_everything  [from acme-detectors]")
     assert lines[at + 1 : at + 4] == [
         "      The whole image is one object.",
         "      score: float = 0.75  # in [0, 1], of the one object",
         "",
     ]
-    at = lines.index("  acme_certain  [from acme]")
+    at = lines.index("  acme_certain  [from acme-detectors]")
     assert lines[at + 1 : at + 4] == [
         "      The whole image is one object. Here: acme_everything without doubt.",
         "      score: float = 1.0  # in [0, 1], of the one object",
         "",
     ]
     assert "cannot be used: detector acme.missing.Detector: there is no module acme.missing" in done.stdout
-    at = lines.index("  acme_orphan  [from acme]")
+    at = lines.index("  acme_orphan  [from acme-detectors]")
     assert lines[at + 1].startswith("      cannot be used: ")
     assert "acme_nobody" in lines[at + 1]
 

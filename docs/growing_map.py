@@ -1,6 +1,6 @@
 """Maps a video and writes a moving picture of the map as it grows.
 
-python examples/growing_map.py OUT.webp [key=value ...]     the keys of a run, dataset=desk among them
+python docs/growing_map.py OUT.webp [key=value ...]     keys of a run
 """
 
 from __future__ import annotations

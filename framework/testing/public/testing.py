@@ -1,0 +1,65 @@
+"""Contract tests for plugin authors, importable as `instancemap.testing`.
+
+    from instancemap.testing import OptionContract, RefinerContract
+
+    class TestMyRefiner(OptionContract, RefinerContract):
+        option = "my_refiner"
+
+pytest finds the tests in the class. They run on short videos of a small room in which every pixel is known.
+"""
+
+import pytest
+
+pytest.register_assert_rewrite("framework.testing")  # failed assertions show their values
+
+from framework.testing.corner_room import (
+    CAMERA,
+    CLASSES,
+    RoomMap,
+    bleeding_clusters,
+    exact_clusters,
+    frame_at,
+    pose_at,
+    spheres_in,
+)
+from framework.testing.dataset import SequenceContract
+from framework.testing.detector import DetectorContract
+from framework.testing.fuser import FuserContract
+from framework.testing.option import OptionContract
+from framework.testing.refiner import RefinerContract
+from framework.testing.tracker import TrackerContract
+from framework.testing.viewer import (
+    FRAMES,
+    LOST,
+    SKIPPED,
+    STAGE_MS,
+    ViewerContract,
+    WatchedMap,
+    frame_with_found,
+    show_run,
+)
+
+__all__ = [
+    "CAMERA",
+    "CLASSES",
+    "FRAMES",
+    "LOST",
+    "SKIPPED",
+    "STAGE_MS",
+    "DetectorContract",
+    "FuserContract",
+    "OptionContract",
+    "RefinerContract",
+    "RoomMap",
+    "SequenceContract",
+    "TrackerContract",
+    "ViewerContract",
+    "WatchedMap",
+    "bleeding_clusters",
+    "exact_clusters",
+    "frame_at",
+    "frame_with_found",
+    "pose_at",
+    "show_run",
+    "spheres_in",
+]
