@@ -82,7 +82,7 @@ def _embedded(question: Question, space: str, run: Path | None) -> Float32:
     from framework.detection.hub.image_text import ImageTextModel
 
     name, revision = _model_of(run) if question.model is None else (question.model, "main")
-    opened = ImageTextModel(name, revision, "cpu", half=False)
+    opened = ImageTextModel(name, revision, "cpu", half_precision=False)
     if opened.space != space:
         found = f"the embeddings of {run or 'this map'} are of {space}, and {name} is {opened.space}"
         raise DataError(f"{found}: the words need that very model, {NAME_IT}")

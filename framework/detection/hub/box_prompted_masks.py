@@ -28,7 +28,7 @@ CLASSES = {
 class BoxPromptedMasks:
     """SAM (Kirillov et al. 2023), SAM 2 or EdgeTAM, by its id on huggingface.co or a folder."""
 
-    def __init__(self, model: str, revision: str, device: torch.device, half: bool) -> None:
+    def __init__(self, model: str, revision: str, device: torch.device, half_precision: bool) -> None:
         transformers = imported_transformers()
         self.folder = find_model(model, revision)
         config = read_part("detector.masks", self.folder, "its config.json", transformers.AutoConfig)
@@ -42,7 +42,7 @@ class BoxPromptedMasks:
         prompts = config.prompt_encoder_config
         side = prompts.image_size if self._stretched else config.vision_config.image_size
         self._side = int(side if isinstance(side, int) else side[0])
-        self._dtype = torch.float16 if half and device.type == "cuda" else torch.float32
+        self._dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
         self._network = network.to(device, self._dtype).eval()
         self._device, self._model = device, model
 

@@ -60,7 +60,7 @@ class ImageTextModel:
         side: Width and height of the input images, in px.
     """
 
-    def __init__(self, model: str, revision: str, device: str, half: bool) -> None:
+    def __init__(self, model: str, revision: str, device: str, half_precision: bool) -> None:
         """Load a model by its id on huggingface.co, or from a folder written by `save_pretrained`.
 
         Raises:
@@ -82,7 +82,7 @@ class ImageTextModel:
         self._mean, self._std, self._factor = _normalization(self._folder / PREPROCESSING, self._family)
         self._tokenizer = read_part("detector.model", self._folder, "its tokenizer", transformers.AutoTokenizer)
         network = read_part("detector.model", self._folder, "its weights", transformers.AutoModel)
-        self._dtype = torch.float16 if half and self._device.type == "cuda" else torch.float32
+        self._dtype = torch.float16 if half_precision and self._device.type == "cuda" else torch.float32
         self._network = network.to(self._device, self._dtype).eval()
         self.space = _space(self._folder, model)
 

@@ -21,7 +21,9 @@ PADDING = 128  # gray, on the right or below: the input is a square
 class WordBoxes:
     """OWLv2 (Minderer et al. 2023), by its id on huggingface.co or a folder, for these words."""
 
-    def __init__(self, model: str, revision: str, words: Sequence[str], device: torch.device, half: bool) -> None:
+    def __init__(
+        self, model: str, revision: str, words: Sequence[str], device: torch.device, half_precision: bool
+    ) -> None:
         transformers = imported_transformers()
         self.folder = find_model(model, revision, TOKENIZER)
         config = read_part("detector.model", self.folder, "its config.json", transformers.AutoConfig)
@@ -33,7 +35,7 @@ class WordBoxes:
             [PROMPT.format(word) for word in words],
             padding="max_length", max_length=MOST_TOKENS, truncation=True, return_tensors="pt",
         )  # fmt: skip
-        self._dtype = torch.float16 if half and device.type == "cuda" else torch.float32
+        self._dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
         self._network = network.to(device, self._dtype).eval()
         self._tokens = {name: tokens[name].to(device) for name in ("input_ids", "attention_mask")}
         self._side = int(config.vision_config.image_size)

@@ -153,7 +153,7 @@ def test_a_nested_detector_is_chosen_by_name_and_its_faults_say_where(siglip: Pa
         ConfigError, match=r"detector plugins\.detectors\.with_embeddings\.WithEmbeddings: detector: .*min_pixels"
     ):
         registered.built("detector", "with_embeddings", chosen, "detector.detector.min_pixels=0")
-    with pytest.raises(ConfigError, match="of must be given"):
+    with pytest.raises(ConfigError, match="detector must be given"):
         registered.built("detector", "with_embeddings", "~detector.detector")
 
 
