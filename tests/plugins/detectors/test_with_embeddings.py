@@ -56,7 +56,7 @@ def picture(index: int = 0) -> Frame:
 def test_pictures_and_words_are_embedded_as_transformers_does_it(folder: Path) -> None:
     from transformers import AutoModel, AutoTokenizer
 
-    model = ImageTextModel(str(folder), "main", "cpu", half=False)
+    model = ImageTextModel(str(folder), "main", "cpu", half_precision=False)
     crops = np.random.default_rng(0).integers(0, 255, (3, SIDE, SIDE, 4)).astype(np.uint8)
     network = AutoModel.from_pretrained(folder).eval()
     is_clip = network.config.model_type == "clip"
