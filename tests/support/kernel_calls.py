@@ -95,7 +95,7 @@ def run_others() -> None:
                 build(PoseTracker, own.tracker),
                 build(ClusterRefiner, own.refiner),
                 build(MapFuser, own.fuser),
-                ahead=0,
+                prefetch=0,
             )
             pipeline.run(video)
             pipeline.fuser.scene.mesh()

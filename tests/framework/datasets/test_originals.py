@@ -225,7 +225,7 @@ def test_of_an_excerpt_in_which_an_image_is_missing_the_others_are_mapped(origin
 
 def given_poses(tracker: PoseTracker, sequence: RGBDSequence) -> RunResult:
     """A run that costs nothing but reading."""
-    return Pipeline(NoDetections(), tracker, KeepAll(), GridFuser(), ahead=0).run(sequence)
+    return Pipeline(NoDetections(), tracker, KeepAll(), GridFuser(), prefetch=0).run(sequence)
 
 
 def test_tum_of_which_most_images_are_missing(originals: Path) -> None:

@@ -25,7 +25,7 @@ POSED = [k for k in range(FRAMES) if k not in GAP]
 
 
 def pipeline(tracker: PoseTracker, fuser: GridFuser | None = None) -> Pipeline:
-    return Pipeline(NoDetections(), tracker, KeepAll(), fuser or GridFuser(), ahead=0)
+    return Pipeline(NoDetections(), tracker, KeepAll(), fuser or GridFuser(), prefetch=0)
 
 
 def true_poses(_: Path) -> PoseTracker:

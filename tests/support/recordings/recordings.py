@@ -32,7 +32,7 @@ def write_depth(path: Path, value: int | np.ndarray, shape: tuple[int, int] = (4
 def mapped(sequence: RGBDSequence) -> tuple[RunResult, np.ndarray]:
     """A run over all frames with true poses, and the mapped points (P, 3) in the world."""
     fuser = GridFuser()
-    result = Pipeline(NoDetections(), GroundTruth(), KeepAll(), fuser, ahead=0).run(sequence)
+    result = Pipeline(NoDetections(), GroundTruth(), KeepAll(), fuser, prefetch=0).run(sequence)
     return result, fuser.scene.mesh().vertices
 
 
