@@ -19,7 +19,7 @@ from framework.interfaces import FrameReader, LiveVideo, RGBDVideo
 from framework.runs.metrics import run_metrics
 from framework.runs.run_directory import headline
 from framework.runtime.frame_stream import LiveFrames, stream_of
-from tests.framework.test_pipeline import AHEAD, PressesCtrlC, mapped, pipeline, working_threads
+from tests.framework.test_pipeline import PREFETCH, PressesCtrlC, mapped, pipeline, working_threads
 from tests.support.scenes.corner_room import (
     CornerRoom,
     FaultyDetector,
@@ -121,7 +121,7 @@ def test_what_is_neither_recorded_nor_live_is_refused() -> None:
         stream_of(Neither(), lambda: False)
 
 
-@AHEAD
+@PREFETCH
 def test_a_live_video_that_is_slow_enough_is_mapped_whole(prefetch: int) -> None:
     threads, video = working_threads(), LiveRoom(unreadable=2)
     result = pipeline(prefetch).run(video)
@@ -135,7 +135,7 @@ def test_a_live_video_that_is_slow_enough_is_mapped_whole(prefetch: int) -> None
     assert working_threads() == threads
 
 
-@AHEAD
+@PREFETCH
 def test_when_mapping_is_behind_frames_are_dropped_and_counted(prefetch: int, caplog: pytest.LogCaptureFixture) -> None:
     video = LiveRoom(frames_sent=60, period_s=SLOW_S / 6)
     result = pipeline(prefetch, fuser=GridFuser(slow_s=SLOW_S)).run(video)
@@ -179,7 +179,7 @@ def test_a_recording_has_none_of_these_figures_and_drops_nothing(room: CornerRoo
     assert not {"frames_dropped", "latency_ms"} & run_metrics(result).keys()
 
 
-@AHEAD
+@PREFETCH
 def test_ctrl_c_is_the_end_of_a_live_video(prefetch: int) -> None:
     video, threads = LiveRoom(frames_sent=1000), working_threads()
     result = pipeline(prefetch, tracker=PressesCtrlC(at=0)).run(video)
@@ -230,7 +230,7 @@ def test_a_live_video_without_a_usable_frame_is_an_error() -> None:
         pipeline(tracker=GivenPose()).run(Handed())
 
 
-@AHEAD
+@PREFETCH
 def test_a_fault_of_a_stage_leaves_no_thread(prefetch: int) -> None:
     """The worker may be waiting for a frame, and the listener for the video."""
     video, threads = LiveRoom(frames_sent=1000), working_threads()

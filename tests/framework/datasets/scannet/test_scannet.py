@@ -288,7 +288,7 @@ def test_truth_without_all_of_its_files_is_none_and_said(tmp_path: Path, caplog:
     assert sequence.scene_truth() is None
     assert sequence.annotation == ""
     assert f"no true instances: {tmp_path}/{SCENE}/{SCENE}.aggregation.json is missing" in caplog.text
-    with pytest.raises(DataError, match=r"dataset\.frame_ground_truth needs a labelled mesh"):
+    with pytest.raises(DataError, match=r"dataset\.frame_ground_truth: .*aggregation"):
         ScanNet(tmp_path, SCENE, frame_ground_truth=True)
 
 
