@@ -20,19 +20,19 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
 
+from framework.baselines.class_evidence_kernels import best_clusters, find_blocks_under_masks, update_classes
 from framework.data import Float32, Float64, Int32, PointClusters, UInt8, UInt16
 from framework.errors import DataError
-from framework.mapping.labels.class_slots import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
-from framework.mapping.labels.label_evidence import best_first, named_classes
+from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
+from framework.mapping.labels.label_evidence import named_classes
 from framework.mapping.labels.pixel_lists import PixelLists
 from framework.mapping.storage.map_file import check_known, check_like
 from framework.mapping.voxels.integration import SeenBlocks
-from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, VoxelGrid, device, grown
+from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 MOST_EXPONENT = 700.0  # of a ratio that float64 can hold
-MOST_FRAMES = np.uint16(65535)  # that a voxel counts
 
 
 class ClassEvidence(NamedTuple):
@@ -64,7 +64,7 @@ class MaskClasses(NamedTuple):
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
     """What the clusters of a frame say, log P(class) / P(background) (N, C), as the voxels take it."""
     above_rest, named, bits = named_classes(log_ratio, logarithmic=True)
-    best = _best_clusters(points.first, points.cluster, clusters.scores)
+    best = best_clusters(points.first, points.cluster, clusters.scores)
     return MaskClasses(
         best[points.of_pixel.ravel()],
         log_ratio.astype(np.float32),
@@ -73,106 +73,6 @@ def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists
         bits,
         frame,
     )
-
-
-@njit(cache=True, nogil=True)
-def _best_clusters(first, cluster, scores):
-    """(L,) the cluster of each list with the best score, of equal ones the first, -1 = there is none."""
-    best = np.full(first.shape[0] - 1, -1, np.int32)
-    for i in range(best.shape[0]):
-        for place in range(first[i], first[i + 1]):
-            k, found = cluster[place], best[i]
-            if found < 0 or scores[k] > scores[found] or (scores[k] == scores[found] and k < found):
-                best[i] = k
-    return best
-
-
-@device
-def best_class(grid, evidence, log_missed, block, n):
-    """The likeliest class of a voxel, -1 when that is the background; a tie is the background's.
-
-    `log_missed` is what each frame that saw the voxel under no mask says for every class over the background.
-    """
-    row = grid.label_row[block]
-    if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
-        return np.int32(-1)
-    above = evidence.log_ratio[row, n, 0] + log_missed * np.float32(evidence.unmasked[block, n])
-    return np.int32(evidence.class_ids[row, n, 0]) if above > 0 else np.int32(-1)
-
-
-@device
-def _add_class(labels, sums, label, total):
-    """Gives a class its slot, the least likely one's if none is free. Returns 1 when a class was dropped."""
-    least = 0
-    for s in range(len(labels)):
-        if labels[s] == NO_CLASS:
-            labels[s] = label
-            sums[s] = total
-            return 0
-        if sums[s] < sums[least]:
-            least = s
-    if total > sums[least]:
-        labels[least] = label
-        sums[least] = total
-    return 1
-
-
-@device
-def observe_mask(evidence, row, n, masks, k):
-    """One step of the recursion for a voxel that a frame sees under cluster k. Returns the number of evictions."""
-    labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
-    known = 0  # bits of the named classes that have a slot
-    for s in range(len(labels)):
-        if labels[s] == NO_CLASS:
-            break  # slots are filled from the front
-        sums[s] += masks.log_ratio[k, labels[s]]
-        known |= masks.named_bit[k, labels[s]]
-    evicted = 0
-    for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
-        label = masks.named_classes[k, m]
-        if m > 0 and label == masks.named_classes[k, 0]:
-            break
-        if not (known >> m) & 1:
-            evicted += _add_class(labels, sums, label, evidence.rest[row, n] + masks.log_ratio[k, label])
-    evidence.rest[row, n] += masks.rest[k]
-    best_first(labels, sums, NO_CLASS)
-    if evidence.masked[row, n] < MOST_FRAMES:
-        evidence.masked[row, n] += 1
-    if evidence.first_frame[row, n] < 0:
-        evidence.first_frame[row, n] = masks.frame
-    evidence.last_frame[row, n] = masks.frame
-    return evicted
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Notes in wants_row (A,) the blocks without a row that have a voxel under some mask."""
-    for a in prange(seen.blocks.shape[0]):
-        wants_row[a] = False
-        first = seen.near_first[a]
-        if grid.label_row[seen.blocks[a]] < 0:
-            for i in range(first, first + seen.near_count[a]):
-                if cluster[seen.near_pixel[i]] >= 0:
-                    wants_row[a] = True
-                    break
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _update(grid, seen, evidence, masks, evicted):
-    """Updates the near voxels of the seen blocks; evicted (A,) counts slots given away."""
-    unmasked = evidence.unmasked  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
-    for a in prange(seen.blocks.shape[0]):
-        evicted[a] = 0
-        block = seen.blocks[a]
-        row = grid.label_row[block]
-        first = seen.near_first[a]
-        for i in range(first, first + seen.near_count[a]):
-            n = seen.near_voxel[i]
-            k = masks.cluster[seen.near_pixel[i]]
-            if k >= 0:
-                evicted[a] += observe_mask(evidence, row, n, masks, k)
-            elif unmasked[block, n] < MOST_FRAMES:
-                unmasked[block, n] += 1
 
 
 class ClassRows:
@@ -207,9 +107,9 @@ class ClassRows:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
         wants_row = np.empty(len(seen.blocks), np.bool_)
         evicted = np.empty(len(seen.blocks), np.int32)
-        _find_blocks_under_masks(self.voxels.grid, seen, masks.cluster, wants_row)
+        find_blocks_under_masks(self.voxels.grid, seen, masks.cluster, wants_row)
         self._add_rows(seen.blocks[wants_row])
-        _update(self.voxels.grid, seen, self.evidence, masks, evicted)
+        update_classes(self.voxels.grid, seen, self.evidence, masks, evicted)
         self.evicted += int(evicted.sum())
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:

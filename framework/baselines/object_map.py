@@ -16,7 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.baselines.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume, look_up_object
+from framework.baselines.object_volume import FOREGROUND, VOLUME_ARRAYS, ObjectVolume
+from framework.baselines.object_volume_kernels import look_up_object
 from framework.data import (
     Bool,
     Camera,
@@ -35,7 +36,7 @@ from framework.interfaces import SceneMap
 from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_list import Confirmation, list_instances
 from framework.mapping.instances.instance_table import InstanceTable
-from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.vertex_labels import vertex_colors
 from framework.mapping.storage.map_file import (
     check_like,
@@ -50,7 +51,8 @@ from framework.mapping.voxels.frustum import boxes_in_view
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
-from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, VoxelGrid
+from framework.mapping.voxels.voxel_grid import VoxelGrid
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
 FORMAT = "object_volumes 4"  # of the saved file; a change of meaning counts it up
 OBJECT = "object_"  # before the names of the arrays that hold all objects' volumes, one after the other

@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from numba import njit, prange
 
-from framework.baselines.class_evidence import ClassEvidence, ClassRows, best_class
+from framework.baselines.class_evidence import ClassEvidence, ClassRows
 from framework.baselines.connected_components import component_statistics, connected_components, vertex_classes
+from framework.baselines.semantic_map_kernels import label_view
 from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, SurfaceView, View
 from framework.interfaces import SceneMap
 from framework.mapping.instances.association import agreed_classes
@@ -17,25 +17,10 @@ from framework.mapping.instances.instance_list import aligned_box, box_around, v
 from framework.mapping.storage.map_file import faults_of, read_map, write_map
 from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
-from framework.mapping.voxels.raycasting import voxel_seen
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 
 MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of what a map is made with; m^2
 FORMAT = "semantic 3"  # of the saved file; a change of meaning counts it up
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fills class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m."""
-    for v in prange(depth.shape[0]):
-        key = np.int64(-2)
-        region = np.int32(-1)
-        for u in range(depth.shape[1]):
-            class_ids[v, u] = -1
-            if depth[v, u] > 0:
-                block, n, key, region = voxel_seen(grid, view, u, v, depth[v, u], key, region)
-                if block >= 0:
-                    class_ids[v, u] = best_class(grid, evidence, log_missed, block, n)
 
 
 class SemanticMap(SceneMap):
@@ -88,7 +73,7 @@ class SemanticMap(SceneMap):
         surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)
-        _label_view(self.volume.voxels.grid, self.labels.evidence, self._log_missed, view, surface.depth, class_ids)
+        label_view(self.volume.voxels.grid, self.labels.evidence, self._log_missed, view, surface.depth, class_ids)
         return View(**vars(surface), instance_ids=np.zeros(camera.shape, np.int32), class_ids=class_ids)
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:

@@ -15,12 +15,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numba import njit
 
 from framework.data import Camera, Float64, UInt16
-from framework.datasets.calibration.raw_images import NO_READING
 from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording
 from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.datasets.seven_scenes_kernels import register_depth
 from framework.errors import DataError
 from framework.files.matrix_file import read_matrix
 
@@ -30,7 +29,6 @@ DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published
 # parallel, 25 mm apart as a Kinect's are; a free fit of the offset gains nothing.
 COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
 BASELINE = 0.025  # m; the colour camera stands this far along the depth camera's x axis
-
 _IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
 
 
@@ -76,7 +74,7 @@ def register(raw: UInt16) -> UInt16:
         return raw
     registered = np.zeros(COLOR_CAMERA.shape, np.uint16)
     ratio = COLOR_CAMERA.fx / DEPTH_CAMERA.fx
-    _move(
+    register_depth(
         raw,
         ratio,
         COLOR_CAMERA.cx - ratio * DEPTH_CAMERA.cx,
@@ -85,20 +83,3 @@ def register(raw: UInt16) -> UInt16:
         registered,
     )
     return registered
-
-
-@njit(cache=True, nogil=True)
-def _move(raw: UInt16, ratio: float, u_0: float, v_0: float, disparity_1: float, registered: UInt16) -> None:
-    """Moves pixel (u, v) with reading z to (ratio u + u_0 - disparity_1 / z, ratio v + v_0); z stays the same."""
-    height, width = registered.shape
-    for v in range(raw.shape[0]):
-        v_color = round(ratio * v + v_0)
-        if not 0 <= v_color < height:
-            continue
-        for u in range(raw.shape[1]):
-            z = raw[v, u]
-            if z == 0 or z == NO_READING:
-                continue
-            u_color = round(ratio * u + u_0 - disparity_1 / z)
-            if 0 <= u_color < width and (registered[v_color, u_color] == 0 or z < registered[v_color, u_color]):
-                registered[v_color, u_color] = z

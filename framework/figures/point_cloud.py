@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import cv2
 import numpy as np
-from numba import njit
 
 from framework.data import Float32, Float64, Int32
+from framework.figures.point_cloud_kernels import splat_points
 
 SHADE_RANGES_PX = (1, 2, 4)  # how far away neighbors are looked at
 SHADE_DEPTH_M = 0.06  # a neighbor that is nearer by this much, all around, darkens to 1/e
@@ -26,23 +26,8 @@ def splat(pixels: Float32, depth: Float32, radius: Float32, shape: tuple[int, in
     """
     nearest = np.full(shape, -1, np.int32)
     buffer = np.full(shape, np.inf, np.float32)
-    _splat(np.ascontiguousarray(pixels, np.float32), depth, radius, nearest, buffer)
+    splat_points(np.ascontiguousarray(pixels, np.float32), depth, radius, nearest, buffer)
     return nearest, buffer
-
-
-@njit(cache=True, nogil=True)
-def _splat(pixels: Float32, depth: Float32, radius: Float32, nearest: Int32, buffer: Float32) -> None:
-    height, width = buffer.shape
-    for i in range(len(depth)):
-        u, v, r = pixels[i, 0], pixels[i, 1], radius[i]
-        if not (-r - 1 <= u <= width + r and -r - 1 <= v <= height + r):  # NaN neither
-            continue
-        column, row, reach = int(np.rint(u)), int(np.rint(v)), int(r)
-        for y in range(max(row - reach, 0), min(row + reach + 1, height)):
-            for x in range(max(column - reach, 0), min(column + reach + 1, width)):
-                if (x - column) ** 2 + (y - row) ** 2 <= r * r and depth[i] < buffer[y, x]:
-                    buffer[y, x] = depth[i]
-                    nearest[y, x] = i
 
 
 def shading(buffer: Float32) -> Float32:

@@ -11,12 +11,14 @@ import numpy as np
 from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
 from framework.errors import DataError
 from framework.interfaces import SceneMap
-from framework.mapping.instances.association import agreed_classes, look_up_instances
+from framework.mapping.instances.association import agreed_classes
+from framework.mapping.instances.association_kernels import look_up_instances
 from framework.mapping.instances.instance_list import Confirmation, list_instances
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
-from framework.mapping.labels.label_evidence import Combine, Evidence
+from framework.mapping.labels.label_evidence import Evidence
+from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.vertex_labels import vertex_labels
 from framework.mapping.storage.map_file import (
     check_known,

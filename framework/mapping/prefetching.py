@@ -10,7 +10,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from framework.mapping.voxels.voxel_grid import device
+from framework.mapping.voxels.voxel_grid_kernels import device
 
 CACHE_LINE = 64  # bytes
 _READ, _KEEP, _DATA = 0, 2, 1  # llvm.prefetch: for reading; into the second level of cache and beyond; not code

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from framework.data import Bool, Float32, Frame, Int32, PointClusters
-from framework.refinement.neighborhood import grouped
+from framework.refinement.neighborhood_kernels import grouped
 
 
 def in_densest_piece(

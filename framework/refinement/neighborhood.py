@@ -10,18 +10,18 @@ from dataclasses import dataclass
 
 import numba
 import numpy as np
-import numpy.typing as npt
-from numba import njit, prange
 
 from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Frame, Int32, Int64, PointClusters
+from framework.refinement.neighborhood_kernels import (
+    Int16,
+    bound,
+    gather,
+    grouped,
+    share_among_threads,
+    signed_distances,
+)
 
-Int16 = npt.NDArray[np.int16]
-
-# 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, at most 8 % from the Euclidean one
-CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
-FAR = np.int16(30000)  # 10 000 px; two steps more still fit
-PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
 MAX_RING_WIDTH = 80  # px; wider rings tell nothing about the object
 
 
@@ -101,7 +101,7 @@ class Surroundings:
     def _gathered(self, counts: Int64, mask_counts: Int64, nth: Int64) -> Neighborhoods:
         starts = np.concatenate([[0], np.cumsum(counts)])
         points, depth_in_mask = np.empty((starts[-1], 3), np.float32), np.empty(starts[-1], np.float32)
-        _gather(
+        gather(
             self.pixels, self.firsts, self.windows, self.cells, self.steps, self.frame.depth,
             pinhole(self.frame.camera), starts, mask_counts, nth, *thread_shares(counts), points, depth_in_mask,
         )  # fmt: skip
@@ -142,13 +142,11 @@ def surroundings(clusters: PointClusters, frame: Frame, ring: Ring) -> Surroundi
     readings = frame.depth if clusters.structure is None else np.where(clusters.structure, np.float32(0), frame.depth)
     widths = np.clip(np.rint(ring.ring_fraction * np.sqrt(areas)), ring.min_ring, ring.max_ring).astype(np.int64)
     windows = np.zeros((len(clusters), 4), np.int64)
-    _bound(pixels, firsts, widths, *frame.camera.shape, windows)
+    bound(pixels, firsts, widths, *frame.camera.shape, windows)
     cells = np.concatenate([[0], np.cumsum((windows[:, 2] - windows[:, 0]) * (windows[:, 3] - windows[:, 1]))])
     steps = np.empty(cells[-1], np.int16)
     ring_counts, radii = np.zeros(len(widths), np.int64), np.zeros(len(widths), np.float32)
-    _signed_distances(
-        pixels, firsts, widths, windows, cells, readings, *thread_shares(areas), steps, ring_counts, radii
-    )
+    signed_distances(pixels, firsts, widths, windows, cells, readings, *thread_shares(areas), steps, ring_counts, radii)
     return Surroundings(clusters, frame, order, pixels, firsts, windows, cells, steps, ring_counts, widths, radii)
 
 
@@ -165,27 +163,6 @@ def members(clusters: PointClusters) -> tuple[slice | Int64, Int64]:
     return order, firsts
 
 
-@njit(cache=True, nogil=True)
-def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
-    """The points in the order of their clusters: (members,) indices and (n + 1,) where each cluster begins.
-
-    Within a cluster the points keep their order. Points of no cluster (-1) are left out.
-    """
-    firsts = np.zeros(n + 1, np.int64)
-    for k in cluster:
-        if k >= 0:
-            firsts[k + 1] += 1
-    for k in range(n):
-        firsts[k + 1] += firsts[k]
-    order = np.empty(firsts[n], np.int64)
-    free = firsts[:n].copy()
-    for i, k in enumerate(cluster):
-        if k >= 0:
-            order[free[k]] = i
-            free[k] += 1
-    return order, firsts
-
-
 def thread_shares(costs: Int64) -> tuple[Int64, Int64]:
     """Which thread takes which of N clusters: (N,) their order and (threads + 1,) where each thread's share begins.
 
@@ -193,240 +170,10 @@ def thread_shares(costs: Int64) -> tuple[Int64, Int64]:
     costliest goes first, to the thread that has least to do (Graham 1969). Clusters do not know of each other, so that
     results do not depend on it.
     """
-    order, starts = _share(costs, np.argsort(-costs, kind="stable"), numba.get_num_threads())
-    return order, starts
-
-
-@njit(cache=True, nogil=True)
-def _share(costs: Int64, longest_first: Int64, threads: int) -> tuple[Int64, Int64]:
-    loads, owners, starts = np.zeros(threads, np.int64), np.empty(len(costs), np.int64), np.zeros(threads + 1, np.int64)
-    for k in longest_first:
-        least = 0
-        for thread in range(1, threads):
-            least = thread if loads[thread] < loads[least] else least
-        owners[k] = least
-        loads[least] += costs[k] + 1
-    for k in range(len(costs)):
-        starts[owners[k] + 1] += 1
-    for thread in range(threads):
-        starts[thread + 1] += starts[thread]
-    places, order = starts.copy(), np.empty(len(costs), np.int64)
-    for k in range(len(costs)):
-        order[places[owners[k]]] = k
-        places[owners[k]] += 1
+    order, starts = share_among_threads(costs, np.argsort(-costs, kind="stable"), numba.get_num_threads())
     return order, starts
 
 
 def pinhole(camera: Camera) -> Float32:
     """(4,) fx, fy, cx, cy in the precision of geometry.back_project, for kernels."""
     return np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
-
-
-@njit(cache=True, nogil=True)
-def _bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, windows: Int64) -> None:
-    """Sets (N, 4) v0 u0 v1 u1 (half open): each cluster's bounding box grown by its ring, within the image."""
-    for k in range(len(widths)):
-        if firsts[k] < firsts[k + 1]:
-            u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
-            windows[k, 0], windows[k, 1] = max(v0 - widths[k], 0), max(u0 - widths[k], 0)
-            windows[k, 2], windows[k, 3] = min(v1 + widths[k] + 1, height), min(u1 + widths[k] + 1, width)
-
-
-@njit(cache=True, nogil=True)
-def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
-    """Lowest u and v, highest u and v of at least one pixel."""
-    u0, v0 = pixels[0, 0], pixels[0, 1]
-    u1, v1 = u0, v0
-    for i in range(len(pixels)):
-        u, v = pixels[i, 0], pixels[i, 1]
-        u0 = u if u < u0 else u0
-        u1 = u if u > u1 else u1
-        v0 = v if v < v0 else v0
-        v1 = v if v > v1 else v1
-    return u0, v0, u1, v1
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _signed_distances(
-    pixels: Int32, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
-    share_order: Int64, share_starts: Int64, steps: Int16, ring_counts: Int64, radii: Float32,
-) -> None:  # fmt: skip
-    """In every window (cells,) how deep each of the mask's pixels lies in it; readings in the rings; the masks' radii.
-
-    Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
-    mask; 0 elsewhere. A pixel without a reading is no border of the mask: holes in the depth are common inside of
-    objects.
-    """
-    for share in prange(len(share_starts) - 1):
-        for k in share_order[share_starts[share] : share_starts[share + 1]]:
-            if cells[k] < cells[k + 1]:
-                ring_counts[k], radii[k] = _signed_distances_of(
-                    pixels[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
-                    steps[cells[k] : cells[k + 1]],
-                )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def _signed_distances_of(
-    pixels: Int32, ring: np.int16, window: Int64, depth: Float32, steps: Int16
-) -> tuple[int, np.float32]:
-    """Both distances lie side by side in one grid, with FAR cells around each, and spread over it together.
-
-    A shortest way may make its level steps first, all in the row of its source. So the rows are filled by runs, and the
-    steps down and up, straight and diagonal, are left to two sweeps in vector code.
-    """
-    v0, u0 = window[0], window[1]
-    rows, columns = window[2] - v0, window[3] - u0
-    middle = columns + 1  # the FAR cell between the distance to the mask and that to the rest
-    in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty(columns, np.bool_)
-    for i in range(len(pixels)):
-        in_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = True
-    grid = np.empty((rows, 2 * columns + 3), np.int16)
-    for r in range(rows):
-        row = grid[r]
-        row[0] = row[middle] = row[-1] = FAR
-        _mark_rest(in_mask[r], depth[v0 + r, u0 : u0 + columns], in_rest)
-        _distances_along(in_mask[r], row[1:middle])
-        _distances_along(in_rest, row[middle + 1 : middle + 1 + columns])
-        if r > 0:
-            _spread_across(grid[r - 1], row, middle)
-    count, radius = 0, np.int16(0)
-    for r in range(rows - 1, -1, -1):
-        row = grid[r]
-        if r < rows - 1:
-            _spread_across(grid[r + 1], row, middle)
-        of_row = steps[r * columns : (r + 1) * columns]
-        count += _sign(
-            in_mask[r], row[1:middle], row[middle + 1 : middle + 1 + columns], depth[v0 + r, u0 : u0 + columns], ring,
-            of_row,
-        )  # fmt: skip
-        radius = max(radius, _highest(of_row))
-    return count, PX_PER_STEP * np.float32(radius)
-
-
-@njit(cache=True, nogil=True)
-def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
-    for c in range(len(in_rest)):
-        in_rest[c] = (not in_mask[c]) & (depth[c] > 0)
-
-
-@njit(cache=True, nogil=True)
-def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
-    """Puts one row of the two distances together; the number of its readings in the ring."""
-    count = np.int32(0)
-    for c in range(len(steps)):
-        in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
-        outside = np.int16(-to_mask[c]) if in_ring else np.int16(0)
-        steps[c] = to_rest[c] if in_mask[c] else outside
-        count += np.int32(in_ring)
-    return int(count)
-
-
-@njit(cache=True, nogil=True)
-def _highest(steps: Int16) -> np.int16:
-    highest = np.int16(0)
-    for step in steps:
-        highest = step if step > highest else highest
-    return highest
-
-
-@njit(cache=True, nogil=True)
-def _distances_along(sources: Bool, row: Int16) -> None:
-    """The distance of every cell to the nearest source of its row, FAR without one."""
-    columns = len(row)
-    row[:] = 0
-    begin = 0
-    while begin < columns:
-        if sources[begin]:
-            begin += 1
-            continue
-        end = begin + 1
-        while end < columns and not sources[end]:
-            end += 1
-        _fill_gap(row[begin:end], begin > 0, end < columns)
-        begin = end + 1
-
-
-@njit(cache=True, nogil=True)
-def _fill_gap(gap: Int16, source_before: bool, source_behind: bool) -> None:
-    n, step, far = np.int32(len(gap)), np.int32(CHAMFER_STEP), np.int32(FAR)
-    for c in range(n):
-        left = step * (np.int32(c) + np.int32(1)) if source_before else far
-        right = step * (n - np.int32(c)) if source_behind else far
-        nearest = left if left < right else right
-        gap[c] = nearest if nearest < far else far
-
-
-@njit(cache=True, nogil=True)
-def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
-    n = len(row)
-    _lower(row[1 : n - 1], neighbors[: n - 2], neighbors[1 : n - 1], neighbors[2:])
-    row[middle] = FAR
-
-
-@njit(cache=True, nogil=True)
-def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """row = min(row, across + a step, before or behind + a diagonal); without min() and offsets, so it vectorizes."""
-    for i in range(len(row)):
-        diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
-        straight = np.int16(across[i] + CHAMFER_STEP)
-        nearest = straight if straight < diagonal else diagonal
-        row[i] = nearest if nearest < row[i] else row[i]
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _gather(
-    pixels: Int32, firsts: Int64, windows: Int64, cells: Int64, steps: Int16, depth: Float32,
-    pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64, share_order: Int64, share_starts: Int64,
-    points: Float32, depth_in_mask: Float32,
-) -> None:  # fmt: skip
-    """Points, as geometry.back_project gives them (tested), and their depth in the mask."""
-    for share in prange(len(share_starts) - 1):
-        for k in share_order[share_starts[share] : share_starts[share + 1]]:
-            middle, end = starts[k] + mask_counts[k], starts[k + 1]
-            window, own_steps = windows[k], steps[cells[k] : cells[k + 1]]
-            _gather_mask(
-                pixels[firsts[k] : firsts[k + 1]], window, own_steps, depth, pinhole, nth[k],
-                points[starts[k] : middle], depth_in_mask[starts[k] : middle],
-            )  # fmt: skip
-            if middle < end:
-                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # the ring goes on where the mask ended
-                _gather_ring(
-                    window, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
-                )
-
-
-@njit(cache=True, nogil=True)
-def _gather_mask(
-    pixels: Int32, window: Int64, steps: Int16, depth: Float32, pinhole: Float32, nth: int, points: Float32,
-    depth_in_mask: Float32,
-) -> None:  # fmt: skip
-    v0, u0, columns = window[0], window[1], window[3] - window[1]
-    for s in range(len(points)):
-        u, v = pixels[s * nth, 0], pixels[s * nth, 1]
-        _back_project(u, v, depth[v, u], pinhole, points, s)
-        depth_in_mask[s] = PX_PER_STEP * np.float32(steps[(v - v0) * columns + u - u0])
-
-
-@njit(cache=True, nogil=True)
-def _gather_ring(
-    window: Int64, steps: Int16, depth: Float32, pinhole: Float32, skipped: int, nth: int, points: Float32,
-    depth_in_mask: Float32,
-) -> None:  # fmt: skip
-    v0, u0, columns = window[0], window[1], window[3] - window[1]
-    s, until_next = 0, skipped
-    for cell in range(len(steps)):
-        if steps[cell] < 0:
-            if until_next == 0:
-                u, v = u0 + cell % columns, v0 + cell // columns
-                _back_project(u, v, depth[v, u], pinhole, points, s)
-                depth_in_mask[s] = PX_PER_STEP * np.float32(steps[cell])
-                s, until_next = s + 1, nth
-            until_next -= 1
-
-
-@njit(cache=True, nogil=True)
-def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float32, s: int) -> None:
-    points[s, 0] = np.float32(u - pinhole[2]) * (z / pinhole[0])
-    points[s, 1] = np.float32(v - pinhole[3]) * (z / pinhole[1])
-    points[s, 2] = z

@@ -5,11 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numba import njit, prange
 
-from framework.data import Bool, Float32, Int32, Int64, PointClusters
-
-PART = 8192  # rows that a thread copies at once
+from framework.data import Bool, PointClusters
+from framework.refinement.selection_kernels import compress, part_starts
 
 
 def keep_points(clusters: PointClusters, kept: Bool) -> PointClusters:
@@ -18,38 +16,8 @@ def keep_points(clusters: PointClusters, kept: Bool) -> PointClusters:
     A dropped point leaves the arrays. Clusters keep their index, scores and classes, so that cluster k still is
     detection k, also when no point is left of it.
     """
-    starts = _starts(kept)
+    starts = part_starts(kept)
     points_world = np.empty((starts[-1], 3), np.float32)
     pixels, cluster = np.empty((starts[-1], 2), np.int32), np.empty(starts[-1], np.int32)
-    _compress(clusters.points_world, clusters.pixels, clusters.cluster, kept, starts, points_world, pixels, cluster)
+    compress(clusters.points_world, clusters.pixels, clusters.cluster, kept, starts, points_world, pixels, cluster)
     return replace(clusters, points_world=points_world, pixels=pixels, cluster=cluster)
-
-
-@njit(cache=True, nogil=True)
-def _starts(kept: Bool) -> Int64:
-    """Where the kept rows of each part of PART rows begin among all of them."""
-    parts = (len(kept) + PART - 1) // PART
-    starts = np.zeros(parts + 1, np.int64)
-    for part in range(parts):
-        count = np.int32(0)
-        for stays in kept[part * PART : (part + 1) * PART]:
-            count += np.int32(stays)
-        starts[part + 1] = starts[part] + count
-    return starts
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _compress(
-    points: Float32, pixels: Int32, cluster: Int32, kept: Bool, starts: Int64, kept_points: Float32,
-    kept_pixels: Int32, kept_cluster: Int32,
-) -> None:  # fmt: skip
-    """The kept rows; many times faster than three times boolean indexing."""
-    for part in prange(len(starts) - 1):
-        k = starts[part]
-        for i in range(part * PART, min((part + 1) * PART, len(kept))):
-            if kept[i]:
-                for a in range(3):
-                    kept_points[k, a] = points[i, a]
-                kept_pixels[k, 0], kept_pixels[k, 1] = pixels[i, 0], pixels[i, 1]
-                kept_cluster[k] = cluster[i]
-                k += 1

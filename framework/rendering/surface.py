@@ -6,10 +6,11 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
 from framework.data import Bool, Camera, Float32, Float64, Int32
-from framework.rendering.rasterizer import NO_TRIANGLE, Rasterizer, VisibilityBuffer
+from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE
+from framework.rendering.surface_kernels import interpolate
 
 VOTES = 20000  # triangles that are asked which of their sides was seen
 VOTERS = 50  # cameras that are asked
@@ -51,7 +52,7 @@ class Hits:
     def interpolated(self, values: Float32) -> Float32:
         """(H, W, C) of values (V, C) at the vertices, 0 where nothing is seen."""
         image = np.zeros((*self.camera.shape, values.shape[1]), np.float32)
-        _interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
+        interpolate(self.buffer.triangle, self.buffer.uv, self.triangles, np.ascontiguousarray(values), image)
         return image
 
     def nearest(self, labels: Int32) -> Int32:
@@ -114,17 +115,3 @@ class FrontSides:
         T_world_camera = np.eye(4)
         T_world_camera[:3, :3], T_world_camera[:3, 3] = R_world_camera, self._eye_world
         return Hits(camera, self._rasterizer.draw(camera, T_world_camera), self._vertices, self._triangles)
-
-
-@njit(cache=True, nogil=True)
-def _interpolate(triangle: Int32, uv: Float32, triangles: Int32, values: Float32, image: Float32) -> None:
-    for v in range(triangle.shape[0]):
-        for u in range(triangle.shape[1]):
-            f = triangle[v, u]
-            if f == NO_TRIANGLE:
-                continue
-            a, b, c = triangles[f, 0], triangles[f, 1], triangles[f, 2]
-            wb, wc = uv[v, u, 0], uv[v, u, 1]
-            wa = np.float32(1) - wb - wc
-            for k in range(values.shape[1]):
-                image[v, u, k] = wa * values[a, k] + wb * values[b, k] + wc * values[c, k]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from framework.data import Camera, Float32, Float64, Int32
 from framework.rendering.surface import Surface
+from framework.rendering.viewpoint_kernels import draw_fronts, sum_level_normals
 
 FIELD_OF_VIEW_RAD = np.deg2rad(32)  # vertical; narrow, so that far objects are not much smaller than near ones
 ELEVATIONS_RAD = np.deg2rad([38.0, 52.0])
@@ -26,7 +26,7 @@ def upward(poses: Float64, surface: Surface) -> Float64:
     up /= np.linalg.norm(up)
     cone = LEVEL_CONE_RAD
     for _ in range(5):  # mean shift with a narrowing cone
-        mean, share = _level(surface.face_normals, up, np.cos(cone))
+        mean, share = sum_level_normals(surface.face_normals, up, np.cos(cone))
         if share < 0.02 or np.linalg.norm(mean) == 0:
             return np.asarray(up)
         up = mean / np.linalg.norm(mean)
@@ -107,43 +107,10 @@ def _visible(points: Float32, normals: Float32, camera: Camera, T_world_camera: 
     """The points (P, 3) that a small picture shows: in each pixel the nearest of those that turn their front to it."""
     nearest = np.full(camera.shape, -1, np.int32)
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)  # one kernel for both layouts
-    _draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
+    draw_fronts(points, normals, T_world_camera, (camera.fx, camera.fy, camera.cx, camera.cy), nearest)
     return np.asarray(nearest[nearest >= 0])
 
 
 def _score(instance_ids: Int32) -> float:
     """How much a picture shows, given its pixels' ids. Square roots: ten objects are worth more than a large one."""
     return float(np.sqrt(np.bincount(instance_ids, minlength=1)[1:]).sum() + np.sqrt(len(instance_ids)))
-
-
-@njit(cache=True, nogil=True)
-def _level(normals: Float32, up: Float64, cosine: float) -> tuple[Float64, float]:
-    """The sum (3,) of the normals (F, 3) within a cone around `up` (3,), and their share of the area."""
-    total, inside, area = np.zeros(3), 0.0, 0.0
-    for f in range(len(normals)):
-        x, y, z = normals[f, 0], normals[f, 1], normals[f, 2]
-        size = np.sqrt(x * x + y * y + z * z)
-        area += size
-        if x * up[0] + y * up[1] + z * up[2] > cosine * size:
-            inside += size
-            total[0], total[1], total[2] = total[0] + x, total[1] + y, total[2] + z
-    return total, inside / max(area, 1e-12)
-
-
-@njit(cache=True, nogil=True)
-def _draw_fronts(
-    points: Float32, normals: Float32, T: Float64, intrinsics: tuple[float, float, float, float], nearest: Int32
-) -> None:
-    """Writes which point (P, 3) is the nearest (H, W) of those that turn their front to the camera, T_world_camera."""
-    fx, fy, cx, cy = intrinsics
-    height, width = nearest.shape
-    depth = np.full(nearest.shape, np.inf)
-    for i in range(len(points)):
-        x, y, z = points[i, 0] - T[0, 3], points[i, 1] - T[1, 3], points[i, 2] - T[2, 3]
-        distance = T[0, 2] * x + T[1, 2] * y + T[2, 2] * z
-        if x * normals[i, 0] + y * normals[i, 1] + z * normals[i, 2] >= 0 or distance <= 0:
-            continue
-        u = int(np.rint(fx * (T[0, 0] * x + T[1, 0] * y + T[2, 0] * z) / distance + cx))
-        v = int(np.rint(fy * (T[0, 1] * x + T[1, 1] * y + T[2, 1] * z) / distance + cy))
-        if 0 <= u < width and 0 <= v < height and distance < depth[v, u]:
-            depth[v, u], nearest[v, u] = distance, i

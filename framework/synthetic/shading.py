@@ -8,7 +8,8 @@ import numpy as np
 from numba import njit
 
 from framework.data import Bool, Camera, Float32, Float64, Int32, Int64
-from framework.rendering.rasterizer import NO_TRIANGLE, VisibilityBuffer
+from framework.rendering.rasterizer import VisibilityBuffer
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.ray_caster import RayCaster, pixel_rays
 from framework.synthetic.surfaces import Surfaces
 from framework.synthetic.textures import DARK, SHINY, surface_color

@@ -8,11 +8,11 @@ from enum import IntEnum
 
 import cv2
 import numpy as np
-from numba import njit
 
 from framework.config.validation import MOST_DETECTIONS, require
 from framework.data import Bool, Detections, Float32, Float64, Frame, Int32
 from framework.detection.masks.binary_masks import paste_masks, tight_boxes
+from framework.detection.masks.contact_kernels import contacts
 from framework.detection.recurring_false_positives import ghost_places
 from framework.detection.true_instances import TrueInstances, true_instances
 from framework.interfaces import Detector
@@ -28,15 +28,11 @@ LOOKALIKES = (
 )
 # fmt: on
 """COCO classes that are taken for each other, chosen from what detectors are seen to confuse indoors."""
-
 TAKEN_FOR = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
 """What is none of COCO's classes is taken for one of these."""
-
 LOOKALIKE_SHARE = 0.8  # of the probability lost by the true class; the rest is spread over all other classes
 EVEN_SHARE = 0.01  # of each distribution that is the model's mean: like a softmax, it has no zeros
-CONTACT_DEPTH = 0.1  # m, neighbouring pixels of two instances nearer than this in depth touch
 FALSE_SIZES = (24.0, 160.0)  # px, sides of false detections, drawn evenly on a logarithmic scale
-
 LARGEST_CLUTTER = 0.25  # of the image: larger things, walls as a rule, are not taken for objects as a whole
 LARGEST_ATTACHED = 2.0  # times the object's size: larger things are not taken for a part of it
 GHOST_SIZES = (0.2, 1.2)  # m, sides of false detections at places of the room, drawn evenly on a logarithmic scale
@@ -354,27 +350,7 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
 def touching_pairs(frame: Frame) -> Int32:
     """The pairs (M, 2) of instance ids, the smaller id first, that share a border without a step in depth."""
     assert frame.truth is not None
-    return np.asarray(np.unique(_contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
-
-
-@njit(cache=True, nogil=True)
-def _contacts(ids, depth):
-    """The pairs (M, 2) of neighbouring pixels' instances, the smaller id first, some of them more than once."""
-    height, width = ids.shape
-    pairs = np.empty((2 * height * width, 2), np.int32)
-    n = 0
-    for v in range(height):
-        for u in range(width):
-            own = ids[v, u]
-            if own <= 0:
-                continue
-            for y, x in ((v, u + 1), (v + 1, u)):
-                if y == height or x == width or ids[y, x] <= 0 or ids[y, x] == own:
-                    continue
-                if abs(depth[v, u] - depth[y, x]) < np.float32(CONTACT_DEPTH):
-                    pairs[n, 0], pairs[n, 1] = min(own, ids[y, x]), max(own, ids[y, x])
-                    n += 1
-    return pairs[:n].copy()
+    return np.asarray(np.unique(contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
 
 
 def signed_distance(mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Float32:

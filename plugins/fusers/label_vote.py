@@ -11,7 +11,7 @@ from framework.data import Frame, PointClusters, Pose
 from framework.interfaces import MapFuser, SceneMap
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
-from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
 

@@ -15,7 +15,7 @@ import pytest
 from framework.data import Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.mapping.instance_map import InstanceMap
-from framework.mapping.voxels.voxel_grid import BLOCK_SIDE, UNSEEN
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, UNSEEN
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.detectors.none import NoDetections

@@ -4,7 +4,8 @@ import numpy as np
 
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
 from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
-from framework.mapping.labels.label_evidence import Combine, Evidence, Measurement, class_said, named_classes
+from framework.mapping.labels.label_evidence import Evidence, Measurement, class_said, named_classes
+from framework.mapping.labels.label_evidence_kernels import Combine
 
 FLOOR = 0.05
 UNITS = 1 << 16  # as fine as in exact storage

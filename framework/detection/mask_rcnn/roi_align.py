@@ -108,7 +108,7 @@ def _sums(cells: Tensor, x: Samples, y: Samples) -> Tensor:
     if len(sizes) <= at_once:
         return _sum_chunk(cells, x, y).permute(0, 3, 1, 2)
     pooled = cells.new_empty((len(sizes), y.bins, x.bins, cells.shape[1]))
-    for chosen in sizes.argsort().split(at_once):
+    for chosen in sizes.argsort().split(at_once):  # type: ignore[no-untyped-call]
         pooled[chosen] = _sum_chunk(cells, x.of(chosen), y.of(chosen))
     return pooled.permute(0, 3, 1, 2)
 

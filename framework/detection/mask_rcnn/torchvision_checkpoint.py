@@ -77,7 +77,8 @@ def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
             sliced[f"{layer}.{kind}"] = tensors[f"{layer}.{kind}"][rows]
     for kind in ("weight", "bias"):
         deltas = tensors[f"roi_heads.box_predictor.bbox_pred.{kind}"]
-        sliced[f"roi_heads.box_predictor.bbox_pred.{kind}"] = deltas.unflatten(0, (COCO_LABELS, 4))[rows].flatten(0, 1)
+        kept = deltas.unflatten(0, (COCO_LABELS, 4))[rows]  # type: ignore[no-untyped-call]
+        sliced[f"roi_heads.box_predictor.bbox_pred.{kind}"] = kept.flatten(0, 1)
     return sliced
 
 

@@ -85,7 +85,8 @@ def dequantised(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
 @cache
 def has_int8_kernels() -> bool:
     """Whether torch computes convolutions of integers here, and the largest numbers right."""
-    if not (torch.backends.mkldnn.is_available() and torch.backends.quantized.engine == "x86"):
+    has_mkldnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
+    if not has_mkldnn or torch.backends.quantized.engine != "x86":
         return False
     channels = 16
     kernel = torch.full((1, channels, 1, 1), float(MOST_OF_WEIGHTS))

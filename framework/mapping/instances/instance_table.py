@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import Float32, Float64, Int32
 from framework.mapping.instances.object_embedding import ObjectEmbedding, added
-from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_evidence_kernels import Combine
 
 
 class FrameSet:

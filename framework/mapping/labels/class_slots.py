@@ -14,7 +14,7 @@ from numba import types
 from numba.core import cgutils
 from numba.extending import intrinsic, overload
 
-from framework.mapping.voxels.voxel_grid import device
+from framework.mapping.voxels.voxel_grid_kernels import device
 
 CLASS_SLOTS = 16  # of a voxel in compact storage
 NO_CLASS = 255  # in a free slot; slots are filled from the front

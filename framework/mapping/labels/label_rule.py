@@ -16,14 +16,8 @@ from framework.mapping.instances.association import Matches, class_agreement
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.evidence_rows import Storage
-from framework.mapping.labels.label_evidence import (
-    MOST_GAIN,
-    MOST_UNITS,
-    Combine,
-    Measurement,
-    class_said,
-    named_classes,
-)
+from framework.mapping.labels.label_evidence import MOST_GAIN, MOST_UNITS, Measurement, class_said, named_classes
+from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, leave_to_others
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf import VoxelHashing

@@ -3,115 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
 
 from framework.data import Bool, Int32, UInt8
-from framework.mapping.labels.label_evidence import Evidence, best_class, best_counted_instance, labeled_voxel
+from framework.mapping.labels.label_evidence import Evidence
+from framework.mapping.labels.vertex_labels_kernels import color_vertices, label_vertices
 from framework.mapping.voxels.meshing import UnlabeledMesh
-from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, UNSEEN, Grid, device, find_block, unpack_color
-from framework.mapping.voxels.voxel_walk import voxel_number
-
-CORNERS = 8  # voxels around a vertex
-REACH = 2.0  # voxels; those farther from the surface saw other pixels than it, and have no vote
-CHUNK = 1024  # vertices that share their scratch arrays
-
-
-@device
-def corner_voxels(grid, vertex, blocks, numbers, shares):
-    """The voxels around a vertex (3,) m: block, -1 = absent, number within it and trilinear share, into (8,) arrays.
-
-    Returns whether any of them has label evidence.
-    """
-    scale = np.float32(1.0) / grid.voxel_size
-    x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
-    i, j, k = int(np.floor(x)), int(np.floor(y)), int(np.floor(z))
-    x, y, z = x - i, y - j, z - k
-    key = np.int64(-2)
-    region = np.int32(-1)
-    labelled = False
-    for c in range(CORNERS):
-        dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
-        block, key, region = find_block(grid, (i + dx) >> 3, (j + dy) >> 3, (k + dz) >> 3, key, region)
-        blocks[c] = block
-        numbers[c] = voxel_number(i + dx, j + dy, k + dz)
-        shares[c] = (x if dx else 1 - x) * (y if dy else 1 - y) * (z if dz else 1 - z)
-        labelled = labelled or (block >= 0 and grid.label_row[block] >= 0)
-    return labelled
-
-
-@device
-def keep_near(grid, blocks, numbers, shares):
-    """Takes the shares (8,) from those of the voxels around a vertex that were not seen or are far from the surface."""
-    near = np.float32(REACH) * grid.voxel_size
-    for c in range(CORNERS):
-        stored = grid.tsdf[blocks[c], numbers[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
-        if stored == UNSEEN or abs(stored) * grid.tsdf_unit > near:
-            shares[c] = 0
-
-
-@device
-def majority(labels, shares):
-    """The voxel with the largest share of those whose label, above 0, has more than half of all shares; -1 if none has.
-
-    `labels` and `shares` (8,) are those of the voxels around a vertex.
-    """
-    total = np.float32(0.0)
-    for c in range(CORNERS):
-        total += shares[c]
-    for c in range(CORNERS):
-        votes = np.float32(0.0)
-        largest = c
-        for d in range(CORNERS):
-            if labels[d] == labels[c]:
-                votes += shares[d]
-                if shares[d] > shares[largest]:
-                    largest = d
-        if labels[c] > 0 and votes > np.float32(0.5) * total:
-            return largest
-    return -1
-
-
-@device
-def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
-    """(instance, class) of a vertex: the instance that has more than half of its corners' votes, 0 and -1 if none has.
-
-    A voxel near the surface votes with its share for its likeliest instance that counts, or for none.
-    """
-    keep_near(grid, blocks, numbers, shares)
-    for c in range(CORNERS):
-        voxel = labeled_voxel(grid, evidence, blocks[c], numbers[c]) if shares[c] > 0 else np.int32(-1)
-        ids[c] = best_counted_instance(evidence, voxel, counts) if voxel >= 0 else np.int32(0)
-    elected = majority(ids, shares)
-    if elected < 0:
-        return np.int32(0), np.int32(-1)
-    return ids[elected], best_class(evidence, labeled_voxel(grid, evidence, blocks[elected], numbers[elected]))
-
-
-@device
-def color_of(color, voxel, out):
-    """The colour of a voxel, numbered as in an UnlabeledMesh, into `out` (3,)."""
-    red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
-    out[0], out[1], out[2] = red / 4, green / 4, blue / 4
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _color(color, voxels, colors):
-    for v in prange(len(voxels)):
-        color_of(color, voxels[v], colors[v])
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _label(grid, evidence, counts, vertices, voxels, colors, instance_ids, class_ids):
-    for chunk in prange(-(-len(voxels) // CHUNK)):
-        blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
-        ids, shares = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
-        for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(voxels))):
-            color_of(grid.color, voxels[v], colors[v])
-            instance, label = np.int32(0), np.int32(-1)
-            if corner_voxels(grid, vertices[v], blocks, numbers, shares):
-                instance, label = _elect(grid, evidence, counts, blocks, numbers, shares, ids)
-            instance_ids[v] = instance
-            class_ids[v] = label
+from framework.mapping.voxels.voxel_grid import Grid
 
 
 def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: UnlabeledMesh) -> tuple[UInt8, Int32, Int32]:
@@ -126,12 +23,12 @@ def vertex_labels(grid: Grid, evidence: Evidence, counts: Bool, surface: Unlabel
     count = len(surface.voxels)
     colors = np.empty((count, 3), np.uint8)
     instance_ids, class_ids = np.empty(count, np.int32), np.empty(count, np.int32)
-    _label(grid, evidence, counts, surface.vertices, surface.voxels, colors, instance_ids, class_ids)
+    label_vertices(grid, evidence, counts, surface.vertices, surface.voxels, colors, instance_ids, class_ids)
     return colors, instance_ids, class_ids
 
 
 def vertex_colors(grid: Grid, voxels: Int32) -> UInt8:
     """(V, 3) RGB of the voxels nearest to vertices, numbered as in an UnlabeledMesh."""
     colors = np.empty((len(voxels), 3), np.uint8)
-    _color(grid.color, voxels, colors)
+    color_vertices(grid.color, voxels, colors)
     return colors

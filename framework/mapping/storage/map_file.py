@@ -20,9 +20,9 @@ from framework.files.atomic_write import check_regular, written_whole
 from framework.files.json_file import parse_json
 from framework.mapping.instances.instance_table import FrameSet, InstanceRecord, InstanceTable
 from framework.mapping.instances.object_embedding import ARRAYS, SPACE, embedding_arrays, read_embeddings
-from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.storage.map_header import LARGEST_COUNT, MapHeader, whole
-from framework.mapping.voxels.voxel_grid import FARTHEST_BLOCK
+from framework.mapping.voxels.voxel_grid_kernels import FARTHEST_BLOCK
 
 DEFLATE_LEVEL = 1  # of zlib: at most a tenth larger than level 6, which np.savez_compressed has, in half its time
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.mapping.voxels.voxel_grid import device
+from framework.mapping.voxels.voxel_grid_kernels import device
 
 ONE = np.uint64(1)
 _EIGHT = np.uint64(8)

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 
 from framework.data import Camera, Float32, Float64
-from framework.mapping.voxels.voxel_grid import device
 
 BOUNDS = {  # of what measures, and of the voxels that it fills; see Tsdf and VoxelHashing
     "voxel_size": (1e-4, 1.0),
@@ -62,22 +61,3 @@ def pinhole(camera: Camera, T: Float64) -> Pinhole:
         R=np.ascontiguousarray(T[:3, :3], np.float32),
         t=np.ascontiguousarray(T[:3, 3], np.float32),
     )
-
-
-@device
-def ray_direction(view, u, v):
-    """(dx, dy, dz), in the world, m for each m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
-    ray_x = (np.float32(u) - view.cx) / view.fx
-    ray_y = (np.float32(v) - view.cy) / view.fy
-    return (
-        view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2],
-        view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2],
-        view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2],
-    )
-
-
-@device
-def seen_point(view, u, v, z):
-    """(x, y, z), in the world, m: the point that pixel (u, v) sees at depth z (m). `view` holds T_world_camera."""
-    dx, dy, dz = ray_direction(view, u, v)
-    return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz

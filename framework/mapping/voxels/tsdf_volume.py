@@ -15,7 +15,8 @@ from framework.mapping.voxels.integration import Integrator, SeenBlocks
 from framework.mapping.voxels.integration_parameters import BOUNDS, Sensor
 from framework.mapping.voxels.meshing import SurfaceNets, UnlabeledMesh
 from framework.mapping.voxels.raycasting import render_near, render_surface
-from framework.mapping.voxels.voxel_grid import BLOCK_VOXELS, MOST_BLOCKS, VoxelGrid, find_solid_blocks
+from framework.mapping.voxels.voxel_grid import MOST_BLOCKS, VoxelGrid
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, find_solid_blocks
 
 BLOCK_ARRAYS = ("block_coords", "tsdf", "weight", "color", "label_row")  # of the grid, that are saved
 NO_BLOCKS = np.zeros(0, np.int32)

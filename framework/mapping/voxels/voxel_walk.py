@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.mapping.voxels.voxel_grid import COLORED, UNSEEN, device, unpack_color
+from framework.mapping.voxels.voxel_grid_kernels import COLORED, UNSEEN, device, unpack_color
 
 
 @device

@@ -7,33 +7,17 @@ neither that nor evidence for single points, and is slower (tests/benchmarks/tes
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 
 from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.refinement.mixtures.gaussian import (
     ABSENT,
-    add_moments,
-    add_point,
-    add_to,
-    constant_exponential,
-    exponentials,
-    floor_eigenvalues,
-    invert,
-    log_densities,
-    log_evidence,
-    raise_to,
-    raise_to_density,
-    set_coefficients,
 )
+from framework.refinement.mixtures.mixture_kernels import BLOCK, claim, coefficients, fit_all
 
-MIN_SUPPORT = 4.0  # points that a component needs to have a covariance of its own in 3D; with fewer it is dropped
-BLOCK = 256  # points that a kernel handles at once: their densities stay in the first-level cache
 BATCH = 16 * BLOCK  # points that a thread takes at once
-MARGIN = 1e-3  # nats, more than what single precision rounds log densities by
 
 
 @dataclass(frozen=True)
@@ -79,7 +63,7 @@ def fit(
     outliers, log_likelihoods = np.zeros((n, 2)), np.zeros(n)
     iterations = np.zeros(n, np.int64)
     odds = np.zeros(len(points), np.float32) if prior_log_odds is None else prior_log_odds
-    _fit_all(
+    fit_all(
         points, starts, labels, odds, own_components, max_iterations, tolerance, variance_floor, outlier_fraction,
         weights, means, covariances, outliers, log_likelihoods, iterations,
     )  # fmt: skip
@@ -102,7 +86,7 @@ def likely_members(
     A mixture that lost all of its components claims every point: nothing is known against them. Points outside of the
     ranges are claimed by none.
     """
-    rows = _coefficients(mixtures.weights, mixtures.means, mixtures.covariances)
+    rows = coefficients(mixtures.weights, mixtures.means, mixtures.covariances)
     log_outliers = _logarithms(mixtures.outlier_weights * mixtures.outlier_densities)
     odds = np.zeros(len(points), np.float32) if prior_log_odds is None else prior_log_odds
     blocks = -(-(ends - begins) // BATCH)
@@ -110,221 +94,10 @@ def likely_members(
     firsts = begins[owner] + BATCH * (np.arange(len(owner)) - np.repeat(np.cumsum(blocks) - blocks, blocks))
     lasts = np.minimum(firsts + BATCH, ends[owner])
     claimed = np.zeros(len(points), np.bool_)
-    _claim(points, owner, firsts, lasts, odds, rows, log_outliers, own_components, min_posterior, claimed)
+    claim(points, owner, firsts, lasts, odds, rows, log_outliers, own_components, min_posterior, claimed)
     return claimed
 
 
 def _logarithms(values: Float64) -> Float32:
     """log(values), ABSENT for 0."""
     return np.where(values > 0, np.log(np.maximum(values, 1e-300)), ABSENT).astype(np.float32)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _fit_all(
-    points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, max_iterations: int,
-    tolerance: float, variance_floor: float, outlier_fraction: float, weights: Float64, means: Float64,
-    covariances: Float64, outliers: Float64, log_likelihoods: Float64, iterations: Int64,
-) -> None:  # fmt: skip
-    for k in prange(len(starts) - 1):
-        if starts[k + 1] > starts[k]:
-            _fit_one(
-                points[starts[k] : starts[k + 1]], labels[starts[k] : starts[k + 1]], odds[starts[k] : starts[k + 1]],
-                own_components, max_iterations, tolerance, variance_floor, outlier_fraction,
-                weights[k], means[k], covariances[k], outliers[k], log_likelihoods[k : k + 1], iterations[k : k + 1],
-            )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def _fit_one(
-    points: Float32, labels: Int32, odds: Float32, own_components: int, max_iterations: int, tolerance: float,
-    variance_floor: float, outlier_fraction: float, weights: Float64, means: Float64, covariances: Float64,
-    outlier: Float64, log_likelihood: Float64, iterations: Int64,
-) -> None:  # fmt: skip
-    count, components = len(points), len(weights)
-    center, volume = _center_and_volume(points, variance_floor)
-    outlier[0], outlier[1] = outlier_fraction, 1.0 / volume
-    moments = np.zeros((components, 10))
-    for i in range(count):
-        add_point(moments[labels[i]], points[i], center, 1.0 - outlier_fraction)
-    _maximize(moments, center, count, variance_floor, weights, means, covariances)
-    xyz = np.empty((3, count), np.float32)  # centered, so that single precision suffices
-    for i in range(count):
-        for a in range(3):
-            xyz[a, i] = points[i, a] - center[a]
-    rows = np.zeros((components, 10), np.float32)
-    previous = -np.inf
-    for iteration in range(max_iterations):
-        if not _any_left(weights):
-            return
-        for j in range(components):
-            set_coefficients(weights[j], means[j], covariances[j], rows[j])
-            for a in range(3):
-                rows[j, 1 + a] = means[j, a] - center[a]
-        log_outlier = np.float32(math.log(outlier[0] * outlier[1])) if outlier[0] > 0 else ABSENT
-        for j in range(components):
-            for a in range(10):
-                moments[j, a] = 0.0
-        total, outliers = _expect(xyz, odds, own_components, rows, log_outlier, moments)
-        _maximize(moments, center, count, variance_floor, weights, means, covariances)
-        outlier[0] = outliers / count
-        iterations[0], log_likelihood[0] = iteration + 1, total / count
-        if log_likelihood[0] - previous < tolerance:
-            break
-        previous = log_likelihood[0]
-
-
-@njit(cache=True, nogil=True)
-def _any_left(weights: Float64) -> bool:
-    left = False
-    for weight in weights:
-        left = left or weight != 0.0
-    return left
-
-
-@njit(cache=True, nogil=True)
-def _expect(
-    xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
-) -> tuple[float, float]:
-    """E-step [2], which at once sums the M-step's moments; returns sum_i log p(x_i) and the outliers' N_k."""
-    components = len(rows)
-    densities = np.empty((components, BLOCK), np.float32)
-    largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    outliers_before = np.empty(BLOCK, np.float32)
-    total, outliers = 0.0, 0.0
-    for first in range(0, xyz.shape[1], BLOCK):
-        x, y, z = xyz[0, first : first + BLOCK], xyz[1, first : first + BLOCK], xyz[2, first : first + BLOCK]
-        n = len(x)
-        largest[:n] = log_outlier
-        for j in range(components):
-            log_densities(x, y, z, rows[j], densities[j])
-            if j < own_components:
-                add_to(densities[j], odds[first : first + n])
-            raise_to(largest, densities[j], n)
-        constant_exponential(log_outlier, largest, evidence, n)
-        for i in range(n):
-            outliers_before[i] = evidence[i]
-        for j in range(components):
-            exponentials(densities[j], largest, evidence, n)
-        total += log_evidence(largest, evidence, n)
-        outliers += invert(evidence, outliers_before, n)
-        for j in range(components):
-            add_moments(x, y, z, densities[j], evidence, moments[j])
-    return total, outliers
-
-
-@njit(cache=True, nogil=True)
-def _maximize(
-    moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
-    covariances: Float64,
-) -> None:  # fmt: skip
-    """M-step [3, 4]."""
-    for j in range(len(weights)):
-        N_k = moments[j, 0]
-        if N_k < MIN_SUPPORT:
-            weights[j] = 0.0
-            continue
-        weights[j] = N_k / count
-        x, y, z = moments[j, 1] / N_k, moments[j, 2] / N_k, moments[j, 3] / N_k
-        means[j, 0], means[j, 1], means[j, 2] = center[0] + x, center[1] + y, center[2] + z
-        Sigma = covariances[j]
-        Sigma[0, 0] = moments[j, 4] / N_k - x * x
-        Sigma[0, 1] = Sigma[1, 0] = moments[j, 5] / N_k - x * y
-        Sigma[0, 2] = Sigma[2, 0] = moments[j, 6] / N_k - x * z
-        Sigma[1, 1] = moments[j, 7] / N_k - y * y
-        Sigma[1, 2] = Sigma[2, 1] = moments[j, 8] / N_k - y * z
-        Sigma[2, 2] = moments[j, 9] / N_k - z * z
-        floor_eigenvalues(Sigma, variance_floor)
-
-
-@njit(cache=True, nogil=True)
-def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
-    """The mean of the points, and the volume of their bounding box with no side below four standard deviations."""
-    center, low, high = np.zeros(3), np.empty(3), np.empty(3)
-    for a in range(3):
-        low[a] = high[a] = points[0, a]
-    for i in range(len(points)):
-        for a in range(3):
-            center[a] += points[i, a]
-            low[a] = min(low[a], points[i, a])
-            high[a] = max(high[a], points[i, a])
-    volume = 1.0
-    for a in range(3):
-        center[a] /= len(points)
-        volume *= max(high[a] - low[a], 4.0 * math.sqrt(variance_floor))
-    return center, volume
-
-
-@njit(cache=True, nogil=True)
-def _coefficients(weights: Float64, means: Float64, covariances: Float64) -> Float32:
-    rows = np.zeros((*weights.shape, 10), np.float32)
-    for k in range(weights.shape[0]):
-        for j in range(weights.shape[1]):
-            set_coefficients(weights[k, j], means[k, j], covariances[k, j], rows[k, j])
-    return rows
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _claim(
-    points: Float32, owner: Int64, firsts: Int64, lasts: Int64, odds: Float32, rows: Float32, log_outliers: Float32,
-    own_components: int, min_posterior: float, claimed: Bool,
-) -> None:  # fmt: skip
-    """Whether own / (own + others) > min_posterior for each point of the batches, of one mixture each."""
-    for b in prange(len(owner)):
-        k, first, last = owner[b], firsts[b], lasts[b]
-        absent = True
-        for component in range(rows.shape[1]):
-            absent = absent and rows[k, component, 0] <= ABSENT
-        if absent:
-            claimed[first:last] = True
-        else:
-            _claim_batch(
-                points[first:last], odds[first:last], rows[k], log_outliers[k], own_components, min_posterior,
-                claimed[first:last],
-            )  # fmt: skip
-
-
-@njit(cache=True, nogil=True)
-def _claim_batch(
-    points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
-    claimed: Bool,
-) -> None:  # fmt: skip
-    """Most points need no exponential: a sum of n terms lies between its largest term and n times that."""
-    components = len(rows)
-    log_bound = math.log(min_posterior / (1.0 - min_posterior))
-    certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)
-    hopeless = np.float32(log_bound - math.log(own_components) - MARGIN)
-    xyz, densities = np.empty((3, BLOCK), np.float32), np.empty((components, BLOCK), np.float32)
-    own, others = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    doubtful, doubts = np.empty(len(points) + 1, np.int64), 0
-    for first in range(0, len(points), BLOCK):
-        n = min(BLOCK, len(points) - first)
-        for i in range(n):
-            for a in range(3):
-                xyz[a, i] = points[first + i, a]
-        own[:n], others[:n] = ABSENT, log_outlier
-        for j in range(components):
-            raise_to_density(xyz[0, :n], xyz[1, :n], xyz[2, :n], rows[j], own if j < own_components else others)
-        for i in range(n):
-            margin = own[i] + odds[first + i] - others[i]
-            claimed[first + i] = margin > certain
-            doubtful[doubts] = first + i
-            doubts += hopeless < margin <= certain
-    own_odds, largest = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
-    for first in range(0, doubts, BLOCK):
-        n = min(BLOCK, doubts - first)
-        for d in range(n):
-            i = doubtful[first + d]
-            own_odds[d] = odds[i]
-            for a in range(3):
-                xyz[a, d] = points[i, a]
-        largest[:n], own[:n] = log_outlier, 0
-        for j in range(components):
-            log_densities(xyz[0, :n], xyz[1, :n], xyz[2, :n], rows[j], densities[j])
-            if j < own_components:
-                add_to(densities[j], own_odds[:n])
-            raise_to(largest, densities[j], n)
-        constant_exponential(log_outlier, largest, others, n)
-        for j in range(components):
-            exponentials(densities[j], largest, own if j < own_components else others, n)
-        for d in range(n):
-            claimed[doubtful[first + d]] = own[d] > min_posterior * (own[d] + others[d])

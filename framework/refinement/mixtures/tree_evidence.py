@@ -6,7 +6,8 @@ import numpy as np
 
 from framework.data import Bool, Float32
 from framework.refinement.mixtures.mixture_tree import MixtureTree, own_shares
-from framework.refinement.neighborhood import Neighborhoods, grouped
+from framework.refinement.neighborhood import Neighborhoods
+from framework.refinement.neighborhood_kernels import grouped
 
 
 def object_shares(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:

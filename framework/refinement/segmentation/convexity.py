@@ -17,17 +17,18 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
 
 from framework.data import Bool, Camera, Float32, Int32
-from framework.refinement.segmentation.union_find import root, unite
-from framework.sensors.noise_models import axial_sigma, axial_sigma_single
-
-SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
-FEWEST_CELLS = 6  # that a plane is fitted to: three would fit without telling anything
-LEAST_SPREAD = 0.1  # least determinant of a window's second moments over its square, cells^4: a line has 0
-SWITCH = 1.5  # by how much a window beside a cell must fit better than the one around it
-STRIP = 16  # rows of cells in which pieces are connected in parallel
+from framework.refinement.segmentation.convexity_kernels import (
+    absorbed,
+    best_planes,
+    connected,
+    count_edges,
+    fit_planes,
+    pixel_labels,
+    spread,
+    sum_cells,
+)
 
 
 @dataclass(frozen=True)
@@ -38,24 +39,6 @@ class Limits:
     min_noise: float  # m, least standard deviation of depth, where readings come in coarser steps than the sensor's
     max_slope: float  # change of depth over the distance across the line of sight, m per m
     max_angle: float  # rad, by which a surface may bend towards the camera; what noise may bend it by comes on top
-
-
-Noise = tuple[float, float]  # noise_factor and min_noise of the limits, for kernels
-
-
-_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the fast math of the loop that it stands in
-
-
-@njit(cache=True, nogil=True)
-def _sigma(z: float, min_noise: float) -> float:
-    """Standard deviation (m) of depth z (m)."""
-    return float(max(axial_sigma(z), min_noise))
-
-
-@njit(cache=True, nogil=True)
-def _noise_at(inverse: float, noise: Noise) -> np.float32:
-    """By how much inverse depth (1 / m) may be off by noise."""
-    return np.float32(noise[0] * _sigma(1.0 / inverse, noise[1]) * inverse * inverse)
 
 
 def segments(
@@ -71,18 +54,18 @@ def segments(
         [camera.fx / cell, camera.fy / cell, (camera.cx + 0.5) / cell - 0.5, (camera.cy + 0.5) / cell - 0.5], np.float32
     )
     noise = (limits.noise_factor, limits.min_noise)
-    inverse = _cells(depth, cell, noise, slope)
-    fits = _fit_planes(inverse, window, noise, slope)
-    planes = _best_planes(inverse, fits, window, limits.min_noise)
-    edges = _edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
+    inverse = sum_cells(depth, cell, noise, slope)
+    fits = fit_planes(inverse, window, noise, slope)
+    planes = best_planes(inverse, fits, window, limits.min_noise)
+    edges = count_edges(planes, pinhole, noise, limits.max_angle, normal_sigma(1.0, window, cell, camera))
     min_cells = max(min_pixels // cell**2, 1)
-    labels, count = _connected(inverse, _closed(edges, closing), noise, slope, min_cells)
+    labels, count = connected(inverse, _closed(edges, closing), noise, slope, min_cells)
     for _ in range(2 + 2 * closing):  # as wide as edges are
-        labels, planes = _absorbed(inverse, labels, planes, noise)
+        labels, planes = absorbed(inverse, labels, planes, noise)
     # poles and legs are edges all over: what no segment took hangs together by depth alone
-    rest, rest_count = _connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
+    rest, rest_count = connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
     labels = np.where(rest >= 0, rest + count, labels)
-    return _pixel_labels(depth, inverse, labels, planes, cell, noise, slope), int(count + rest_count)
+    return pixel_labels(depth, inverse, labels, planes, cell, noise, slope), int(count + rest_count)
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
@@ -95,401 +78,8 @@ def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> 
     return float(np.sqrt(2.0) * depth_noise / (np.sqrt(readings) * offset))
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
-    """(rows, columns) mean inverse depth of each cell's nearest surface, 1 / m; 0 = no reading."""
-    height, width = depth.shape
-    rows, columns = -(-height // cell), -(-width // cell)
-    inverse = np.zeros((rows, columns), np.float32)
-    for row in prange(rows):
-        r = int(np.int64(row))
-        for c in range(columns):
-            nearest = np.float32(np.inf)
-            for v in range(r * cell, min((r + 1) * cell, height)):
-                for u in range(c * cell, min((c + 1) * cell, width)):
-                    if 0 < depth[v, u] < nearest:
-                        nearest = depth[v, u]
-            if nearest == np.inf:
-                continue
-            farthest = nearest * (1 + slope) + 2 * noise[0] * _sigma(nearest, noise[1])
-            total, count = np.float32(0), 0
-            for v in range(r * cell, min((r + 1) * cell, height)):
-                for u in range(c * cell, min((c + 1) * cell, width)):
-                    if 0 < depth[v, u] <= farthest:
-                        total += np.float32(1) / depth[v, u]
-                        count += 1
-            inverse[r, c] = total / np.float32(count)
-    return inverse
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _add_offset(
-    own: Float32, other: Float32, gate: Float32, gate_slope: Float32, x: np.float32, y: np.float32, reach: np.float32,
-    sums: Float32,
-) -> None:  # fmt: skip
-    """Adds the moments of the cells at one offset (x, y) to those of each cell of a row."""
-    zero, one = np.float32(0), np.float32(1)
-    n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
-    for c in range(len(own)):
-        e = other[c] - own[c]
-        limit = gate[c] + gate_slope[c] * reach
-        w = one if (e < limit) & (e > -limit) & (other[c] > zero) else zero
-        we = w * e
-        n[c] += w
-        sx[c] += w * x
-        sy[c] += w * y
-        sxx[c] += w * (x * x)
-        sxy[c] += w * (x * y)
-        syy[c] += w * (y * y)
-        se[c] += we
-        sxe[c] += we * x
-        sye[c] += we * y
-        see[c] += we * e
-
-
-@njit(cache=True, nogil=True)
-def _gates(inverse: Float32, noise: Noise, slope: np.float32, gate: Float32, gate_slope: Float32) -> None:
-    """How far inverse depth may be off between a row's cells and others: by noise, and a cell's distance apart."""
-    for c in range(len(inverse)):
-        d = inverse[c]
-        if d > 0:
-            gate[c] = _noise_at(d, noise)
-            gate_slope[c] = slope * d
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
-    """(4, rows, columns) inverse depth a x + b y + c around each cell, and the mean squared residual (inf = no fit)."""
-    rows, columns = inverse.shape
-    fits = np.zeros((4, rows, columns), np.float32)
-    for row in prange(rows):
-        r = int(np.int64(row))  # prange counts in unsigned numbers
-        gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-        _gates(inverse[r], noise, slope, gate, gate_slope)
-        sums = np.zeros((10, columns), np.float32)
-        for dy in range(-window, window + 1):
-            for dx in range(-window, window + 1):
-                if not 0 <= r + dy < rows or abs(dx) >= columns:
-                    continue
-                first, last = max(0, -dx), min(columns, columns - dx)
-                _add_offset(
-                    inverse[r, first:last], inverse[r + dy, first + dx : last + dx], gate[first:last],
-                    gate_slope[first:last], np.float32(dx), np.float32(dy), np.float32(np.sqrt(dx * dx + dy * dy)),
-                    sums[:, first:last],
-                )  # fmt: skip
-        _solve(inverse[r], sums, fits[:, r])
-    return fits
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
-    """Least squares of e = a x + b y + c for each cell of a row, by the centered normal equations."""
-    zero, one = np.float32(0), np.float32(1)
-    n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
-    for c in range(len(own)):
-        k = one / (n[c] if n[c] > zero else one)
-        xx, xy, yy = sxx[c] - k * sx[c] * sx[c], sxy[c] - k * sx[c] * sy[c], syy[c] - k * sy[c] * sy[c]
-        xe, ye, ee = sxe[c] - k * sx[c] * se[c], sye[c] - k * sy[c] * se[c], see[c] - k * se[c] * se[c]
-        determinant = xx * yy - xy * xy
-        fits = (own[c] > zero) & (n[c] >= FEWEST_CELLS) & (determinant > np.float32(LEAST_SPREAD) * n[c] * n[c])
-        s = one / (determinant if fits else one)
-        a, b = (yy * xe - xy * ye) * s, (xx * ye - xy * xe) * s
-        residual = k * (ee - a * xe - b * ye)
-        fit[0, c] = a if fits else zero
-        fit[1, c] = b if fits else zero
-        fit[2, c] = own[c] + k * (se[c] - a * sx[c] - b * sy[c]) if fits else zero
-        fit[3, c] = (residual if residual > zero else zero) if fits else np.float32(np.inf)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) -> Float32:
-    """(3, rows, columns) a, b, c of the window that fits each cell best, of that around it and the eight beside it.
-
-    Where noise alone would misfit as much, the window around the cell stays. c = 0 where no window fits.
-    """
-    rows, columns = inverse.shape
-    planes = fits[:3].copy()
-    for row in prange(rows):
-        r = int(np.int64(row))
-        score, variance = np.empty(columns, np.float32), np.zeros(columns, np.float32)
-        for c in range(columns):
-            d = inverse[r, c]
-            if d > 0:
-                variance[c] = (_sigma(1.0 / d, min_noise) * d * d) ** 2
-            score[c] = variance[c] + fits[3, r, c] + (d - fits[2, r, c]) ** 2
-        for dy in (0, -window, window):
-            if not 0 <= r + dy < rows:
-                continue
-            for dx in (0, -window, window):
-                if (dx == 0 and dy == 0) or abs(dx) >= columns:
-                    continue
-                first, last = max(0, -dx), min(columns, columns - dx)
-                _take_better(
-                    inverse[r, first:last], fits[:, r + dy, first + dx : last + dx], np.float32(dx), np.float32(dy),
-                    variance[first:last], score[first:last], planes[:, r, first:last],
-                )  # fmt: skip
-    return planes
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _take_better(
-    own: Float32, fit: Float32, dx: np.float32, dy: np.float32, variance: Float32, score: Float32, plane: Float32
-) -> None:  # fmt: skip
-    switch = np.float32(SWITCH)
-    fit_a, fit_b, fit_c, residual = fit
-    plane_a, plane_b, plane_c = plane
-    for c in range(len(own)):
-        here = fit_c[c] - fit_a[c] * dx - fit_b[c] * dy
-        off = own[c] - here
-        offered = switch * (variance[c] + residual[c] + off * off)
-        better = (offered < score[c]) & (own[c] > np.float32(0))
-        plane_a[c] = fit_a[c] if better else plane_a[c]
-        plane_b[c] = fit_b[c] if better else plane_b[c]
-        plane_c[c] = here if better else plane_c[c]
-        score[c] = offered if better else score[c]
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
-    """(rows, columns) cells without a plane, and those between two opposite neighbors where the surface ends."""
-    _, rows, columns = planes.shape
-    surface = np.empty((9, rows, columns), np.float32)
-    for r in prange(rows):
-        y = np.float32(r) - pinhole[3]
-        _set_surface(planes[:, r], y, pinhole, noise, max_angle, normal_sigma_1m, surface[:, r])
-    edges = np.zeros((rows, columns), np.bool_)
-    for row in prange(rows):
-        r = int(np.int64(row))
-        for c in range(columns):
-            edges[r, c] = planes[2, r, c] <= 0
-        for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            if r - dy < 0 or r + dy >= rows or columns < 3:
-                continue
-            first, last = abs(dx), columns - abs(dx)
-            _mark_between(
-                surface[:, r - dy, first - dx : last - dx], surface[:, r + dy, first + dx : last + dx],
-                np.float32(4 * np.sqrt(dx * dx + dy * dy) / (pinhole[0] + pinhole[1])), edges[r, first:last],
-            )  # fmt: skip
-    return edges
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _set_surface(
-    plane: Float32, y: np.float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float,
-    surface: Float32,
-) -> None:  # fmt: skip
-    """Of a row: unit normals (3) away from the camera, the planes' distances, points (3), what distance to a plane is
-    noise there, and the least cosine between the normals of a surface that does not bend.
-
-    1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane the point is 0.
-    """
-    zero, one = np.float32(0), np.float32(1)
-    fx, fy, cx, _ = pinhole
-    a, b, d = plane
-    nx, ny, nz, distance, px, py, pz, gate, min_cosine = surface
-    k, floor = np.float32(noise[0]), np.float32(noise[1])
-    angle, angle_sigma = np.float32(max_angle), np.float32(normal_sigma_1m)
-    for c in range(len(d)):
-        there = d[c] > zero
-        x = np.float32(c) - cx
-        z = one / (d[c] if there else one)
-        mx, my, mz = a[c] * fx, b[c] * fy, (d[c] if there else one) - a[c] * x - b[c] * y
-        length = one / np.sqrt(mx * mx + my * my + mz * mz)
-        nx[c], ny[c], nz[c], distance[c] = mx * length, my * length, mz * length, length
-        px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if there else zero
-        sigma = _axial_sigma(z)
-        gate[c] = k * (sigma if sigma > floor else floor)
-        # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; an angle beyond it is no crease
-        t = angle + gate[c] * angle_sigma / z
-        t2 = t * t
-        min_cosine[c] = one - np.float32(0.5) * t2 + t2 * t2 * np.float32(1 / 24) if t < np.float32(1.5) else zero
-
-
-@njit(cache=True, nogil=True, fastmath=SIMD)
-def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
-    """Marks cells whose two opposite neighbors are too far off each other's plane, or bend towards the camera.
-
-    `spacing` is the distance between the two at 1 m. By as much each may lie behind the other's plane, which is how
-    two faces meet at a convex edge; before a step, one of them lies in front.
-    """
-    zero = np.float32(0)
-    ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
-    bx, by, bz, bd, bpx, bpy, bpz, _, _ = other
-    for c in range(len(edges)):
-        # how far the other's point lies in front of one's plane, and the reverse
-        h = ad[c] - (ax[c] * bpx[c] + ay[c] * bpy[c] + az[c] * bpz[c])
-        g = bd[c] - (bx[c] * apx[c] + by[c] * apy[c] + bz[c] * apz[c])
-        cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
-        far, near = h if h > zero else -h, g if g > zero else -g
-        z = apz[c] if apz[c] < bpz[c] else bpz[c]
-        jump = (far if far < near else near) > gate[c] + (spacing * z if h * g > zero else zero)
-        concave = (h + g > zero) & (cosine < min_cosine[c])
-        both = (apz[c] > zero) & (bpz[c] > zero)
-        edges[c] |= both & (jump | concave)
-
-
 def _closed(edges: Bool, radius: int) -> Bool:
     """The edges with their gaps closed by a square of 2 `radius` + 1 cells; what lies outside of the image is none."""
     if radius == 0:
         return edges
-    return np.asarray(_spread(_spread(edges, radius, True), radius, False), np.bool_)
-
-
-@njit(cache=True, nogil=True)  # as below, too little work to share
-def _spread(marked: Bool, radius: int, value: bool) -> Bool:
-    """Cells that have `value` pass it on to all within `radius`."""
-    rows, columns = marked.shape
-    across, both = np.empty_like(marked), np.empty_like(marked)
-    for r in range(rows):
-        across[r] = marked[r]
-        for dx in range(1, min(radius, columns - 1) + 1):
-            _pass_on(marked[r, dx:], value, across[r, :-dx])
-            _pass_on(marked[r, :-dx], value, across[r, dx:])
-    for r in range(rows):
-        both[r] = across[r]
-        for dy in range(-radius, radius + 1):
-            if 0 <= r + dy < rows:
-                _pass_on(across[r + dy], value, both[r])
-    return both
-
-
-@njit(cache=True, nogil=True)
-def _pass_on(source: Bool, value: bool, target: Bool) -> None:
-    for c in range(len(source)):
-        target[c] = (target[c] | source[c]) if value else (target[c] & source[c])
-
-
-@njit(cache=True, nogil=True)
-def _unite_row(
-    inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
-) -> None:  # fmt: skip
-    """Unites the cells of row r with those to their left, or above them, where depth does not jump."""
-    columns = inverse.shape[1]
-    step = columns if upwards else 1
-    flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
-    for cell in range(r * columns + (not upwards), (r + 1) * columns):
-        other = cell - step
-        if flat_edges[cell] or flat_edges[other] or parents[cell] == parents[other]:
-            continue
-        d, e = flat_inverse[cell], flat_inverse[other]
-        if abs(d - e) < _noise_at(d, noise) + slope * d:
-            unite(parents, cell, other)
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
-    """Connected pieces of cells that are no edge: (rows, columns) in [0, count), -1 = edge or too small a piece."""
-    rows, columns = inverse.shape
-    parents = np.arange(rows * columns).astype(np.int32)
-    strips = -(-rows // STRIP)
-    for strip in prange(strips):
-        s = int(np.int64(strip))
-        for r in range(s * STRIP, min((s + 1) * STRIP, rows)):
-            _unite_row(inverse, edges, noise, slope, r, False, parents)
-            if r > s * STRIP:
-                _unite_row(inverse, edges, noise, slope, r, True, parents)
-    for s in range(1, strips):
-        _unite_row(inverse, edges, noise, slope, s * STRIP, True, parents)
-    sizes = np.zeros(rows * columns, np.int32)
-    flat_edges = edges.ravel()
-    for cell in range(rows * columns):
-        if not flat_edges[cell]:
-            sizes[root(parents, cell)] += 1
-    numbers, count = np.full(rows * columns, -1, np.int32), 0
-    labels = np.full(rows * columns, -1, np.int32)
-    for cell in range(rows * columns):
-        first = root(parents, cell)
-        if flat_edges[cell] or sizes[first] < min_cells:
-            continue
-        if numbers[first] < 0:
-            numbers[first] = count
-            count += 1
-        labels[cell] = numbers[first]
-    return labels.reshape((rows, columns)), count
-
-
-@njit(cache=True, nogil=True)  # too little work to share: a fifth of a millisecond
-def _absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """One step of the segments into the cells that have none: to the neighbor whose plane foretells the cell best."""
-    rows, columns = inverse.shape
-    new_labels, new_planes = labels.copy(), planes.copy()
-    for r in range(rows):
-        for c in range(columns):
-            d = inverse[r, c]
-            if labels[r, c] >= 0 or d <= 0:
-                continue
-            least = _noise_at(d, noise)
-            for dy, dx in ((0, -1), (-1, 0), (0, 1), (1, 0)):
-                s, t = r + dy, c + dx
-                if not (0 <= s < rows and 0 <= t < columns) or labels[s, t] < 0:
-                    continue
-                foretold = planes[2, s, t] - planes[0, s, t] * dx - planes[1, s, t] * dy
-                if abs(d - foretold) < least:
-                    least = abs(d - foretold)
-                    new_labels[r, c] = labels[s, t]
-                    new_planes[0, r, c], new_planes[1, r, c] = planes[0, s, t], planes[1, s, t]
-                    new_planes[2, r, c] = foretold
-    return new_labels, new_planes
-
-
-@njit(cache=True, nogil=True, parallel=True)
-def _pixel_labels(
-    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise,
-    slope: np.float32,
-) -> Int32:  # fmt: skip
-    """(H, W) of the cells nearest to a pixel (its own, and those beside it) the label of the one that foretells it.
-
-    What none of their planes foretells takes the label of its own cell, where it lies near that cell's mean.
-    """
-    height, width = depth.shape
-    rows, columns = labels.shape
-    found = np.full((height, width), -1, np.int32)
-    middle = np.float32(0.5 * (cell - 1))
-    for row in prange(rows):
-        r = int(np.int64(row))
-        near_labels, near_planes = np.empty(9, np.int32), np.empty((9, 3), np.float32)
-        for c in range(columns):
-            if inverse[r, c] <= 0:
-                continue
-            d = inverse[r, c]
-            gate = _noise_at(d, noise)
-            label = labels[r, c]
-            alone = True  # in the midst of a segment there is nothing to choose
-            for n in range(9):
-                s, t = r + n // 3 - 1, c + n % 3 - 1
-                inside = 0 <= s < rows and 0 <= t < columns
-                near_labels[n] = labels[s, t] if inside else label
-                alone &= near_labels[n] == label
-            for n in range(0 if alone else 9):
-                s, t = min(max(r + n // 3 - 1, 0), rows - 1), min(max(c + n % 3 - 1, 0), columns - 1)
-                _plane_of_cell(planes, inverse, s, t, near_planes[n])
-            for v in range(r * cell, min((r + 1) * cell, height)):
-                y = (np.float32(v - r * cell) - middle) / np.float32(cell)
-                for u in range(c * cell, min((c + 1) * cell, width)):
-                    if depth[v, u] <= 0:
-                        continue
-                    x = (np.float32(u - c * cell) - middle) / np.float32(cell)
-                    e = np.float32(1) / depth[v, u]
-                    if abs(e - d) < gate + slope * d:
-                        found[v, u] = label
-                    if alone:
-                        continue
-                    least = gate
-                    for dy in range(0 if y < 0 else 1, 3 if y > 0 else 2):
-                        for dx in range(0 if x < 0 else 1, 3 if x > 0 else 2):
-                            n = 3 * dy + dx
-                            plane = near_planes[n]
-                            off = abs(e - plane[2] - plane[0] * (x - (dx - 1)) - plane[1] * (y - (dy - 1)))
-                            if near_labels[n] >= 0 and off < least:
-                                least = off
-                                found[v, u] = near_labels[n]
-    return found
-
-
-@njit(cache=True, nogil=True)
-def _plane_of_cell(planes: Float32, inverse: Float32, r: int, c: int, plane: Float32) -> None:
-    """a, b, c of a cell; where no window fits, the plane at its depth."""
-    if planes[2, r, c] > 0:
-        plane[0], plane[1], plane[2] = planes[0, r, c], planes[1, r, c], planes[2, r, c]
-    else:
-        plane[0], plane[1], plane[2] = 0, 0, inverse[r, c]
+    return np.asarray(spread(spread(edges, radius, True), radius, False), np.bool_)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from framework.baselines.class_evidence import ClassEvidence, ClassRows, MaskClasses, mask_classes, observe_mask
+from framework.baselines.class_evidence import ClassEvidence, ClassRows, MaskClasses, mask_classes
+from framework.baselines.class_evidence_kernels import observe_mask
 from framework.data import PointClusters
 from framework.errors import DataError
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NEW_CLASSES, NO_CLASS

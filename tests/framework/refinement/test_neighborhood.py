@@ -14,7 +14,8 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
 from framework.geometry import back_project
 from framework.refinement.lifting import lift
-from framework.refinement.neighborhood import Neighborhoods, Ring, grouped, members, surroundings, thread_shares
+from framework.refinement.neighborhood import Neighborhoods, Ring, members, surroundings, thread_shares
+from framework.refinement.neighborhood_kernels import grouped
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
 

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from framework.data import PointClusters
-from framework.refinement.selection import PART, keep_points
+from framework.refinement.selection import keep_points
+from framework.refinement.selection_kernels import PART
 
 
 @pytest.mark.parametrize("points", [0, 1, PART - 1, PART, PART + 1, 3 * PART + 100])

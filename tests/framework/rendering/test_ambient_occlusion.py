@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.rendering.ambient_occlusion import DEPTH, RANGE_M, THICKNESS_M, TILE, openness
+from framework.rendering.ambient_occlusion import DEPTH, RANGE_M, openness
+from framework.rendering.ambient_occlusion_kernels import THICKNESS_M, TILE
 
 CAMERA = Camera(160, 120, 300.0, 310.0, 79.5, 59.5)
 X, Y = np.meshgrid(

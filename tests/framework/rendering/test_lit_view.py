@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.rendering.lit_view import AMBIENT, DIFFUSE, LAMP, NOTHING, LitView
+from framework.rendering.lit_view import NOTHING, LitView
+from framework.rendering.lit_view_kernels import AMBIENT, DIFFUSE, LAMP
 from framework.rendering.surface import Surface
 
 CAMERA = Camera(40, 20, 20.0, 20.0, 19.5, 9.5)

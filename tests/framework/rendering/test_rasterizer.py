@@ -10,7 +10,8 @@ import pytest
 
 from framework.data import Camera
 from framework.geometry import exp_se3
-from framework.rendering.rasterizer import CHUNK, NO_TRIANGLE, Rasterizer, VisibilityBuffer
+from framework.rendering.rasterizer import Rasterizer, VisibilityBuffer
+from framework.rendering.rasterizer_kernels import CHUNK, NO_TRIANGLE
 from framework.synthetic.ray_caster import RayCaster, image_rays, pixel_rays
 from framework.synthetic.walk import look
 

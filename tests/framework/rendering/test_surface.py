@@ -7,7 +7,7 @@ import pytest
 
 from framework.data import Camera
 from framework.geometry import inverse, project, transform
-from framework.rendering.rasterizer import NO_TRIANGLE
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.rendering.surface import FrontSides, Hits, Surface
 from framework.rendering.viewpoint import looking
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.rendering.rasterizer import NO_TRIANGLE
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.furniture.piece import Furniture
 from framework.synthetic.furniture.solids import panel, rounded_box
 from framework.synthetic.lights import globe

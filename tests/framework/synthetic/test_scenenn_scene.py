@@ -16,7 +16,7 @@ from framework.errors import ConfigError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.ply import PlyMesh, read_ply
 from framework.geometry import inverse
-from framework.rendering.rasterizer import NO_TRIANGLE
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic import scenenn_scene
 from framework.synthetic.benchmark import SceneSpec
 from framework.synthetic.furniture.cluttered_groups import chair_row

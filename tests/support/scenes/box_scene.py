@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from framework.data import Camera, Detections, Frame, FrameTruth
-from framework.rendering.rasterizer import NO_TRIANGLE
+from framework.rendering.rasterizer_kernels import NO_TRIANGLE
 from framework.synthetic.ray_caster import RayCaster, image_rays
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from framework.data import Camera
-from framework.detection.masks import masks_from_boxes
+from framework.detection.masks import masks_from_boxes_kernels
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -76,14 +76,14 @@ def test_a_plane_holds_together_when_it_is_slanted_less_than_allowed(slant, whol
 
 def test_the_largest_step_grows_with_depth_and_focal_length():
     for z in (0.5, 1.0, 4.0):
-        limit = masks_from_boxes._largest_step(z, np.tan(np.radians(80)) / 150)
+        limit = masks_from_boxes_kernels._largest_step(z, np.tan(np.radians(80)) / 150)
         assert limit == pytest.approx(z * np.tan(np.radians(80)) / 150 + 3 * (0.0012 + 0.0019 * (z - 0.4) ** 2))
         for step, joined in ((0.95 * limit, True), (1.05 * limit, False)):
             depth = np.where(U < 70, np.float32(z), np.float32(z + step))
             # over the whole range, so that only the connection decides
             mask = np.zeros((120, 160), np.bool_)
             ones = np.ones(160)
-            masks_from_boxes._grow(depth, ones, np.ones(120), 0.1, 10.0, np.tan(np.radians(80)) / 150, mask)
+            masks_from_boxes_kernels._grow(depth, ones, np.ones(120), 0.1, 10.0, np.tan(np.radians(80)) / 150, mask)
             assert mask.all() == joined
 
 
@@ -100,10 +100,12 @@ def test_the_component_is_that_of_a_plain_labelling():
         for k in range(1, n + 1):
             hole = holes == k
             touches = hole[0].any() or hole[-1].any() or hole[:, 0].any() or hole[:, -1].any()
-            if not touches and (not depth[hole].any() or hole.sum() <= masks_from_boxes.CLOSED_HOLE * hole.size):
+            if not touches and (
+                not depth[hole].any() or hole.sum() <= masks_from_boxes_kernels.CLOSED_HOLE * hole.size
+            ):
                 expected = expected | hole
         mask = np.zeros((30, 40), np.bool_)
-        masks_from_boxes._grow(depth, weight_x, weight_y, 0.5, 1.5, 0.01, mask)
+        masks_from_boxes_kernels._grow(depth, weight_x, weight_y, 0.5, 1.5, 0.01, mask)
         np.testing.assert_array_equal(mask, expected)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.importing.depth.depth_upsampling import COLOR_SIGMA, ONE_SURFACE, upsampled
+from framework.importing.depth.depth_upsampling import upsampled
+from framework.importing.depth.depth_upsampling_kernels import COLOR_SIGMA, ONE_SURFACE
 from tests.support.scenes.corner_room import look
 
 COLOR = Camera(320, 240, 300.0, 300.0, 157.0, 118.0)

@@ -6,9 +6,12 @@ import pytest
 from framework.data import Int32
 from framework.errors import DataError
 from framework.mapping.labels import evidence_rows
-from framework.mapping.labels.evidence_rows import SLOTS, EvidenceRows, Storage, _merge_voxel
-from framework.mapping.labels.label_evidence import MOST_UNITS, Combine, Evidence, best_class, update_voxel
-from framework.mapping.voxels.integration import GROUP, SeenBlocks
+from framework.mapping.labels.evidence_rows import SLOTS, EvidenceRows, Storage
+from framework.mapping.labels.evidence_rows_kernels import _merge_voxel
+from framework.mapping.labels.label_evidence import MOST_UNITS, Evidence
+from framework.mapping.labels.label_evidence_kernels import Combine, best_class, update_voxel
+from framework.mapping.voxels.integration import SeenBlocks
+from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from tests.support.one_pixel import COVERED, FLOOR, UNITS, blank, distribution, measured, voted
 from tests.support.thread_counts import by_one_thread_and_two

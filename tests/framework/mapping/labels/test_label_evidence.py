@@ -7,16 +7,13 @@ from hypothesis import strategies as st
 
 from framework.mapping.labels.class_slots import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
-from framework.mapping.labels.label_evidence import (
-    MOST_GAIN,
-    MOST_UNITS,
+from framework.mapping.labels.label_evidence import MOST_GAIN, MOST_UNITS, class_said, named_classes
+from framework.mapping.labels.label_evidence_kernels import (
     Combine,
     add_evidence,
     best_class,
     best_counted_instance,
     best_instance,
-    class_said,
-    named_classes,
     update_voxel,
 )
 from tests.support.one_pixel import BARE, COVERED, FLOOR, UNITS, blank, distribution, measured, voted

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from framework.data import Detections, Pose
-from framework.mapping.labels.vertex_labels import REACH, vertex_labels
+from framework.mapping.labels.vertex_labels import vertex_labels
+from framework.mapping.labels.vertex_labels_kernels import REACH
 from framework.mapping.voxels.meshing import UnlabeledMesh
-from framework.mapping.voxels.voxel_grid import UNSEEN, find_block
+from framework.mapping.voxels.voxel_grid_kernels import UNSEEN, find_block
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from plugins.fusers.bayesian_tsdf import BayesianTsdf

@@ -10,10 +10,12 @@ from framework.data import Frame
 from framework.errors import FrameError, MapFullError
 from framework.geometry import inverse
 from framework.mapping.voxels import integration
-from framework.mapping.voxels.integration import GOLDEN, LEAST_BEHIND, Integrator, SeenBlocks
+from framework.mapping.voxels.integration import GOLDEN, Integrator, SeenBlocks
+from framework.mapping.voxels.integration_kernels import LEAST_BEHIND
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf import VoxelHashing
-from framework.mapping.voxels.voxel_grid import TSDF_MAX, UNSEEN, WEIGHT_ONE, VoxelGrid
+from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE, VoxelGrid
+from framework.mapping.voxels.voxel_grid_kernels import UNSEEN
 from framework.registry import assemble
 from tests.support.scenes.analytic_scene import CAMERA, pose, room, walk
 from tests.support.thread_counts import by_one_thread_and_two

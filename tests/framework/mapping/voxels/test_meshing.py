@@ -11,7 +11,8 @@ from scipy.spatial import KDTree
 from framework.data import Detections, Frame, InstanceMesh, Pose
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.voxels.meshing import MAX_JUMP, SurfaceNets, UnlabeledMesh
-from framework.mapping.voxels.voxel_grid import UNSEEN, VoxelGrid
+from framework.mapping.voxels.voxel_grid import VoxelGrid
+from framework.mapping.voxels.voxel_grid_kernels import UNSEEN
 from framework.refinement.lifting import lift
 from framework.registry import assemble
 from framework.synthetic.room import RoomKind

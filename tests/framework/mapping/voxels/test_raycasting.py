@@ -7,7 +7,8 @@ from framework.data import Camera, Frame
 from framework.mapping.labels.evidence_rows import EvidenceRows
 from framework.mapping.voxels.integration import Integrator
 from framework.mapping.voxels.integration_parameters import Sensor, pinhole
-from framework.mapping.voxels.raycasting import TILE, cast_coarse, cast_view, render, render_near, tile_bounds
+from framework.mapping.voxels.raycasting import cast_view, render, render_near, tile_bounds
+from framework.mapping.voxels.raycasting_kernels import TILE, cast_coarse
 from framework.mapping.voxels.voxel_grid import VoxelGrid
 from framework.mapping.voxels.voxel_walk import inverses, leave_cell
 from framework.sensors.noise_models import axial_sigma_single

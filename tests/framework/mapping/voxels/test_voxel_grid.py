@@ -8,7 +8,8 @@ from numba import njit
 
 from framework.errors import MapFullError
 from framework.mapping.voxels import voxel_grid
-from framework.mapping.voxels.voxel_grid import FIRST_RESERVED, UNSEEN, VoxelGrid, find_block, reserved
+from framework.mapping.voxels.voxel_grid import FIRST_RESERVED, VoxelGrid, reserved
+from framework.mapping.voxels.voxel_grid_kernels import UNSEEN, find_block
 
 
 @njit

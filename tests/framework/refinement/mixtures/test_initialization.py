@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from framework.refinement.mixtures.initialization import START_ITERATIONS, start_labels
+from framework.refinement.mixtures.initialization import start_labels
+from framework.refinement.mixtures.initialization_kernels import START_ITERATIONS
 from framework.refinement.neighborhood import Neighborhoods
 
 pytestmark = pytest.mark.integration

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from framework.refinement.mixtures import mixture, mixture_tree
+from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT
 from framework.refinement.mixtures.mixture_tree import Level, MixtureTree
 from tests.support.thread_counts import by_one_thread_and_two
 from tests.support.tree_densities import gaussian_densities, leaves, log_likelihoods, owners
@@ -42,7 +43,7 @@ def slow_cut(points: np.ndarray, groups: int) -> np.ndarray:
         g = max(scatters, key=lambda g: scatters[g].max())
         axis = scatters[g].argmax()
         upper = (labels == g) & (points[:, axis] > points[labels == g, axis].mean())
-        if upper.sum() < mixture.MIN_SUPPORT or (labels == g).sum() - upper.sum() < mixture.MIN_SUPPORT:
+        if upper.sum() < MIN_SUPPORT or (labels == g).sum() - upper.sum() < MIN_SUPPORT:
             closed.add(g)
             continue
         labels[upper] = labels.max() + 1

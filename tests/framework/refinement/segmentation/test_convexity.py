@@ -7,7 +7,7 @@ import pytest
 from scipy import ndimage
 
 from framework.data import Camera
-from framework.refinement.segmentation import convexity
+from framework.refinement.segmentation import convexity, convexity_kernels
 from framework.refinement.segmentation.convexity import Limits, normal_sigma, segments
 from tests.support.thread_counts import by_one_thread_and_two
 
@@ -134,7 +134,7 @@ def test_planes_are_exact_on_a_plane():
     """In inverse depth a plane is linear: every window of it, at the image's border too, gives the same one."""
     v, u = np.mgrid[:12, :20]
     inverse = (0.5 + 0.004 * u - 0.003 * v).astype(np.float32)
-    fits = convexity._fit_planes(inverse, 2, NOISE, np.float32(0.1))
+    fits = convexity_kernels.fit_planes(inverse, 2, NOISE, np.float32(0.1))
     np.testing.assert_allclose(fits[0], 0.004, atol=2e-6)
     np.testing.assert_allclose(fits[1], -0.003, atol=2e-6)
     np.testing.assert_allclose(fits[2], inverse, atol=2e-6)
@@ -146,7 +146,7 @@ def test_fits_are_those_of_lstsq_on_the_neighbors_of_like_depth():
     inverse = (0.5 + rng.normal(0, 0.002, (9, 11))).astype(np.float32)
     inverse[:, 6:] += 0.4  # another surface, in front
     inverse[rng.random(inverse.shape) < 0.2] = 0
-    fits = convexity._fit_planes(inverse, 2, NOISE, np.float32(0.01))
+    fits = convexity_kernels.fit_planes(inverse, 2, NOISE, np.float32(0.01))
     found = 0
     for r, c in np.argwhere(inverse > 0):
         v, u = np.mgrid[max(r - 2, 0) : min(r + 3, 9), max(c - 2, 0) : min(c + 3, 11)]
@@ -165,7 +165,9 @@ def test_fits_are_those_of_lstsq_on_the_neighbors_of_like_depth():
 def test_at_a_crease_a_cell_takes_the_plane_of_its_own_side():
     u = np.arange(31)
     inverse = np.tile(np.where(u < 15, 0.5, 0.5 + 0.02 * (u - 14.5)), (15, 1)).astype(np.float32)
-    planes = convexity._best_planes(inverse, convexity._fit_planes(inverse, 3, NOISE, np.float32(1.0)), 3, 0.0)
+    planes = convexity_kernels.best_planes(
+        inverse, convexity_kernels.fit_planes(inverse, 3, NOISE, np.float32(1.0)), 3, 0.0
+    )
     np.testing.assert_allclose(planes[0, 5, :15], 0, atol=1e-4)
     np.testing.assert_allclose(planes[0, 5, 15:], 0.02, atol=1e-4)
 
@@ -176,7 +178,7 @@ def test_normal_sigma_is_the_spread_of_fitted_normals():
     cell, window, sigma = 1, 3, 0.002
     depth = 1 + rng.normal(0, sigma, (7 * 30, 7 * 40))
     camera = Camera(280, 210, 135.0, 135.0, 139.5, 104.5)
-    fits = convexity._fit_planes((1 / depth).astype(np.float32), window, (10.0, 0.0), np.float32(1.0))
+    fits = convexity_kernels.fit_planes((1 / depth).astype(np.float32), window, (10.0, 0.0), np.float32(1.0))
     slopes = fits[0, 3::7, 3::7] * camera.fx  # along x, of windows that do not overlap; 1 m away, of the depth
     assert np.sqrt(2) * slopes.std() == pytest.approx(normal_sigma(sigma, window, cell, camera), rel=0.1)
 
@@ -186,11 +188,11 @@ def test_pieces_are_those_of_scipy():
     inverse = np.ones((70, 41), np.float32)
     for density in (0.2, 0.4):
         edges = rng.random(inverse.shape) < density
-        labels, count = convexity._connected(inverse, edges, NOISE, np.float32(0.1), 1)
+        labels, count = convexity_kernels.connected(inverse, edges, NOISE, np.float32(0.1), 1)
         expected, expected_count = ndimage.label(~edges)
         assert count == expected_count
         np.testing.assert_array_equal(labels, expected - 1)  # both number pieces by their first cell
-        large, large_count = convexity._connected(inverse, edges, NOISE, np.float32(0.1), 5)
+        large, large_count = convexity_kernels.connected(inverse, edges, NOISE, np.float32(0.1), 5)
         sizes = np.bincount(expected.ravel())
         np.testing.assert_array_equal(large >= 0, (sizes[expected] >= 5) & ~edges)
         assert large_count == (sizes[1:] >= 5).sum()
@@ -199,7 +201,7 @@ def test_pieces_are_those_of_scipy():
 def test_depth_cuts_pieces():
     inverse = np.ones((4, 10), np.float32)
     inverse[:, 5:] = 0.5
-    labels, count = convexity._connected(inverse, np.zeros((4, 10), bool), NOISE, np.float32(0.01), 1)
+    labels, count = convexity_kernels.connected(inverse, np.zeros((4, 10), bool), NOISE, np.float32(0.01), 1)
     assert count == 2
     np.testing.assert_array_equal(labels, np.tile(np.repeat([0, 1], 5), (4, 1)))
 

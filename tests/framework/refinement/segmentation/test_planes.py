@@ -7,7 +7,8 @@ import pytest
 
 from framework.data import Camera, Frame
 from framework.geometry import back_project
-from framework.refinement.segmentation.planes import Planes, _order, find_planes, plane_image
+from framework.refinement.segmentation.planes import Planes, find_planes, plane_image
+from framework.refinement.segmentation.planes_kernels import _order
 from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)

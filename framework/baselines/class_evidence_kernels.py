@@ -1,0 +1,112 @@
+"""Kernels of class_evidence.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.mapping.labels.class_slots import ALL_NAMED, NEW_CLASSES, NO_CLASS
+from framework.mapping.labels.label_evidence_kernels import best_first
+from framework.mapping.voxels.voxel_grid_kernels import device
+
+MOST_FRAMES = np.uint16(65535)  # that a voxel counts
+
+
+@njit(cache=True, nogil=True)
+def best_clusters(first, cluster, scores):
+    """(L,) the cluster of each list with the best score, of equal ones the first, -1 = there is none."""
+    best = np.full(first.shape[0] - 1, -1, np.int32)
+    for i in range(best.shape[0]):
+        for place in range(first[i], first[i + 1]):
+            k, found = cluster[place], best[i]
+            if found < 0 or scores[k] > scores[found] or (scores[k] == scores[found] and k < found):
+                best[i] = k
+    return best
+
+
+@device
+def best_class(grid, evidence, log_missed, block, n):
+    """The likeliest class of a voxel, -1 when that is the background; a tie is the background's.
+
+    `log_missed` is what each frame that saw the voxel under no mask says for every class over the background.
+    """
+    row = grid.label_row[block]
+    if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
+        return np.int32(-1)
+    above = evidence.log_ratio[row, n, 0] + log_missed * np.float32(evidence.unmasked[block, n])
+    return np.int32(evidence.class_ids[row, n, 0]) if above > 0 else np.int32(-1)
+
+
+@device
+def _add_class(labels, sums, label, total):
+    """Gives a class its slot, the least likely one's if none is free. Returns 1 when a class was dropped."""
+    least = 0
+    for s in range(len(labels)):
+        if labels[s] == NO_CLASS:
+            labels[s] = label
+            sums[s] = total
+            return 0
+        if sums[s] < sums[least]:
+            least = s
+    if total > sums[least]:
+        labels[least] = label
+        sums[least] = total
+    return 1
+
+
+@device
+def observe_mask(evidence, row, n, masks, k):
+    """One step of the recursion for a voxel that a frame sees under cluster k. Returns the number of evictions."""
+    labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
+    known = 0  # bits of the named classes that have a slot
+    for s in range(len(labels)):
+        if labels[s] == NO_CLASS:
+            break  # slots are filled from the front
+        sums[s] += masks.log_ratio[k, labels[s]]
+        known |= masks.named_bit[k, labels[s]]
+    evicted = 0
+    for m in range(NEW_CLASSES if known != ALL_NAMED else 0):
+        label = masks.named_classes[k, m]
+        if m > 0 and label == masks.named_classes[k, 0]:
+            break
+        if not (known >> m) & 1:
+            evicted += _add_class(labels, sums, label, evidence.rest[row, n] + masks.log_ratio[k, label])
+    evidence.rest[row, n] += masks.rest[k]
+    best_first(labels, sums, NO_CLASS)
+    if evidence.masked[row, n] < MOST_FRAMES:
+        evidence.masked[row, n] += 1
+    if evidence.first_frame[row, n] < 0:
+        evidence.first_frame[row, n] = masks.frame
+    evidence.last_frame[row, n] = masks.frame
+    return evicted
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def find_blocks_under_masks(grid, seen, cluster, wants_row):
+    """Notes in wants_row (A,) the blocks without a row that have a voxel under some mask."""
+    for a in prange(seen.blocks.shape[0]):
+        wants_row[a] = False
+        first = seen.near_first[a]
+        if grid.label_row[seen.blocks[a]] < 0:
+            for i in range(first, first + seen.near_count[a]):
+                if cluster[seen.near_pixel[i]] >= 0:
+                    wants_row[a] = True
+                    break
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def update_classes(grid, seen, evidence, masks, evicted):
+    """Updates the near voxels of the seen blocks; evicted (A,) counts slots given away."""
+    unmasked = evidence.unmasked  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
+    for a in prange(seen.blocks.shape[0]):
+        evicted[a] = 0
+        block = seen.blocks[a]
+        row = grid.label_row[block]
+        first = seen.near_first[a]
+        for i in range(first, first + seen.near_count[a]):
+            n = seen.near_voxel[i]
+            k = masks.cluster[seen.near_pixel[i]]
+            if k >= 0:
+                evicted[a] += observe_mask(evidence, row, n, masks, k)
+            elif unmasked[block, n] < MOST_FRAMES:
+                unmasked[block, n] += 1

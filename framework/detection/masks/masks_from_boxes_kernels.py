@@ -1,0 +1,156 @@
+"""Kernels of masks_from_boxes.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from framework.sensors.noise_models import axial_sigma
+
+BIN = 0.02  # of log depth: 2 % of the depth
+FARTHEST = 100.0  # m, the end of the histogram
+NEAREST = 0.05  # m, its start; nearer readings are not counted
+VALLEY = 0.15  # share of a mode's peak below which a bin ends it
+NOISE = 3.0  # standard deviations of the depth's noise
+CLOSED_HOLE = 0.01  # share of the box: larger holes with readings are seen through
+
+
+@njit(cache=True, nogil=True)
+def fill_masks(borders, depth, significance, step, min_readings, masks):
+    n, height, width = masks.shape
+    found = np.zeros(n, np.bool_)
+    for i in range(n):
+        u0, v0 = max(0, int(np.ceil(borders[i, 0]))), max(0, int(np.ceil(borders[i, 1])))
+        u1, v1 = min(width, int(np.ceil(borders[i, 2]))), min(height, int(np.ceil(borders[i, 3])))
+        if u1 <= u0 or v1 <= v0:
+            continue
+        window = depth[v0:v1, u0:u1]
+        if (window > NEAREST).sum() < max(1.0, min_readings * window.size):
+            continue
+        weight_x, weight_y = _tent(borders[i, 0], borders[i, 2], u0, u1), _tent(borders[i, 1], borders[i, 3], v0, v1)
+        near, far = _foreground(window, weight_x, weight_y, significance)
+        if far <= near:
+            continue
+        _grow(window, weight_x, weight_y, near, far, step, masks[i, v0:v1, u0:u1])
+        found[i] = True
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _tent(start, end, first, stop):
+    """Weights of pixels first to stop - 1 along one axis of a box: 1 at its centre, 0 at its borders."""
+    center, half = 0.5 * (start + end), 0.5 * (end - start)
+    return np.maximum(0.0, 1.0 - np.abs(np.arange(first, stop) - center) / half) + 1e-6
+
+
+@njit(cache=True, nogil=True)
+def _foreground(window, weight_x, weight_y, significance):
+    """The interval of depth (near, far), m, of the nearest significant mode; of the heaviest where none is."""
+    bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
+    histogram = np.zeros(bins + 2)
+    total = 0.0
+    for v in range(window.shape[0]):
+        for u in range(window.shape[1]):
+            z = window[v, u]
+            if NEAREST < z < FARTHEST:
+                weight = weight_x[u] * weight_y[v]
+                histogram[1 + int(np.log(z / NEAREST) / BIN)] += weight
+                total += weight
+    smooth = np.zeros(bins + 2)
+    smooth[1:-1] = 0.25 * histogram[:-2] + 0.5 * histogram[1:-1] + 0.25 * histogram[2:]
+    best, best_first, best_last = 0.0, 0, -1
+    first = 0
+    while first < len(smooth):
+        if smooth[first] <= 0:
+            first += 1
+            continue
+        peak, mass, last = smooth[first], histogram[first], first
+        rising = True
+        while last + 1 < len(smooth):
+            following = smooth[last + 1]
+            # a valley: low against the peak, and it does not go on falling
+            if following <= 0 or (following < VALLEY * peak and not rising and following > smooth[last]):
+                break
+            rising = following >= smooth[last]
+            last += 1
+            mass += histogram[last]
+            peak = max(peak, following)
+        if mass > best:
+            best, best_first, best_last = mass, first, last
+        if mass >= significance * total:
+            best_first, best_last = first, last
+            break
+        first = last + 1
+    return NEAREST * np.exp((best_first - 1) * BIN), NEAREST * np.exp(best_last * BIN)
+
+
+@njit(cache=True, nogil=True)
+def _grow(window, weight_x, weight_y, near, far, step, mask):
+    """Writes the heaviest connected component of the pixels between near and far into `mask`, its holes closed."""
+    height, width = window.shape
+    label = np.zeros((height, width), np.int32)
+    stack = np.empty((height * width, 2), np.int32)
+    best, best_weight, labels = 0, -1.0, 0
+    for v0 in range(height):
+        for u0 in range(width):
+            if label[v0, u0] or not near <= window[v0, u0] <= far:
+                continue
+            labels += 1
+            label[v0, u0] = labels
+            stack[0] = v0, u0
+            n, weight = 1, 0.0
+            while n:
+                n -= 1
+                v, u = stack[n]
+                weight += weight_x[u] * weight_y[v]
+                z = window[v, u]
+                for dv, du in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                    y, x = v + dv, u + du
+                    if y < 0 or x < 0 or y >= height or x >= width or label[y, x]:
+                        continue
+                    other = window[y, x]
+                    if near <= other <= far and abs(other - z) <= _largest_step(min(other, z), step):
+                        label[y, x] = labels
+                        stack[n] = y, x
+                        n += 1
+            if weight > best_weight:
+                best, best_weight = labels, weight
+    for v in range(height):
+        for u in range(width):
+            mask[v, u] = label[v, u] == best
+    _close(window, mask, stack)
+
+
+@njit(cache=True, nogil=True)
+def _largest_step(z, step):
+    """The largest difference in depth, m, between neighbours of one surface at z m."""
+    return step * z + NOISE * axial_sigma(z)
+
+
+@njit(cache=True, nogil=True)
+def _close(window, mask, stack):
+    """Adds to `mask` the holes that do not reach the window's border, and are without readings or small."""
+    height, width = mask.shape
+    seen = mask.copy()
+    for v0 in range(height):
+        for u0 in range(width):
+            if seen[v0, u0]:
+                continue
+            seen[v0, u0] = True
+            stack[0] = v0, u0
+            done, n, readings, enclosed = 0, 1, 0, True
+            while done < n:
+                v, u = stack[done]
+                done += 1
+                readings += window[v, u] > 0
+                if v == 0 or u == 0 or v == height - 1 or u == width - 1:
+                    enclosed = False
+                for dv, du in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+                    y, x = v + dv, u + du
+                    if 0 <= y < height and 0 <= x < width and not seen[y, x]:
+                        seen[y, x] = True
+                        stack[n] = y, x
+                        n += 1
+            if enclosed and (readings == 0 or n <= CLOSED_HOLE * mask.size):
+                for k in range(n):
+                    mask[stack[k, 0], stack[k, 1]] = True

@@ -1,0 +1,87 @@
+"""Kernels of association.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.data import Float32, Int32
+from framework.mapping.labels.label_evidence import Evidence
+from framework.mapping.labels.label_evidence_kernels import best_instance, label_row, next_instance
+from framework.mapping.labels.pixel_lists_kernels import CHUNKS
+from framework.mapping.prefetching import prefetch_element
+from framework.mapping.voxels.integration_parameters import Pinhole
+from framework.mapping.voxels.raycasting_kernels import voxel_seen
+from framework.mapping.voxels.voxel_grid import Grid
+from framework.mapping.voxels.voxel_grid_kernels import device
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def look_up_instances(
+    grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
+) -> None:
+    """Fills instance_ids (2, ceil(H / stride), ceil(W / stride)) with the likeliest instance of the voxel nearest to
+    every stride-th reading of every stride-th row of `depth` (H, W), and with the next likeliest one; 0 = none.
+
+    This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
+    that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
+    """
+    columns = instance_ids.shape[2]
+    for row in prange(instance_ids.shape[1]):
+        key = np.int64(-2)
+        region = np.int32(-1)
+        rows, voxels = np.empty(columns, np.int32), np.empty(columns, np.int32)
+        for column in range(columns):
+            rows[column] = -1
+            z = depth[row * stride, column * stride]
+            if z > np.float32(0.0):
+                block, n, key, region = voxel_seen(grid, view, column * stride, row * stride, z, key, region)
+                rows[column], voxels[column] = label_row(grid, block), n
+                if rows[column] >= 0:
+                    prefetch_element(evidence.labeled, rows[column], n)
+        # in passes of their own, each of which has the memory asked for that the next one needs
+        for column in range(columns):
+            voxel = evidence.labeled[rows[column], voxels[column]] if rows[column] >= 0 else np.int32(-1)
+            voxels[column] = voxel
+            if voxel >= 0:
+                prefetch_element(evidence.instance_ids, voxel, 0)
+        for column in range(columns):
+            voxel = voxels[column]
+            instance_ids[0, row, column] = best_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
+            instance_ids[1, row, column] = next_instance(evidence, voxel) if voxel >= 0 else np.int32(0)
+
+
+@njit(cache=True, nogil=True)
+def find_seen(instance_ids, seen):
+    """Marks in seen (ids + 1,) the instances that occur in instance_ids (h, w)."""
+    for instance in instance_ids.flat:
+        if instance > 0:
+            seen[instance] = True
+
+
+@device
+def _add_run(count, number, label, first, cluster, column, votes):
+    """Adds `count` pixels with a list's number and an instance to the votes (N + 1, M + 1) of its clusters, and of all
+    pixels, in the last row.
+    """
+    votes[votes.shape[0] - 1, column[label]] += count
+    for place in range(first[number], first[number + 1]):
+        votes[cluster[place], column[label]] += count
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def count_votes(of_pixel, first, cluster, instance_ids, stride, column, votes):
+    """Adds to votes (CHUNKS, N + 1, M + 1) the pixels of each cluster, and of any or none, that fall on the instance of
+    each column, by runs: a counter raised by one waits for itself.
+    """
+    rows = instance_ids.shape[0]
+    for chunk in prange(CHUNKS):
+        number, label, count = np.int32(0), np.int32(0), np.int32(0)
+        for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
+            for place in range(instance_ids.shape[1]):
+                i, found = of_pixel[row * stride, place * stride], instance_ids[row, place]
+                if i != number or found != label:
+                    _add_run(count, number, label, first, cluster, column, votes[chunk])
+                    number, label, count = i, found, np.int32(0)
+                count += np.int32(1)
+        _add_run(count, number, label, first, cluster, column, votes[chunk])

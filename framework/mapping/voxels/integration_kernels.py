@@ -1,0 +1,208 @@
+"""Kernels of integration.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.mapping.prefetching import prefetch_row
+from framework.mapping.voxels.bit_slices import ONE, lowest_bit
+from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE
+from framework.mapping.voxels.voxel_grid_kernels import (
+    BLOCK_SIDE,
+    BLOCK_VOXELS,
+    COLORED,
+    device,
+    is_solid,
+    one_more,
+    pack_color,
+    unpack_color,
+)
+
+LAYER_VOXELS = BLOCK_SIDE**2
+GROUP = 16  # blocks that one thread does in a row, and whose near voxels are listed one behind the other
+FAR = 1e9  # m
+LEAST_BEHIND = 0.02  # of the full weight, at the far end of the truncation band: enough to have been seen
+
+
+@device
+def _project_voxels(grid, block, camera, min_depth, shape, pixel, scratch):
+    """The pixel number that sees each voxel of a block, eq. [6], into pixel (512,), its depth (m) into scratch[:512].
+
+    Voxels outside the image get pixel 0 and a depth beyond any reading.
+    """
+    zero, half, one = np.float32(0.0), np.float32(0.5), np.float32(1.0)
+    seven, three = np.int32(7), np.int32(3)
+    width = np.int32(shape[1])
+    x0 = np.float32(grid.block_coords[block, 0] * BLOCK_SIDE)
+    y0 = np.float32(grid.block_coords[block, 1] * BLOCK_SIDE)
+    z0 = np.float32(grid.block_coords[block, 2] * BLOCK_SIDE)
+    voxel = grid.voxel_size
+    R00, R01, R02, t0 = camera.R[0, 0] * voxel, camera.R[0, 1] * voxel, camera.R[0, 2] * voxel, camera.t[0]
+    R10, R11, R12, t1 = camera.R[1, 0] * voxel, camera.R[1, 1] * voxel, camera.R[1, 2] * voxel, camera.t[1]
+    R20, R21, R22, t2 = camera.R[2, 0] * voxel, camera.R[2, 1] * voxel, camera.R[2, 2] * voxel, camera.t[2]
+    fx, fy, cx, cy = camera.fx, camera.fy, camera.cx + half, camera.cy + half
+    right, bottom = np.float32(shape[1]), np.float32(shape[0])
+    for layer in range(BLOCK_SIDE):
+        z = z0 + np.float32(np.int32(layer))
+        layer_x, layer_y, layer_z = R02 * z + t0, R12 * z + t1, R22 * z + t2
+        first = layer * LAYER_VOXELS
+        for n in range(LAYER_VOXELS):
+            m = np.int32(n)
+            x, y = x0 + np.float32(np.int32(m & seven)), y0 + np.float32(np.int32(m >> three))
+            px = R00 * x + R01 * y + layer_x
+            py = R10 * x + R11 * y + layer_y
+            pz = R20 * x + R21 * y + layer_z
+            w = one / max(pz, min_depth)
+            u = fx * px * w + cx
+            v = fy * py * w + cy
+            inside = (pz > min_depth) & (u > zero) & (v > zero) & (u < right) & (v < bottom)
+            number = np.int32(np.int32(v) * width + np.int32(u))
+            pixel[first + n] = number if inside else np.int32(0)
+            scratch[first + n] = pz if inside else np.float32(FAR)
+
+
+@device
+def _average_distances(tsdf, weight, voxel, to_units, sensor, rounding, near_band, scratch):
+    """The running average of the distances and weights (512,) of a block.
+
+    Returns how many voxels get a colour, and how many are within near_band m of the measured surface.
+
+    scratch[512:] holds each voxel's reading (m) and gets the new observation's share in the average of the colour, 0
+    where there is none; scratch[:512] holds the depth (m) and gets the distance to the measured surface, m.
+    """
+    zero, one = np.float32(0.0), np.float32(1.0)
+    full2 = sensor.full_weight_depth * sensor.full_weight_depth
+    weight_one = np.float32(WEIGHT_ONE)
+    max_weight = sensor.max_weight * weight_one
+    most, least = np.float32(TSDF_MAX), np.float32(LEAST_BEHIND)
+    ramp = one / max(sensor.truncation - voxel, np.float32(0.5) * voxel)
+    colored = near = np.int32(0)
+    for n in range(BLOCK_VOXELS):
+        d = scratch[n + BLOCK_VOXELS]
+        band = sensor.truncation + sensor.truncation_slope * d
+        sdf = d - scratch[n]
+        seen = (d > sensor.min_depth) & (d < sensor.max_depth) & (sdf > -band)
+        # Behind the surface an observation is worth the less the deeper: there it contradicts what is seen from behind.
+        # The band has widened with the noise, and only its far end loses weight: noise would push surfaces away else.
+        behind = max(least, min((band + sdf) * ramp, one))
+        w_new = max(one, weight_one * behind * min(one, full2 / max(d * d, np.float32(1e-6))))
+        w_old = np.float32(weight[n])
+        portion = w_new / (w_old + w_new) if seen else zero
+        stored = np.float32(tsdf[n])
+        target = min(sdf, band) * to_units
+        value = stored + portion * (target - stored) if w_old > zero else target
+        # near 1, rounding lifts the widest distance to 32768, which would wrap round to UNSEEN
+        value = max(-most, min(np.floor(value + rounding), most))
+        tsdf[n] = np.int16(value) if seen else tsdf[n]
+        weight[n] = np.uint16(min(w_old + w_new, max_weight)) if seen else weight[n]
+        scratch[n] = sdf if seen else np.float32(FAR)
+        # colour belongs to the surface, not to the air before it
+        at_surface = seen & (sdf < band)
+        scratch[n + BLOCK_VOXELS] = portion if at_surface else zero
+        colored = one_more(colored, at_surface)
+        near = one_more(near, seen & (abs(sdf) <= near_band))
+    return colored, near
+
+
+@device
+def _average_colors(packed, color, pixel, first, rounding, scratch, seen):
+    """The running average of the packed colours (512,) of a block, in the layer from voxel `first` on, with those
+    of its pixels (512,) in `color`, RGBA in their bytes.
+
+    scratch[512:] holds the share of each voxel's new observation, 0 where there is none; seen (64,) gets the colours.
+    """
+    byte, one_byte, two_bytes = np.int32(255), np.int32(8), np.int32(16)
+    zero, one, four, brightest = np.float32(0.0), np.float32(1.0), np.float32(4.0), np.float32(4 * 255)
+    no_color = np.uint32(0)
+    for n in range(LAYER_VOXELS):
+        seen[n] = color[np.uint32(pixel[first + n])]
+    for n in range(LAYER_VOXELS):
+        old, share = packed[first + n], scratch[first + n + BLOCK_VOXELS]
+        fresh = (share > zero) & ((old & COLORED) == no_color)  # air has weight, but no colour to average with
+        share = one if fresh else share
+        new = np.int32(seen[n])
+        red, green, blue = unpack_color(old)
+        red += share * (four * np.float32(np.int32(new & byte)) - red)
+        green += share * (four * np.float32(np.int32((new >> one_byte) & byte)) - green)
+        blue += share * (four * np.float32(np.int32((new >> two_bytes) & byte)) - blue)
+        mean = pack_color(
+            min(red + rounding, brightest), min(green + rounding, brightest), min(blue + rounding, brightest)
+        )
+        packed[first + n] = mean if share > zero else old
+
+
+@device
+def _is_colored(scratch, first):
+    """Whether the frame has a colour for a voxel of the layer that begins at voxel `first`, scratch as above."""
+    largest = np.float32(0.0)
+    for n in range(LAYER_VOXELS):
+        largest = max(largest, scratch[first + n + BLOCK_VOXELS])
+    return largest > np.float32(0.0)
+
+
+@device
+def _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch):
+    """Lists the voxels whose distance to the measured surface in scratch[:512] is at most near_band, with their pixels,
+    from place `first` on.
+
+    A layer's comparisons are gathered in the bits of a word, which the compiler vectorises.
+    """
+    for layer in range(BLOCK_SIDE):
+        begin = layer * LAYER_VOXELS
+        word = np.uint64(0)
+        for n in range(LAYER_VOXELS):
+            word |= np.uint64(abs(scratch[begin + n]) <= near_band) << np.uint64(n)
+        while word != np.uint64(0):
+            n = begin + lowest_bit(word)
+            word &= word - ONE
+            near_voxel[first] = np.uint16(n)
+            near_pixel[first] = pixel[n]
+            first += 1
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def integrate(
+    grid, active, depth, color, camera, sensor, rounding, near_band, near_first, near_count, near_voxel, near_pixel
+):
+    """Updates distance, weight and colour of every voxel of the active blocks that the depth image sees.
+
+    `color` (H, W) holds a pixel's RGBA in its bytes, `camera` T_camera_world. `rounding` in [0, 1) is added before
+    values are truncated to integers. near_first (A,), near_count (A,), near_voxel (512 A,) and near_pixel (512 A,) get
+    the voxels within near_band m of the measured surface, as SeenBlocks has them.
+
+    A block is done in passes over its 512 voxels that the compiler vectorises: they hold no branches, read images only
+    in loops of their own, and share one scratch array, so that few arrays have to be proved not to overlap.
+    """
+    shape = depth.shape
+    depth = depth.ravel()
+    color = color.ravel()
+    solid = grid.solid  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
+    to_units = np.float32(1.0) / grid.tsdf_unit
+    last = active.shape[0] - 1
+    for group in prange((active.shape[0] + GROUP - 1) // GROUP):
+        pixel = np.empty(BLOCK_VOXELS, np.int32)
+        scratch = np.empty(2 * BLOCK_VOXELS, np.float32)
+        seen = np.empty(LAYER_VOXELS, np.uint32)
+        first = group * GROUP * BLOCK_VOXELS
+        for a in range(group * GROUP, min((group + 1) * GROUP, active.shape[0])):
+            block = active[a]
+            after = np.int64(active[min(a + 1, last)])
+            prefetch_row(grid.tsdf, after)
+            prefetch_row(grid.weight, after)
+            prefetch_row(grid.color, after)
+            tsdf, weight, packed = grid.tsdf[block], grid.weight[block], grid.color[block]
+            _project_voxels(grid, block, camera, sensor.min_depth, shape, pixel, scratch)
+            for n in range(BLOCK_VOXELS):
+                scratch[n + BLOCK_VOXELS] = depth[np.uint32(pixel[n])]
+            colored_voxels, near_voxels = _average_distances(
+                tsdf, weight, grid.voxel_size, to_units, sensor, rounding, near_band, scratch
+            )
+            solid[block] = is_solid(tsdf)
+            for layer in range(BLOCK_SIDE if colored_voxels > 0 else 0):
+                if _is_colored(scratch, layer * LAYER_VOXELS):
+                    _average_colors(packed, color, pixel, layer * LAYER_VOXELS, rounding, scratch, seen)
+            if near_voxels > 0:
+                _list_near(pixel, near_band, near_voxel, near_pixel, first, scratch)
+            near_first[a], near_count[a] = first, near_voxels
+            first += near_voxels

@@ -1,0 +1,204 @@
+"""Kernels of voxel_grid.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+BLOCK_SIDE = 8  # voxels
+BLOCK_VOXELS = BLOCK_SIDE**3
+UNSEEN = -32768  # the stored distance of a voxel that no frame has seen: readers need not load the weight
+NO_KEY = -1
+
+# What kernels call in their innermost loops. Without reference counts (_nrt): threads that count the same arrays of the
+# Grid up and down at each call wait for each other.
+device = njit(cache=True, nogil=True, forceinline=True, error_model="numpy", _nrt=False)
+
+
+@device
+def one_more(count, condition):
+    """`count`, int32, and one where the condition holds. numba adds in 64 bits, and half as many fit into a vector."""
+    return np.int32(count + (np.int32(1) if condition else np.int32(0)))
+
+
+_KEY_BITS = 21  # of each coordinate in a 63-bit key: +-2^20 blocks, 84 km at 1 cm voxels
+FARTHEST_BLOCK = 1 << (_KEY_BITS - 1)  # blocks from the origin, along any axis, where the map ends
+_KEY_OFFSET = FARTHEST_BLOCK
+_KEY_MASK = (1 << _KEY_BITS) - 1
+
+
+@device
+def pack_key(x, y, z):
+    """The key of the coordinates of a region or a block, never negative."""
+    return (
+        ((np.int64(x) + _KEY_OFFSET) & _KEY_MASK) << (2 * _KEY_BITS)
+        | ((np.int64(y) + _KEY_OFFSET) & _KEY_MASK) << _KEY_BITS
+        | ((np.int64(z) + _KEY_OFFSET) & _KEY_MASK)
+    )
+
+
+@device
+def unpack_key(key):
+    """The coordinates that pack_key() was given."""
+    return (
+        np.int32((key >> (2 * _KEY_BITS)) - _KEY_OFFSET),
+        np.int32(((key >> _KEY_BITS) & _KEY_MASK) - _KEY_OFFSET),
+        np.int32((key & _KEY_MASK) - _KEY_OFFSET),
+    )
+
+
+@device
+def _slot(key, size):
+    """Where the search for `key` starts in a table of `size` slots (Fibonacci hashing)."""
+    mixed = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64(mixed >> np.uint64(32)) & (size - 1)
+
+
+@device
+def find_region(grid, key):
+    """The number of the region with this key, -1 if there is none. Linear probing."""
+    size = grid.table_keys.shape[0]
+    slot = _slot(key, size)
+    while True:
+        found = grid.table_keys[slot]
+        if found == key:
+            return grid.table_regions[slot]
+        if found == NO_KEY:
+            return np.int32(-1)
+        slot = (slot + 1) & (size - 1)
+
+
+@device
+def child_number(bx, by, bz):
+    """The place of a block in its region's table."""
+    return ((bz & 7) * 8 + (by & 7)) * 8 + (bx & 7)
+
+
+@device
+def find_block(grid, bx, by, bz, last_key, last_region):
+    """(block, key, region) at block coordinates; block -1 = not allocated.
+
+    `last_key` and `last_region` are what the previous call returned: the cache that makes neighbouring look-ups cheap.
+    """
+    key = pack_key(bx >> 3, by >> 3, bz >> 3)
+    if key != last_key:
+        last_region = find_region(grid, key)
+    if last_region < 0:
+        return np.int32(-1), key, last_region
+    return grid.region_blocks[last_region, child_number(bx, by, bz)], key, last_region
+
+
+@njit(cache=True, nogil=True)
+def insert_blocks(grid, coords, start, region_count, block_count, blocks):
+    """Allocates the blocks of coords[start:] that do not exist yet, in order, and fills in their numbers, blocks (N,).
+
+    Returns (next, region_count, block_count); next < len(coords) means that a capacity was reached there: grow, call
+    again.
+    """
+    size = grid.table_keys.shape[0]
+    region, last_key = np.int32(-1), np.int64(NO_KEY)
+    for i in range(start, coords.shape[0]):
+        bx, by, bz = coords[i, 0], coords[i, 1], coords[i, 2]
+        key = pack_key(bx >> 3, by >> 3, bz >> 3)
+        if key != last_key:  # neighbors lie in the same region, mostly
+            region = find_region(grid, key)
+            last_key = key
+        if region < 0:
+            if region_count == grid.region_blocks.shape[0] or 2 * (region_count + 1) > size:
+                return i, region_count, block_count
+            region = np.int32(region_count)
+            region_count += 1
+            slot = _slot(key, size)
+            while grid.table_keys[slot] != NO_KEY:
+                slot = (slot + 1) & (size - 1)
+            grid.table_keys[slot] = key
+            grid.table_regions[slot] = region
+            grid.region_coords[region, 0] = bx >> 3
+            grid.region_coords[region, 1] = by >> 3
+            grid.region_coords[region, 2] = bz >> 3
+            grid.region_blocks[region] = -1
+        child = child_number(bx, by, bz)
+        if grid.region_blocks[region, child] < 0:
+            if block_count == grid.block_coords.shape[0]:
+                return i, region_count, block_count
+            grid.region_blocks[region, child] = block_count
+            grid.block_coords[block_count, 0] = bx
+            grid.block_coords[block_count, 1] = by
+            grid.block_coords[block_count, 2] = bz
+            grid.tsdf[block_count] = UNSEEN
+            grid.weight[block_count] = 0
+            grid.color[block_count] = 0
+            grid.solid[block_count] = 0
+            grid.label_row[block_count] = -1
+            _link_neighbors(grid, block_count)
+            block_count += 1
+        blocks[i] = grid.region_blocks[region, child]
+    return coords.shape[0], region_count, block_count
+
+
+@njit(cache=True, nogil=True)
+def _link_neighbors(grid, block):
+    """Tells a new block of its neighbors, and them of it."""
+    bx, by, bz = grid.block_coords[block, 0], grid.block_coords[block, 1], grid.block_coords[block, 2]
+    key = np.int64(-2)
+    region = np.int32(-1)
+    for c in range(8):
+        dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
+        after, key, region = find_block(grid, bx + dx, by + dy, bz + dz, key, region)
+        grid.neighbors[block, c] = after
+        before, key, region = find_block(grid, bx - dx, by - dy, bz - dz, key, region)
+        if before >= 0:
+            grid.neighbors[before, c] = block
+
+
+# numpy's numbers, and their results cast, because numba computes in 64 bits else: half as many fit into a vector
+_CHANNEL = np.int32(1023)
+_GREEN = np.int32(10)
+_BLUE = np.int32(20)
+COLORED = np.uint32(1 << 30)  # the bit that tells a colour from none
+
+
+@device
+def pack_color(red, green, blue):
+    """A voxel's colour from quarters of a level, 0 to 1020 each: ten bits a channel, so that averages do not stall."""
+    return np.uint32(np.int32(red) | np.int32(green) << _GREEN | np.int32(blue) << _BLUE) | COLORED
+
+
+@device
+def unpack_color(packed):
+    """(red, green, blue) float32 in quarters of a level."""
+    bits = np.int32(packed)
+    return (
+        np.float32(np.int32(bits & _CHANNEL)),
+        np.float32(np.int32((bits >> _GREEN) & _CHANNEL)),
+        np.float32(np.int32((bits >> _BLUE) & _CHANNEL)),
+    )
+
+
+@device
+def is_solid(tsdf):
+    """Whether a voxel of a block, tsdf (512,), was seen to lie behind a surface."""
+    lowest = np.int16(0)
+    for n in range(BLOCK_VOXELS):
+        stored = tsdf[n]
+        lowest = min(lowest, stored if stored != UNSEEN else np.int16(0))
+    return lowest < 0
+
+
+@njit(cache=True, nogil=True)
+def find_solid_blocks(grid, block_count):
+    """Fills grid.solid of the first blocks from their distances."""
+    for block in range(block_count):
+        grid.solid[block] = is_solid(grid.tsdf[block])
+
+
+@njit(cache=True, nogil=True)
+def rehash(old_keys, old_regions, keys, regions):
+    size = keys.shape[0]
+    for i in range(old_keys.shape[0]):
+        if old_keys[i] != NO_KEY:
+            slot = _slot(old_keys[i], size)
+            while keys[slot] != NO_KEY:
+                slot = (slot + 1) & (size - 1)
+            keys[slot] = old_keys[i]
+            regions[slot] = old_regions[i]

@@ -1,0 +1,52 @@
+"""Kernels of lifting.py."""
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Bool, Float32, Float64, Int32
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def count_readings(masks: Bool, depth: Float32, counts: npt.NDArray[np.int64]) -> None:
+    """Sets counts (N * H + 1,) to how many pixels of each row of each mask have a reading, one place on."""
+    height = depth.shape[0]
+    for row in prange(masks.shape[0] * height):
+        k, v = row // height, row % height
+        count = 0
+        for u in range(depth.shape[1]):
+            count += masks[k, v, u] & (depth[v, u] > 0)
+        counts[row + 1] = count
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def gather_readings(
+    masks: Bool,
+    depth: Float32,
+    camera: tuple[float, float, float, float],
+    T_world_camera: Float64,
+    starts: npt.NDArray[np.int64],
+    points_world: Float32,
+    pixels: Int32,
+    cluster: Int32,
+) -> None:
+    """Fills points_world (P, 3), pixels (P, 2) and cluster (P,) with the masks' readings, row by row."""
+    height = depth.shape[0]
+    fx, fy, cx, cy = camera
+    T = T_world_camera
+    for row in prange(masks.shape[0] * height):
+        if starts[row] == starts[row + 1]:
+            continue
+        k, v = row // height, row % height
+        p = starts[row]
+        for u in range(depth.shape[1]):
+            z = depth[v, u]
+            if masks[k, v, u] and z > 0:
+                x, y = (u - cx) / fx * z, (v - cy) / fy * z
+                for i in range(3):
+                    points_world[p, i] = T[i, 0] * x + T[i, 1] * y + T[i, 2] * z + T[i, 3]
+                pixels[p, 0], pixels[p, 1] = u, v
+                cluster[p] = k
+                p += 1

@@ -1,0 +1,178 @@
+"""Kernels of mixture_tree.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.data import Float32, Float64, Int32, Int64
+from framework.refinement.mixtures.gaussian import (
+    SIMD,
+    constant_exponential,
+    exponentials,
+    log_densities,
+    set_coefficients,
+)
+from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT
+
+SHARE_ITERATIONS = 20  # of EM over which side a node's points are on; the error at least halves where sides are clear
+
+
+@njit(cache=True, nogil=True)
+def set_all_coefficients(weights: Float64, means: Float64, covariances: Float64, rows: Float32) -> None:
+    for j in range(len(weights)):
+        set_coefficients(weights[j], means[j], covariances[j], rows[j])
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
+    for k in prange(len(starts) - 1):
+        if starts[k + 1] > starts[k]:
+            _cut_one(points[starts[k] : starts[k + 1]], groups, labels[starts[k] : starts[k + 1]])
+
+
+@njit(cache=True, nogil=True)
+def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
+    """The members of each group lie together in `order`, so that a cut only looks at the group that it cuts."""
+    n = len(points)
+    order, upper = np.arange(n), np.empty(n, np.int64)
+    begins, ends = np.zeros(groups, np.int64), np.zeros(groups, np.int64)
+    means, scatters = np.zeros((groups, 3)), np.zeros((groups, 3))
+    ends[0] = n
+    _measure(points, order, means[0], scatters[0])
+    used = 1
+    while used < groups:
+        g, axis, largest = 0, 0, 0.0
+        for j in range(used):
+            for a in range(3):
+                if scatters[j, a] > largest:
+                    g, axis, largest = j, a, scatters[j, a]
+        if largest == 0.0:
+            return
+        low, high = begins[g], 0
+        for r in range(begins[g], ends[g]):
+            i = order[r]
+            if points[i, axis] > means[g, axis]:
+                upper[high] = i
+                high += 1
+            else:
+                order[low] = i
+                low += 1
+        order[low : ends[g]] = upper[:high]
+        if high < MIN_SUPPORT or low - begins[g] < MIN_SUPPORT:
+            scatters[g] = 0.0
+            continue
+        begins[used], ends[used], ends[g] = low, ends[g], low
+        for j in (g, used):
+            _measure(points, order[begins[j] : ends[j]], means[j], scatters[j])
+        for i in order[begins[used] : ends[used]]:
+            labels[i] = used
+        used += 1
+
+
+@njit(cache=True, nogil=True)
+def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -> None:
+    """The members' mean and their scatter along each axis."""
+    origin = points[members[0]]  # sums of offsets from a member do not cancel
+    count, sums, squares = len(members), np.zeros(3), np.zeros(3)
+    for i in members:
+        for a in range(3):
+            x = float(points[i, a] - origin[a])
+            sums[a] += x
+            squares[a] += x * x
+    for a in range(3):
+        mean[a] = origin[a] + sums[a] / count
+        scatter[a] = max(squares[a] - sums[a] * sums[a] / count, 0.0)
+
+
+@njit(cache=True, nogil=True)
+def bounding_boxes(points: Float32, starts: Int64, least_side: float) -> Float64:
+    """(N, 2, 3) the bounding box of each set, with no side below `least_side`."""
+    boxes = np.zeros((len(starts) - 1, 2, 3))
+    for k in range(len(starts) - 1):
+        for a in range(3):
+            low, high = np.inf, -np.inf
+            for i in range(starts[k], starts[k + 1]):
+                low, high = min(low, points[i, a]), max(high, points[i, a])
+            margin = max(0.5 * (least_side - (high - low)), 0.0)
+            boxes[k, 0, a], boxes[k, 1, a] = low - margin, high + margin
+    return boxes
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def pass_down(
+    points: Float32, log_odds: Float32, nodes: Int64, begins: Int64, ends: Int64, rows: Float32, shares: Float32,
+    firsts: Int64, log_outliers: Float32, above: Float32, child: Int64, share: Float32,
+) -> None:  # fmt: skip
+    for b in prange(len(nodes)):
+        q, begin, end = nodes[b], begins[b], ends[b]
+        first, last = firsts[q], firsts[q + 1]
+        _pass_block(
+            points[begin:end], log_odds[begin:end], rows[first:last], shares[first:last], first, log_outliers[q],
+            above[q], child[begin:end], share[begin:end],
+        )  # fmt: skip
+
+
+@njit(cache=True, nogil=True)
+def _pass_block(
+    points: Float32, log_odds: Float32, rows: Float32, shares: Float32, first: int, log_outlier: np.float32,
+    above: np.float32, child: Int64, share: Float32,
+) -> None:  # fmt: skip
+    n, children = len(points), len(rows)
+    child[:] = -1
+    share[:] = 0
+    if children == 0:
+        return
+    xyz, densities = np.empty((3, n), np.float32), np.empty((children, n), np.float32)
+    for i in range(n):
+        for a in range(3):
+            xyz[a, i] = points[i, a]
+    largest, best = np.full(n, log_outlier), np.full(n, -1, np.int32)
+    for j in range(children):
+        log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
+        _take_better(densities[j], np.int32(j), largest, best)
+    for i in range(n):
+        child[i] = first + best[i] if best[i] >= 0 else -1
+    evidence = np.empty(n, np.float32)
+    constant_exponential(log_outlier, largest, evidence, n)
+    for i in range(n):
+        share[i] = above * evidence[i]
+    for j in range(children):
+        exponentials(densities[j], largest, evidence, n)
+        _add_scaled(densities[j], shares[j], share)
+    for i in range(n):
+        ours = share[i] * np.exp(log_odds[i])
+        share[i] = ours / (ours + max(evidence[i] - share[i], np.float32(0)))
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def _take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32) -> None:
+    for i in range(len(largest)):
+        better = densities[i] > largest[i]
+        best[i] = j if better else best[i]
+        largest[i] = densities[i] if better else largest[i]
+
+
+@njit(cache=True, nogil=True, fastmath=SIMD)
+def _add_scaled(densities: Float32, share: np.float32, values: Float32) -> None:
+    for i in range(len(values)):
+        values[i] += share * densities[i]
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def share_all(log_odds: Float32, starts: Int64, above_points: float, shares: Float32) -> None:
+    for j in prange(len(starts) - 1):
+        if starts[j + 1] > starts[j]:
+            ratios = np.exp(log_odds[starts[j] : starts[j + 1]])
+            shares[j] = _likeliest_share(ratios, float(shares[j]), above_points)
+
+
+@njit(cache=True, nogil=True)
+def _likeliest_share(ratios: Float32, above: float, above_points: float) -> float:
+    share = 0.5
+    for _ in range(SHARE_ITERATIONS):
+        ours = above_points * above
+        for ratio in ratios:
+            ours += share * ratio / (share * ratio + 1.0 - share)
+        share = ours / (len(ratios) + above_points)
+    return share

@@ -1,0 +1,284 @@
+"""Kernels of planes.py."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from framework.data import Bool, Float32, Float64, Int64, UInt8
+
+CELL = 16  # px a side: 9 cm at 3 m and 540 px focal length, smaller than what should count as a plane
+STEP = 2  # px between the readings of a cell that are looked at
+FULL = (CELL // STEP) ** 2  # of them in a whole cell
+REFITS = 3  # passes that collect the cells of a plane anew; it hardly moves in the last
+TRIM = 1.5  # times the median deviation of a plane's cells: what lies worse is left out of the fit
+SIGMAS = 3.0  # standard deviations of the noise that a reading may lie off its plane
+MAX_PLANES = 32  # more than a frame has large ones
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
+    """(rows, columns, 10) of each cell: the sums of 1, x, y, x x, x y, y y, q, x q, y q, q q over its readings."""
+    height, width = depth.shape
+    fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
+    for row in prange(moments.shape[0]):
+        for column in range(moments.shape[1]):
+            n, sx, sy, sxx, sxy, syy, sq, sxq, syq, sqq = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+            for v in range(row * CELL, min((row + 1) * CELL, height), STEP):
+                y = (v - cy) / fy
+                for u in range(column * CELL, min((column + 1) * CELL, width), STEP):
+                    if depth[v, u] > 0:
+                        x, q = (u - cx) / fx, 1.0 / depth[v, u]
+                        n += 1.0
+                        sx += x
+                        sy += y
+                        sxx += x * x
+                        sxy += x * y
+                        syy += y * y
+                        sq += q
+                        sxq += x * q
+                        syq += y * q
+                        sqq += q * q
+            cell = moments[row, column]
+            cell[0], cell[1], cell[2], cell[3], cell[4] = n, sx, sy, sxx, sxy
+            cell[5], cell[6], cell[7], cell[8], cell[9] = syy, sq, sxq, syq, sqq
+
+
+@njit(cache=True, nogil=True)
+def _solve(moment: Float64, m: Float64) -> bool:
+    """Sets m to the least-squares plane of the readings, by Cramer's rule; False where they do not tell one.
+
+    The normal equations are centered: x and y of one cell vary by a hundredth of their size.
+    """
+    n = moment[0]
+    if n < 3:
+        return False
+    x, y, q = moment[1] / n, moment[2] / n, moment[6] / n
+    xx, xy, yy = moment[3] / n - x * x, moment[4] / n - x * y, moment[5] / n - y * y
+    xq, yq = moment[7] / n - x * q, moment[8] / n - y * q
+    determinant = xx * yy - xy * xy
+    if determinant <= 1e-9 * xx * yy:
+        return False
+    m[0] = (xq * yy - yq * xy) / determinant
+    m[1] = (yq * xx - xq * xy) / determinant
+    m[2] = q - m[0] * x - m[1] * y
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _deviation(moment: Float64, m: Float64) -> float:
+    """The rms of q - m . r over the readings, 1/m."""
+    n, sx, sy, sxx, sxy = moment[0], moment[1], moment[2], moment[3], moment[4]
+    syy, sq, sxq, syq, sqq = moment[5], moment[6], moment[7], moment[8], moment[9]
+    a, b, c = m[0], m[1], m[2]
+    linear = a * sxq + b * syq + c * sq
+    quadratic = a * a * sxx + b * b * syy + c * c * n + 2.0 * (a * b * sxy + a * c * sx + b * c * sy)
+    return math.sqrt(max(sqq - 2.0 * linear + quadratic, 0.0) / n)
+
+
+@njit(cache=True, nogil=True)
+def _length(m: Float64) -> float:
+    return math.sqrt(m[0] * m[0] + m[1] * m[1] + m[2] * m[2])
+
+
+@njit(cache=True, nogil=True)
+def _lies_in(moment: Float64, m: Float64, distance: float, noise: float) -> bool:
+    """A point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
+    return bool(_deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0])
+
+
+@njit(cache=True, nogil=True)
+def _area(moment: Float64, m: Float64, spacing: float) -> float:
+    """m^2 of the plane that the cell's readings stand for: each for spacing^2 z^2 / |n . r| = spacing^2 |m| z^3."""
+    n = moment[0]
+    z = n / moment[6]
+    return float(n * spacing * spacing * _length(m) * z * z * z)
+
+
+@njit(cache=True, nogil=True)
+def write_flatness(cells: Float64, distance: float, noise: float, flatness: Float64) -> None:
+    """Writes the deviation of each cell (C, 10) that is full and flat enough to begin a plane."""
+    m = np.zeros(3)
+    for i in range(len(cells)):
+        if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise):
+            flatness[i] = _deviation(cells[i], m)
+
+
+@njit(cache=True, nogil=True)
+def find_plane_cells(
+    cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, min_area: float,
+    spacing: float, found: Float64,
+) -> int:  # fmt: skip
+    """Writes m, deviation, area, share and what is behind of each plane; how many there are. `free` is used up."""
+    m, total = np.zeros(3), np.zeros(10)
+    tried = np.zeros(len(cells), np.bool_)
+    readings = 0.0
+    for i in range(len(cells)):
+        readings += cells[i, 0]
+    k = 0
+    region, deviations = np.empty(len(cells), np.int64), np.empty(len(cells))
+    for seed in seeds:
+        if not free[seed] or tried[seed] or k == MAX_PLANES:
+            continue
+        size = _grow(cells, columns, seed, free, distance, noise, m, region)
+        area = 0.0
+        for j in range(size):
+            i = region[j]
+            tried[i] = True
+            area += _area(cells[i], m, spacing)
+        if 4 * area < min_area:
+            continue
+        for a in range(10):
+            total[a] = 0.0
+        for _ in range(REFITS):
+            _collect(cells, free, m, distance, noise, deviations)
+            _refit(cells, deviations, m, total)
+        _collect(cells, free, m, distance, noise, deviations)
+        area, count = 0.0, 0.0
+        for i in range(len(cells)):
+            if deviations[i] < np.inf:
+                area += _area(cells[i], m, spacing)
+                count += cells[i, 0]
+        if area < min_area or total[0] == 0:
+            continue
+        for i in range(len(cells)):
+            free[i] = free[i] and deviations[i] == np.inf
+        found[k, 0], found[k, 1], found[k, 2], found[k, 3] = m[0], m[1], m[2], min(_deviation(total, m), noise)
+        found[k, 4], found[k, 5] = area, count / readings
+        found[k, 6] = _readings_behind(cells, m, found[k, 3], distance) / count
+        k += 1
+    return k
+
+
+@njit(cache=True, nogil=True)
+def _grow(
+    cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, m: Float64, region: Int64
+) -> int:
+    """Fills `region` with the cells that hang together with the seed in one plane, and m with the plane; their number.
+
+    The plane is fitted again with every cell that comes in.
+    """
+    seen = np.zeros(len(cells), np.bool_)
+    total = np.zeros(10)
+    for a in range(10):
+        total[a] = cells[seed, a]
+    _solve(total, m)
+    region[0], seen[seed] = seed, True
+    size, done = 1, 0
+    while done < size:
+        i = region[done]
+        done += 1
+        row, column = i // columns, i % columns
+        for j, exists in (
+            (i - columns, row > 0),
+            (i - 1, column > 0),
+            (i + 1, column < columns - 1),
+            (i + columns, i + columns < len(cells)),
+        ):
+            if exists and free[j] and not seen[j]:
+                seen[j] = True
+                if _lies_in(cells[j], m, distance, noise):
+                    region[size] = j
+                    size += 1
+                    for a in range(10):
+                        total[a] += cells[j, a]
+                    _solve(total, m)
+    return size
+
+
+@njit(cache=True, nogil=True)
+def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: float, deviations: Float64) -> None:
+    """Sets the deviation of each free cell that lies in the plane, infinity for all others."""
+    slope = distance * _length(m)
+    for i in range(len(cells)):
+        deviations[i] = np.inf
+        if free[i]:
+            deviation = _deviation(cells[i], m)
+            if deviation <= noise + slope * cells[i, 6] / cells[i, 0]:
+                deviations[i] = deviation
+
+
+@njit(cache=True, nogil=True)
+def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
+    """The plane of the cells that lie best in m, and the sum of their moments: at least half of those that lie in it.
+
+    The others are cells across the line where two planes meet, which would tilt both towards each other.
+    """
+    inside, count = np.empty(len(deviations)), 0
+    for i in range(len(deviations)):
+        if deviations[i] < np.inf:
+            inside[count] = deviations[i]
+            count += 1
+    if count == 0:
+        return
+    inside, middle = inside[:count], count // 2
+    upper = _order(inside, middle)
+    bound = TRIM * (upper if count % 2 else (_order(inside, middle - 1) + upper) / 2)
+    best = np.zeros(10)
+    for i in range(len(cells)):
+        if deviations[i] <= bound:
+            for a in range(10):
+                best[a] += cells[i, a]
+    if _solve(best, m):
+        for a in range(10):
+            total[a] = best[a]
+
+
+@njit(cache=True, nogil=True)
+def _order(values: Float64, k: int) -> float:
+    """The k-th smallest value; moves the values (Hoare 1961, "Find"). np.median takes longer to compile."""
+    first, last = 0, len(values) - 1
+    while first < last:
+        pivot = values[(first + last) // 2]
+        i, j = first, last
+        while i <= j:
+            while values[i] < pivot:
+                i += 1
+            while values[j] > pivot:
+                j -= 1
+            if i <= j:
+                values[i], values[j] = values[j], values[i]
+                i, j = i + 1, j - 1
+        if k <= j:
+            last = j
+        elif k >= i:
+            first = i
+        else:
+            break
+    return float(values[k])
+
+
+@njit(cache=True, nogil=True)
+def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: float) -> float:
+    """Readings of the cells whose mean lies on the far side of the plane, clear of it."""
+    behind = 0.0
+    for i in range(len(cells)):
+        n = cells[i, 0]
+        if n > 0:
+            q = cells[i, 6] / n
+            expected = (m[0] * cells[i, 1] + m[1] * cells[i, 2]) / n + m[2]
+            if expected - q > SIGMAS * (deviation + distance * _length(m) * q):
+                behind += n
+    return behind
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def label_points(
+    depth: Float32, pinhole: npt.NDArray[np.float32], m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
+    image: UInt8,
+) -> None:  # fmt: skip
+    fx, fy, cx, cy = pinhole
+    for v in prange(depth.shape[0]):
+        y = np.float32(v - cy) / fy
+        nearest = np.full(depth.shape[1], np.float32(np.inf))
+        for k in range(len(m)):
+            a, b = m[k, 0] / fx, m[k, 1] * y + m[k, 2] - m[k, 0] * cx / fx
+            for u in range(depth.shape[1]):
+                z = depth[v, u]
+                off = abs(z * (a * np.float32(u) + b) - np.float32(1.0))
+                if z > 0 and off <= reach[k] + sigmas[k] * z and off < nearest[u] * lengths[k]:
+                    nearest[u] = off / lengths[k]
+                    image[v, u] = k + 1

@@ -1,0 +1,53 @@
+"""Kernels of segment_owners.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from framework.data import Bool, Int32
+
+
+@njit(cache=True, nogil=True)
+def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: int, min_overlap: float) -> Int32:
+    """(count,) the cluster with the most pixels in each segment, the first of equals; -1 = none has enough of them."""
+    sizes, covered = np.zeros(count, np.int64), np.zeros((count, clusters), np.int64)
+    for label in labels.ravel():
+        if label >= 0:
+            sizes[label] += 1
+    for i in range(len(cluster)):
+        label = labels[pixels[i, 1], pixels[i, 0]]
+        if label >= 0 and cluster[i] >= 0:
+            covered[label, cluster[i]] += 1
+    owners = np.full(count, -1, np.int32)
+    for s in range(count):
+        best = np.argmax(covered[s])
+        if covered[s, best] > min_overlap * sizes[s]:
+            owners[s] = best
+    return owners
+
+
+@njit(cache=True, nogil=True)
+def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
+    """(P,) the points that stay; (A, 2) pixels of owned segments that their owner lacks, and (A,) the owner."""
+    height, width = labels.shape
+    kept, there = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
+    for i in range(len(cluster)):
+        u, v = pixels[i, 0], pixels[i, 1]
+        if cluster[i] >= 0:
+            kept[i] = labels[v, u] >= 0 and owners[labels[v, u]] == cluster[i]
+            there[v, u] |= kept[i]
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            there[v, u] |= labels[v, u] < 0 or owners[labels[v, u]] < 0
+            count += not there[v, u]
+    missing, owner = np.empty((count, 2), np.int32), np.empty(count, np.int32)
+    count = 0
+    for v in range(height):
+        for u in range(width):
+            if not there[v, u]:
+                missing[count, 0], missing[count, 1] = u, v
+                owner[count] = owners[labels[v, u]]
+                count += 1
+    return kept, missing, owner

@@ -1,0 +1,49 @@
+"""Kernels of lit_view.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from framework.data import Float32, Float64, Int32
+
+TO_LAMP = np.array([-0.45, -0.75, -0.6])  # in the camera's coordinates: over the viewer's left shoulder
+LAMP = TO_LAMP / np.linalg.norm(TO_LAMP)
+AMBIENT, DIFFUSE = 0.70, 0.34  # light from around and from the lamp, which is soft
+
+
+@njit(cache=True, nogil=True)
+def light_up(normals: Float32, R_world_camera: Float64, K: Float64, light: Float32) -> None:
+    """Writes the brightness (H, W), and turns the normals (H, W, 3): to the camera, of unit length, in its axes."""
+    R = R_world_camera
+    for v in range(normals.shape[0]):
+        y = (v - K[1, 2]) / K[1, 1]
+        for u in range(normals.shape[1]):
+            n = normals[v, u]
+            nx = R[0, 0] * n[0] + R[1, 0] * n[1] + R[2, 0] * n[2]
+            ny = R[0, 1] * n[0] + R[1, 1] * n[1] + R[2, 1] * n[2]
+            nz = R[0, 2] * n[0] + R[1, 2] * n[1] + R[2, 2] * n[2]
+            away = (u - K[0, 2]) / K[0, 0] * nx + y * ny + nz > 0
+            scale = (-1 if away else 1) / max(np.sqrt(nx * nx + ny * ny + nz * nz), 1e-12)
+            n[0], n[1], n[2] = scale * nx, scale * ny, scale * nz
+            light[v, u] = AMBIENT + DIFFUSE * max(n[0] * LAMP[0] + n[1] * LAMP[1] + n[2] * LAMP[2], 0.0)
+
+
+@njit(cache=True, nogil=True)
+def paint(ids: Int32, gray: Float32, palette: Float32, painted: Float32) -> None:
+    """Writes the colour (H, W, 3) of each pixel's instance, before it is lit; some texture shows through."""
+    height, width = ids.shape
+    for v in range(height):
+        for u in range(width):
+            instance = ids[v, u]
+            border = (
+                (u > 0 and ids[v, u - 1] != instance)
+                or (u < width - 1 and ids[v, u + 1] != instance)
+                or (v > 0 and ids[v - 1, u] != instance)
+                or (v < height - 1 and ids[v + 1, u] != instance)
+            )
+            dim = np.float32(0.45 if border else 1)  # where an instance meets another one or the background
+            background = np.float32(0.22) * gray[v, u] + np.float32(178)  # pale, so that the instances stand out
+            texture = np.float32(0.84) + np.float32(0.16 / 140) * gray[v, u]
+            for k in range(3):
+                painted[v, u, k] = dim * (palette[instance, k] * texture if instance > 0 else background)

@@ -1,0 +1,328 @@
+"""Kernels of alignment.py."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from framework.mapping.voxels.voxel_grid_kernels import device, one_more
+from framework.sensors.noise_models import axial_sigma_single
+
+CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
+BATCH = 160  # points; divides the usual widths
+LANES = 16  # of a sum: point n of a batch is added to lane n % LANES
+ROW = 5  # sums for each of the six errors' derivatives: its products with itself, the next three and the error
+SUMS = 6 * ROW + 1  # of points, in lanes: those of the normal equations, then that of the change of brightness
+TERMS = SUMS + 6  # of a chunk: its sums, then the counts below
+# where the fields of a batch begin: of its points in the frame, in the view, and in the model ...
+DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
+    field * BATCH for field in range(21)
+)
+POINT_FIELDS = 21
+# ... and of its terms
+J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
+TERM_SIZE = ADDED + SUMS * LANES  # behind the fields, what the batch adds to the lanes
+FAR = 2.0  # m; ATE of freiburg1_rpy's first 300 frames 26.7 mm without, 24.7 mm with it; of redkitchen 21.2 mm both
+NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
+
+
+# Not cv2.blur: how its running sums are split, and so rounded, depends on what other threads do in OpenCV meanwhile.
+@njit(cache=True, nogil=True, parallel=True)
+def smooth_normals(normals, reach, across, smooth):
+    """Fills smooth (3, H, W) with the means of normals over squares of 2 reach + 1, of length 1, 0 where all are 0."""
+    _, height, width = normals.shape
+    for v in prange(height):
+        for i in range(3):
+            across[i, v] = np.float32(0.0)
+            for d in range(-reach, reach + 1):
+                first = max(-d, 0)
+                for n in range(width - abs(d)):  # unsigned, a place needs no look at whether it counts from the end
+                    across[i, v, np.uint64(first + n)] += normals[i, v, np.uint64(first + d + n)]
+    for v in prange(height):
+        smooth[:, v] = np.float32(0.0)
+        for w in range(max(v - reach, 0), min(v + reach + 1, height)):
+            for i in range(3):
+                for u in range(width):
+                    smooth[i, v, u] += across[i, w, u]
+        for u in range(width):
+            x, y, z = smooth[0, v, u], smooth[1, v, u], smooth[2, v, u]
+            scale = np.float32(1.0) / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))
+            smooth[0, v, u], smooth[1, v, u], smooth[2, v, u] = x * scale, y * scale, z * scale
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def turn_normals(normals_world, R, normals):
+    """Fills normals (3, H, W) with R n of the normals n of normals_world (H, W, 3)."""
+    for v in prange(normals.shape[1]):
+        for u in range(normals.shape[2]):
+            x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
+            for i in range(3):
+                normals[i, v, u] = R[i, 0] * x + R[i, 1] * y + R[i, 2] * z
+
+
+@device
+def _tukey(r, scale):
+    """Tukey's biweight of a residual in standard deviations."""
+    s = r / scale
+    s = max(np.float32(1.0) - s * s, np.float32(0.0))
+    return s * s
+
+
+@device
+def _load(depth, intensity, normals, v, u0, points):
+    """A batch of the frame from pixel (u0, v) on into `points`; beyond the end of the row there are no readings."""
+    for n in range(BATCH):
+        u = u0 + n
+        if u < depth.shape[1]:
+            points[DEPTH + n], points[INTENSITY + n] = depth[v, u], intensity[v, u]
+            points[NX + n], points[NY + n], points[NZ + n] = normals[0, v, u], normals[1, v, u], normals[2, v, u]
+        else:
+            points[DEPTH + n] = np.float32(0.0)
+
+
+@device
+def _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel):
+    """Where a batch of points lies in the view, m and px, and the view's pixel numbers (BATCH,), -1 = none."""
+    one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
+    width = np.int32(shape[1])
+    right, bottom = np.float32(shape[1]), np.float32(shape[0])
+    y = (np.float32(v) - cy) / fy
+    x0, dx = (np.float32(u0) - cx) / fx, one / fx
+    row_x, row_y, row_z = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
+    R00, R10, R20 = R[0, 0], R[1, 0], R[2, 0]
+    t0, t1, t2 = t[0], t[1], t[2]
+    mfx, mfy, mcx, mcy = model.fx, model.fy, model.cx + half, model.cy + half
+    for n in range(BATCH):
+        d = points[DEPTH + n]
+        x = x0 + np.float32(np.int32(n)) * dx
+        px, py, pz = d * (R00 * x + row_x) + t0, d * (R10 * x + row_y) + t1, d * (R20 * x + row_z) + t2
+        inv_z = one / max(pz, np.float32(NEAREST))
+        u, v_ = mfx * px * inv_z + mcx, mfy * py * inv_z + mcy
+        inside = (d > zero) & (pz > np.float32(NEAREST)) & (u > zero) & (v_ > zero) & (u < right) & (v_ < bottom)
+        number = np.int32(v_) * width + np.int32(u)
+        pixel[n] = number if inside else np.int32(-1)
+        points[PX + n], points[PY + n], points[PZ + n] = px, py, pz
+        points[U + n], points[V + n] = u, v_
+
+
+@device
+def _gather_model(depth, normals, size, pixel, points):
+    """The model's depth and normal at each point's pixel; depth 0 = none."""
+    for n in range(BATCH):
+        i = pixel[n]
+        if i >= 0:
+            points[QZ + n] = depth[np.uint32(i)]
+            points[MX + n] = normals[np.uint32(i)]
+            points[MY + n] = normals[np.uint32(i + size)]
+            points[MZ + n] = normals[np.uint32(i + size + size)]
+        else:
+            points[QZ + n] = np.float32(0.0)
+
+
+@device
+def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
+    """Point n's term into J: its weight, its error, and the error's derivative by a twist of the view's frame.
+
+    (gx, gy, gz) is the error's derivative by the point (px, py, pz). What has no weight may be anything, also NaN, from
+    a pixel that it does not have.
+    """
+    zero = np.float32(0.0)
+    weighty = weight > zero
+    J[W + n] = weight
+    J[ERROR + n] = error if weighty else zero
+    J[J0 + n] = gx if weighty else zero
+    J[J1 + n] = gy if weighty else zero
+    J[J2 + n] = gz if weighty else zero
+    J[J3 + n] = py * gz - pz * gy if weighty else zero
+    J[J4 + n] = pz * gx - px * gz if weighty else zero
+    J[J5 + n] = px * gy - py * gx if weighty else zero
+
+
+@device
+def _add_geometry(model, R, weights, points, J):
+    """The point-to-plane terms of a batch into J; returns (visible, weighed, close, behind).
+
+    points[NEAR] becomes 1 where a point is near enough to its model point, 0 elsewhere.
+    """
+    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    inv_fx, inv_fy = one / model.fx, one / model.fy
+    cx, cy = model.cx + half, model.cy + half
+    R00, R01, R02, R10, R11, R12 = R[0, 0], R[0, 1], R[0, 2], R[1, 0], R[1, 1], R[1, 2]
+    R20, R21, R22 = R[2, 0], R[2, 1], R[2, 2]
+    inv_far = one / np.float32(FAR)
+    max_distance2 = weights.max_distance * weights.max_distance
+    close_distance = weights.close_distance
+    min_dot, scale, strength = weights.min_normal_dot, weights.geometric_scale, weights.depth_weight
+    visible = weighed = close = behind = np.int32(0)
+    for n in range(BATCH):
+        q = points[QZ + n]
+        px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
+        # the model point is the one that the pixel's centre sees
+        qx = (np.floor(points[U + n]) + half - cx) * inv_fx * q
+        qy = (np.floor(points[V + n]) + half - cy) * inv_fy * q
+        ex, ey, ez = px - qx, py - qy, pz - q
+        mapped = q > zero
+        near = mapped & (ex * ex + ey * ey + ez * ez <= max_distance2)
+        nx, ny, nz = points[MX + n], points[MY + n], points[MZ + n]
+        fx, fy, fz = points[NX + n], points[NY + n], points[NZ + n]
+        dot = (
+            nx * (R00 * fx + R01 * fy + R02 * fz)
+            + ny * (R10 * fx + R11 * fy + R12 * fz)
+            + nz * (R20 * fx + R21 * fy + R22 * fz)
+        )
+        noise = axial_sigma_single(points[DEPTH + n])
+        sigma = noise * max(one, points[DEPTH + n] * inv_far)
+        distance = nx * ex + ny * ey + nz * ez
+        weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
+        weight = weight if near & (dot > min_dot) else zero
+        weighty = weight > zero
+        points[NEAR + n] = one if near else zero
+        _write_term(J, n, weight, distance, nx, ny, nz, px, py, pz)
+        apart = max(close_distance, np.float32(3.0) * noise)
+        visible = one_more(visible, mapped)
+        weighed = one_more(weighed, weighty)
+        close = one_more(close, mapped & (abs(ez) < apart))
+        behind = one_more(behind, mapped & (ez > apart + apart))
+    return visible, weighed, close, behind
+
+
+@device
+def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
+    """The four intensities of the model around each point, and its place between them; -1 = nothing mapped there."""
+    one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
+    width = np.int32(shape[1])
+    right, bottom = np.float32(shape[1] - 2), np.float32(shape[0] - 2)
+    for n in range(BATCH):
+        # U and V have their origin at the corner of the image
+        u, v = points[U + n] * inverse_scale - half, points[V + n] * inverse_scale - half
+        inside = (points[NEAR + n] > zero) & (u >= one) & (v >= one) & (u < right) & (v < bottom)
+        column, line = np.int32(u), np.int32(v)
+        points[A + n], points[B + n] = u - np.float32(column), v - np.float32(line)
+        pixel[n] = line * width + column if inside else np.int32(-1)
+    for n in range(BATCH):
+        i = pixel[n]
+        if i >= 0:
+            points[I00 + n], points[I10 + n] = intensity[np.uint32(i)], intensity[np.uint32(i + 1)]
+            points[I01 + n], points[I11 + n] = intensity[np.uint32(i + width)], intensity[np.uint32(i + width + 1)]
+        else:
+            points[I00 + n] = -one
+
+
+@device
+def _add_photometry(model, inverse_scale, weights, brightness, points, J):
+    """The photometric terms of a batch into J, with frame - model intensity; returns (weighed, compared)."""
+    one, zero = np.float32(1.0), np.float32(0.0)
+    noise, scale = weights.intensity_noise, weights.photometric_scale
+    strength = weights.color_weight / (noise * noise)
+    fx, fy = model.fx * inverse_scale, model.fy * inverse_scale
+    compared = weighed = np.int32(0)
+    for n in range(BATCH):
+        a, b = points[A + n], points[B + n]
+        i00, i10, i01, i11 = points[I00 + n], points[I10 + n], points[I01 + n], points[I11 + n]
+        seen = (i00 >= zero) & (i10 >= zero) & (i01 >= zero) & (i11 >= zero)
+        du0, du1 = i10 - i00, i11 - i01
+        top, low = i00 + a * du0, i01 + a * du1
+        change = top + b * (low - top) - points[INTENSITY + n]
+        px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
+        inv_z = one / max(pz, np.float32(NEAREST))
+        gx = (du0 + b * (du1 - du0)) * fx * inv_z
+        gy = (low - top) * fy * inv_z
+        gz = -(gx * px + gy * py) * inv_z
+        error = change + brightness
+        weight = _tukey(error / noise, scale) * strength
+        weight = weight if seen else zero
+        weighty = weight > zero
+        _write_term(J, n, weight, error, gx, gy, gz, px, py, pz)
+        compared = one_more(compared, seen)
+        weighed = one_more(weighed, weighty)
+        J[DARKER + n] = -change if seen else zero
+    return weighed, compared
+
+
+@device
+def _multiply(J, first, second, third, fourth, row):
+    """The products of a batch's derivatives `first`, weighed, with themselves, with the others and with the error."""
+    zero = np.float32(0.0)
+    added = ADDED + row * ROW * LANES
+    for lane in range(LANES):
+        product0 = product1 = product2 = product3 = product_error = zero
+        for step in range(BATCH // LANES):  # unrolled by the compiler, which then vectorises the loop over lanes
+            n = step * LANES + lane
+            weighted = J[W + n] * J[first + n]
+            product0 += weighted * J[first + n]
+            product1 += weighted * J[second + n]
+            product2 += weighted * J[third + n]
+            product3 += weighted * J[fourth + n]
+            product_error += weighted * J[ERROR + n]
+        J[added + lane] = product0
+        J[added + LANES + lane] = product1
+        J[added + 2 * LANES + lane] = product2
+        J[added + 3 * LANES + lane] = product3
+        J[added + 4 * LANES + lane] = product_error
+
+
+@device
+def _add_products(J, lanes):
+    """Adds w J^T J, its upper triangle and a little more, and w J^T r of a batch to their lanes."""
+    _multiply(J, J0, J1, J2, J3, 0)
+    _multiply(J, J1, J2, J3, J4, 1)
+    _multiply(J, J2, J3, J4, J5, 2)
+    _multiply(J, J3, J4, J5, J0, 3)
+    _multiply(J, J4, J5, J0, J1, 4)
+    _multiply(J, J5, J0, J1, J2, 5)
+    for n in range(6 * ROW * LANES):
+        lanes[n] += np.float64(J[ADDED + n])
+
+
+@device
+def _add_brightness(J, lanes):
+    """Adds the change of brightness of a batch to its lanes."""
+    for lane in range(LANES):
+        change = np.float32(0.0)
+        for step in range(BATCH // LANES):
+            n = step * LANES + lane
+            change += J[DARKER + n]
+        lanes[6 * ROW * LANES + lane] += np.float64(change)
+
+
+@njit(cache=True, nogil=True, parallel=True, error_model="numpy")
+def accumulate(
+    depth, intensity, normals, fx, fy, cx, cy, model, model_intensity, inverse_scale, R, t, weights, brightness, sums
+):
+    """Sums the normal equations over one pyramid level of the frame, by chunks of rows, into sums (CHUNKS, TERMS).
+
+    `R`, `t` are T_view_camera. `inverse_scale` is the width of model_intensity over that of the view.
+    """
+    height, width = depth.shape
+    shape, level_shape = model.depth.shape, model_intensity.shape
+    size = np.int32(model.depth.size)
+    flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
+    for chunk in prange(CHUNKS):
+        total = np.zeros(TERMS, np.float64)
+        lanes = np.zeros(SUMS * LANES, np.float64)
+        points = np.zeros(POINT_FIELDS * BATCH, np.float32)
+        J = np.empty(TERM_SIZE, np.float32)
+        pixel = np.empty(BATCH, np.int32)
+        for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
+            for u0 in range(0, width, BATCH):
+                _load(depth, intensity, normals, v, u0, points)
+                _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel)
+                _gather_model(flat_depth, flat_normals, size, pixel, points)
+                visible, weighed, close, behind = _add_geometry(model, R, weights, points, J)
+                _add_products(J, lanes)
+                total[SUMS] += visible
+                total[SUMS + 1] += weighed
+                total[SUMS + 2] += close
+                total[SUMS + 3] += behind
+                if weights.color_weight > np.float32(0.0):
+                    _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
+                    weighed, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
+                    _add_products(J, lanes)
+                    _add_brightness(J, lanes)
+                    total[SUMS + 4] += weighed
+                    total[SUMS + 5] += compared
+        for i in range(SUMS):
+            for lane in range(LANES):
+                total[i] += lanes[i * LANES + lane]
+        for i in range(TERMS):  # not `sums[chunk] = total`, which takes seconds to compile
+            sums[chunk, i] = total[i]
