@@ -56,7 +56,7 @@ from framework.files.search_paths import folder_of
 from framework.geometry import back_project, exp_se3, inverse, project, transform
 from framework.mapping.instance_map import InstanceMap
 from framework.mapping.instances.association import Association
-from framework.mapping.labels.label_evidence import Combine
+from framework.mapping.labels.label_evidence_kernels import Combine
 from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
 from framework.mapping.labels.pixel_lists import list_points_by_pixel
 from framework.refinement.selection import keep_points
