@@ -39,7 +39,7 @@ class InstanceMapNode(Node):
             return
         if added.lost:
             self.get_logger().warning(f"lost: {added.reason}", throttle_duration_sec=1.0)
-        elif added.new or added.gone:
+        elif added.new or added.removed:
             self.markers.publish(MarkerArray(markers=[Marker(action=Marker.DELETEALL), *self.boxes()]))
 
     def boxes(self) -> list[Marker]:

@@ -43,25 +43,23 @@ from framework.interfaces import (
 )
 from framework.pipeline import Pipeline
 from framework.queries.map_queries import Map
-from framework.queries.text_search import Answer, Found, Question, search
+from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build
-from framework.runs.stored_runs import MAP, PLACES
+from framework.runs.stored_runs import KEYFRAMES, MAP
 from framework.runtime.process_settings import Settings
 from framework.runtime.run_log import Journal
-from framework.tracking.keyframes_file import read_places
+from framework.tracking.keyframes_file import read_keyframes
 
 __all__ = [
-    "Added",
-    "Answer",
     "Camera",
     "ClusterRefiner",
     "ConfigError",
     "DataError",
     "Detections",
     "Detector",
-    "Found",
     "Frame",
     "FrameError",
+    "FrameResult",
     "Instance",
     "InstanceMapError",
     "InstanceMesh",
@@ -70,10 +68,12 @@ __all__ = [
     "MapFullError",
     "MapFuser",
     "Mapper",
+    "Match",
     "Pipeline",
     "PointClusters",
     "Pose",
     "PoseTracker",
+    "QueryResult",
     "RGBDSequence",
     "SceneMap",
     "View",
@@ -94,15 +94,15 @@ def pipeline_of(config: DictConfig) -> Pipeline:
     return Pipeline(detector, tracker, refiner, fuser, config.prefetch, viewer)
 
 
-def go_on(pipeline: Pipeline, run: Path) -> None:
+def resume_map(pipeline: Pipeline, run: Path) -> None:
     """Has a pipeline that has mapped nothing go on with the map of a stored run.
 
     The tracker says that it is lost until it finds itself in that map. Raises DataError where the run has left no map
     that can be read, ConfigError where the stages cannot go on with it.
     """
     scene = scene_of("resume_from", run)
-    pipeline.fuser.go_on(scene)
-    pipeline.tracker.recall(read_places(run / PLACES), scene)
+    pipeline.fuser.resume(scene)
+    pipeline.tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene)
 
 
 def begin_in(pipeline: Pipeline, run: Path) -> None:
@@ -110,7 +110,7 @@ def begin_in(pipeline: Pipeline, run: Path) -> None:
 
     Raises likewise.
     """
-    pipeline.tracker.recall(read_places(run / PLACES), scene_of("localize_in", run))
+    pipeline.tracker.load_keyframes(read_keyframes(run / KEYFRAMES), scene_of("localize_in", run))
 
 
 def begin(config: DictConfig) -> Pipeline:
@@ -120,7 +120,7 @@ def begin(config: DictConfig) -> Pipeline:
     if map_ is not None and world is not None:
         raise ConfigError("resume_from and localize_in: expected at most one of them, got both")
     if map_ is not None:
-        go_on(pipeline, checked_path("resume_from", map_))
+        resume_map(pipeline, checked_path("resume_from", map_))
     if world is not None:
         begin_in(pipeline, checked_path("localize_in", world))
     compile_for_run()
@@ -136,11 +136,11 @@ def scene_of(key: str, run: Path) -> SceneMap:
 
 
 @dataclass(frozen=True)
-class Added(Pose):
+class FrameResult(Pose):
     """What became of a frame: the camera's pose, or that it is lost, and which objects there are since."""
 
     new: tuple[int, ...] = ()  # ids of objects that count from this frame on
-    gone: tuple[int, ...] = ()  # ids that count no more: merged with another object, or outvoted
+    removed: tuple[int, ...] = ()  # ids that no longer count: merged with another object, or outvoted
 
 
 class Mapper(Map):
@@ -184,7 +184,7 @@ class Mapper(Map):
         camera: Camera | None = None,
         timestamp: float | None = None,
         up: Float64 | None = None,
-    ) -> Added:
+    ) -> FrameResult:
         """Detects, tracks, refines and fuses one frame; the frames of a video in their order.
 
         `color` (H, W, 3) is uint8 RGB, `depth` (H, W) float32 m along z, 0 = no reading, `pose` (4, 4) T_world_camera
@@ -205,10 +205,10 @@ class Mapper(Map):
             before = self.scene.instance_ids()
             found = self._map(frame)
             if found.lost:
-                return Added(found.T_world_camera, lost=True, reason=found.reason)
+                return FrameResult(found.T_world_camera, lost=True, reason=found.reason)
             self._T_world_camera = found.T_world_camera
             now = self.scene.instance_ids()
-        return Added(found.T_world_camera, new=tuple(sorted(now - before)), gone=tuple(sorted(before - now)))
+        return FrameResult(found.T_world_camera, new=tuple(sorted(now - before)), removed=tuple(sorted(before - now)))
 
     def _map(self, frame: Frame) -> Pose:
         """Detects and maps a frame, and has the viewer show it."""
@@ -305,7 +305,7 @@ def export(
     return exports.export(Path(run), kinds, None if out is None else Path(out), chosen, up, floor)
 
 
-def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> Answer:
+def query(run: Map | Path | str, words: str, by: str | None = None, model: Path | str | None = None) -> QueryResult:
     """The objects of a run, or of a map, that words mean, best first: `query("outputs/demo", "a red chair").objects`.
 
     `by` "embeddings" compares the words with the objects' pictures, through `model`, a folder, a file or an id on
@@ -315,7 +315,7 @@ def query(run: Map | Path | str, words: str, by: str | None = None, model: Path 
     Raises ConfigError for a question that is none, DataError for a run without a map, for words that nothing in it is
     called, and for embeddings that are not there or of another model.
     """
-    question = Question(words, by, None if model is None else str(model))
+    question = TextQuery(words, by, None if model is None else str(model))
     if isinstance(run, Map):
         return search(run, question)
     return search(Map(scene_of("query", Path(run))), question, Path(run))

@@ -121,18 +121,22 @@ class PoseTracker(ABC):
         that has none: the frame is skipped.
         """
 
-    def places(self) -> Mapping[str, Array]:
-        """What it remembers of what it has seen from where, for `recall`; nothing where it remembers nothing."""
+    def keyframes(self) -> Mapping[str, Array]:
+        """Return the arrays of the keyframes, for `load_keyframes`; empty if the tracker keeps none."""
         return {}
 
-    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
-        """Goes on with what another one remembers: it says that it is lost until it finds itself in `scene`, which was
-        mapped then.
+    def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
+        """Resume from stored keyframes; poses are lost until relocalization in `scene` succeeds.
 
-        `places` is empty where that one remembered nothing. Raises ConfigError where it cannot do with these, and
-        DataError where they are none.
+        Args:
+            keyframes: The arrays that `keyframes` returned; empty if there were none.
+            scene: The map in which these keyframes were recorded.
+
+        Raises:
+            ConfigError: the tracker cannot relocalize with these keyframes.
+            DataError: the arrays are not keyframes.
         """
-        raise ConfigError(f"{type(self).__name__} cannot find itself in a map from before")
+        raise ConfigError(f"tracker: {type(self).__name__} cannot relocalize in a stored map; choose another tracker")
 
 
 class ClusterRefiner(ABC):
@@ -158,9 +162,13 @@ class MapFuser(ABC):
         Raises MapFullError when the map's block budget is reached.
         """
 
-    def go_on(self, scene: SceneMap) -> None:
-        """Takes a map from before in place of its own empty one. Raises ConfigError where it cannot write that one."""
-        raise ConfigError(f"{type(self).__name__} cannot go on with a map from before")
+    def resume(self, scene: SceneMap) -> None:
+        """Continue a stored map instead of the empty one.
+
+        Raises:
+            ConfigError: the fuser cannot write this map.
+        """
+        raise ConfigError(f"fuser: {type(self).__name__} cannot resume a stored map; choose another fuser")
 
 
 class SceneMap(ABC):
@@ -202,10 +210,10 @@ class SceneMap(ABC):
         """Their ids; asked after each frame by who maps frames as they come: override it where it can be cheap."""
         return frozenset(self.instances())
 
-    def likeliest_classes(self) -> Mapping[int, tuple[int, float]]:
-        """The likeliest class of each object, an index into `classes`, and its confidence, by id.
+    def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
+        """Return the most likely class of each object (an index into `classes`) and its confidence, by id.
 
-        Asked about once a second by who watches the map grow: override it where it can be cheap.
+        Viewers call it about once per second; override it if the map has a faster way.
         """
         found = self.instances().values()
         return {one.id: (int(one.class_probabilities.argmax()), one.confidence) for one in found}
@@ -234,7 +242,7 @@ class SceneMap(ABC):
         """Whether `up` is what a sensor told of the frames, and not found in the surface."""
         return False
 
-    def up_from(self) -> str:
+    def up_source(self) -> str:
         """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
         if self.up() is None:
             return ""

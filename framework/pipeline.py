@@ -93,7 +93,7 @@ class Pipeline:
                     self.map_all(video, journal, interruption)
             except BaseException as stop:
                 journal.stopped_by = stop
-            places = self.places(journal)
+            keyframes = self.keyframes(journal)
         if journal.stopped_by is not None:
             if journal.frames_in_map == 0:
                 raise journal.stopped_by
@@ -101,15 +101,15 @@ class Pipeline:
                 journal.stopped_by = None  # that is how it ends; a second signal is another Interrupted
         elif journal.frames_in_map == 0 or self.fuser.scene.voxel_count == 0:
             raise DataError(f"{video.name}: {self.why_nothing(journal)}")
-        return replace(journal.result(), places=places)
+        return replace(journal.result(), keyframes=keyframes)
 
-    def places(self, journal: Journal) -> Mapping[str, Array]:
+    def keyframes(self, journal: Journal) -> Mapping[str, Array]:
         """What the tracker remembers; a fault of the last frame's place, which is told only now, ends the run, too."""
         try:
-            return self.tracker.places()
+            return self.tracker.keyframes()
         except Exception as fault:
             journal.stopped_by = journal.stopped_by or fault
-            return self.tracker.places()
+            return self.tracker.keyframes()
 
     def why_nothing(self, journal: Journal) -> str:
         """What became of the frames of a run whose map is empty."""

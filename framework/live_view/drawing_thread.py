@@ -91,7 +91,7 @@ class Background:
             return
         try:
             with self._snapshots.kept():
-                mesh, objects = self._scene.mesh(), self._scene.likeliest_classes()
+                mesh, objects = self._scene.mesh(), self._scene.most_likely_classes()
             self._taken += 1
             if self._taken == self._next_up:
                 self._up = self._scene.up()

@@ -35,7 +35,7 @@ class MapSnapshot:
     index: int  # Frame.index of the last frame that is in it
     timestamp: float  # s
     mesh: InstanceMesh
-    objects: Mapping[int, tuple[int, float]]  # SceneMap.likeliest_classes
+    objects: Mapping[int, tuple[int, float]]  # SceneMap.most_likely_classes
     up: Float64 | None  # (3,), as it was last asked for
 
 

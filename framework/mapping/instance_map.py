@@ -87,8 +87,8 @@ class InstanceMap(SceneMap):
     def instance_ids(self) -> frozenset[int]:
         return self.confirmation.ids(self.table)
 
-    def likeliest_classes(self) -> Mapping[int, tuple[int, float]]:
-        return self.confirmation.likeliest_classes(self.table)
+    def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
+        return self.confirmation.most_likely_classes(self.table)
 
     def begin(self, classes: tuple[str, ...]) -> None:
         """Takes the first frame's label space for the map's. Raises DataError for another one later."""

@@ -103,10 +103,10 @@ class Map:
         with self.lock:
             return self.scene.up()
 
-    def up_from(self) -> str:
+    def up_source(self) -> str:
         """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
         with self.lock:
-            return self.scene.up_from()
+            return self.scene.up_source()
 
     def floor(self) -> float | None:
         """m along `up`, how high the floor is: a point is `point @ up - floor` above it. None where it was not seen."""

@@ -24,7 +24,7 @@ WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instanc
 
 
 @dataclass(frozen=True)
-class Found:
+class Match:
     """An object that may be meant."""
 
     instance: Instance
@@ -35,16 +35,16 @@ class Found:
 
 
 @dataclass(frozen=True)
-class Answer:
+class QueryResult:
     """The objects of a map that words may mean."""
 
     by: str  # what they were found by: "embeddings" of their pictures, or "names" of classes and colours
     space: str  # the model that the map's embeddings are of, and its version; "" = it has no embeddings
-    objects: tuple[Found, ...]  # best first; by embeddings all that have one, by names those that are meant
+    objects: tuple[Match, ...]  # best first; by embeddings all that have one, by names those that are meant
 
 
 @dataclass(frozen=True)
-class Question:
+class TextQuery:
     """What somebody looks for in a map. Raises ConfigError for what is no question."""
 
     words: str
@@ -62,7 +62,7 @@ class Question:
             raise ConfigError(f"a model is of embeddings, and by names none is asked: found {self.model!r:.60}")
 
 
-def search(scene: Map, question: Question, run: Path | None = None) -> Answer:
+def search(scene: Map, question: TextQuery, run: Path | None = None) -> QueryResult:
     """The objects that the question means; `run` is the directory of the map's run, None = it is of none.
 
     Raises DataError for words that nothing is called, and where the embeddings that are asked for are not there or are
@@ -71,13 +71,13 @@ def search(scene: Map, question: Question, run: Path | None = None) -> Answer:
     space = scene.scene.embedding_space
     by = question.by or ("embeddings" if space or question.model is not None else "names")
     if by == "names":
-        return Answer(by, space, tuple(by_names(scene, question.words)))
+        return QueryResult(by, space, tuple(by_names(scene, question.words)))
     if not space:
         raise DataError(f"{run or 'this map'} has no embeddings: run with {WITH_EMBEDDINGS}, or ask by names")
-    return Answer(by, space, tuple(by_embedding(scene, _embedded(question, space, run))))
+    return QueryResult(by, space, tuple(by_embedding(scene, _embedded(question, space, run))))
 
 
-def _embedded(question: Question, space: str, run: Path | None) -> Float32:
+def _embedded(question: TextQuery, space: str, run: Path | None) -> Float32:
     """The question's words (D,) in a map's space."""
     from framework.detection.hub.image_text import ImageTextModel
 
@@ -99,7 +99,7 @@ def _model_of(run: Path | None) -> tuple[str, str]:
     raise DataError(f"{run / CONFIG} does not say of which model the embeddings are: {NAME_IT}")
 
 
-def by_embedding(scene: Map, text: Float32) -> list[Found]:
+def by_embedding(scene: Map, text: Float32) -> list[Match]:
     """The objects by the cosine of the angle between their embedding and that of a text (D,), the nearest first.
 
     Objects without an embedding are left out. Raises DataError where the map's have another length.
@@ -111,7 +111,7 @@ def by_embedding(scene: Map, text: Float32) -> list[Found]:
         return _found(scene, {k: float(embedding @ text) for k, embedding in known.items()})
 
 
-def by_names(scene: Map, query: str) -> list[Found]:
+def by_names(scene: Map, query: str) -> list[Match]:
     """The objects by how probably they are of a class that the query names, times how well a colour that it names fits
     their surface, without those that are not meant at all. Those that fit alike are ranked by their confidence.
 
@@ -147,11 +147,11 @@ def _colors(mesh: InstanceMesh, instance: Instance) -> Float32:
     return np.asarray(mesh.colors[instance.vertices].astype(np.float32) / np.float32(255), np.float32)
 
 
-def _found(scene: Map, similarities: dict[int, float]) -> list[Found]:
+def _found(scene: Map, similarities: dict[int, float]) -> list[Match]:
     """The objects with these similarities by id, best first; of equals, the more trusted one."""
     instances, mesh = scene.instances(), scene.mesh()
     return [
-        Found(
+        Match(
             instance=instances[k],
             name=scene.name(instances[k]),
             similarity=similarities[k],

@@ -62,7 +62,7 @@ def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
     if up is None:
         return {}
     figures: Metrics = {f"map.up.{axis}": float(value) for axis, value in zip("xyz", up, strict=True)}
-    figures["up_from"] = scene.up_from()
+    figures["up_from"] = scene.up_source()
     return figures | {"map.floor_m": floor_height(mesh.vertices, mesh.triangles, up)}
 
 

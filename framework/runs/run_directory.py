@@ -39,17 +39,17 @@ from framework.runs.provenance import code_version, config_hash, environment
 from framework.runs.stored_runs import (
     CONFIG,
     INSTANCES,
+    KEYFRAMES,
     MAP,
     MAPPED,
     MESH,
     METRICS,
     PARTIAL_METRICS,
-    PLACES,
     REPORT,
     TRAJECTORY,
 )
 from framework.runtime.run_log import RunResult
-from framework.tracking.keyframes_file import write_places
+from framework.tracking.keyframes_file import write_keyframes
 
 log = logging.getLogger(__name__)
 
@@ -99,7 +99,7 @@ class RunRecord:
         """
         self.directory.mkdir(parents=True, exist_ok=True)
         scene, attempt = result.scene, _Attempts(result.stopped_by)
-        for name in (*MAPPED, PLACES):  # of an earlier run into the same directory
+        for name in (*MAPPED, KEYFRAMES):  # of an earlier run into the same directory
             attempt((self.directory / name).unlink, missing_ok=True)
         if not (self.directory / CONFIG).exists():  # the directory was removed meanwhile
             attempt(_write_config, self.directory / CONFIG, self.config)
@@ -117,8 +117,8 @@ class RunRecord:
         if found is not None:
             attempt(write_mesh, self.directory / MESH, found[0])
         attempt(scene.save, self.directory / MAP)
-        if result.places:
-            attempt(write_places, self.directory / PLACES, result.places)
+        if result.keyframes:
+            attempt(write_keyframes, self.directory / KEYFRAMES, result.keyframes)
         if found is not None:
             figures |= attempt(instance_metrics, video, *found, scene.classes) or {}
         figures |= attempt(trajectory_metrics, result) or {}

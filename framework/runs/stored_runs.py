@@ -30,7 +30,7 @@ MESH = "mesh.ply"
 INSTANCES = "instances.json"
 TRAJECTORY = "trajectory.txt"
 REPORT = "report.html"  # what `report` writes: made of a record, and no part of it
-PLACES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
+KEYFRAMES = "keyframes.npz"  # what the tracker remembers, for who goes on with the map; some remember nothing
 MAPPED = (TRAJECTORY, "timings.csv", INSTANCES, MESH, MAP, "overview.png")
 """What is written of a map, in this order: on a disk that is full the small ones still find a place."""
 

@@ -66,7 +66,7 @@ class RunResult:
     intervals: tuple[float, ...] = ()  # s, wall clock from each frame to the next
     pose_source: str = PoseTracker.pose_source
     live: LiveFigures | None = None  # None = of a recording, which is mapped whole
-    places: Mapping[str, Array] = field(default_factory=dict)  # that the tracker remembers
+    keyframes: Mapping[str, Array] = field(default_factory=dict)  # that the tracker remembers
 
     @property
     def frames_lost(self) -> int:

@@ -12,13 +12,13 @@ from framework.mapping.storage.map_file import faults_of, read_arrays, write_map
 FORMAT = "places 1"  # of the file; a change of meaning counts it up
 
 
-def write_places(path: Path, places: Mapping[str, Array]) -> None:
+def write_keyframes(path: Path, keyframes: Mapping[str, Array]) -> None:
     """Writes the arrays, whole or not at all."""
-    write_map(path, {"format": FORMAT, "names": sorted(places)}, places)
+    write_map(path, {"format": FORMAT, "names": sorted(keyframes)}, keyframes)
 
 
-def read_places(path: Path) -> dict[str, Array]:
-    """What `write_places` wrote, nothing where there is no file. Raises DataError for a file that is none."""
+def read_keyframes(path: Path) -> dict[str, Array]:
+    """What `write_keyframes` wrote, nothing where there is no file. Raises DataError for a file that is none."""
     if not is_there(path):
         return {}
     with faults_of(path):

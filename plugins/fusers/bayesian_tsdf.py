@@ -37,7 +37,7 @@ class BayesianTsdf(MapFuser):
         check_bounds(self, class_floor=(1e-6, 0.999), instance_floor=(1e-6, 0.999), absence_likelihood=(1e-6, 1.0))
         self.scene: InstanceMap = self.voxels.new_map(RULE)
 
-    def go_on(self, scene: SceneMap) -> None:
+    def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULE)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:

@@ -42,7 +42,7 @@ class LabelVote(MapFuser):
     def __post_init__(self) -> None:
         self.scene: InstanceMap = self.voxels.new_map(RULES[self.vote])
 
-    def go_on(self, scene: SceneMap) -> None:
+    def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, RULES[self.vote])
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:

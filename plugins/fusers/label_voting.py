@@ -40,7 +40,7 @@ class LabelVoting(MapFuser):
     def __post_init__(self) -> None:
         self.scene: InstanceMap = self.voxels.new_map(self.rule.value)
 
-    def go_on(self, scene: SceneMap) -> None:
+    def resume(self, scene: SceneMap) -> None:
         self.scene = self.voxels.continued(scene, self.rule.value)
 
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:

@@ -22,5 +22,5 @@ class GroundTruth(PoseTracker):
             raise NoPoseError(f"frame {frame.index} has no true pose at {frame.timestamp:.3f} s")
         return Pose(frame.T_world_camera)
 
-    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
+    def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
         """The true poses are of the map's world; there is nothing to be found again."""

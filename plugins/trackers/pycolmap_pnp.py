@@ -65,11 +65,11 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.add_with(frame, features, found.T_world_camera)
         return Pose(found.T_world_camera)
 
-    def places(self) -> Mapping[str, Array]:
+    def keyframes(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
 
-    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
-        self._keyframes.restore(places)
+    def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
+        self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
         """The first frame with enough features is where the world begins."""

@@ -64,5 +64,5 @@ class TrajectoryFile(PoseTracker):
             self._T_world_file = T_world_first @ inverse(T_file_camera)
         return Pose(self._T_world_file @ T_file_camera)
 
-    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
+    def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
         """The poses are of the map's world, as they are given; there is nothing to be found again."""

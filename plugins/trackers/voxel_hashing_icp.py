@@ -164,11 +164,11 @@ class VoxelHashingIcp(PoseTracker):
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
         return self._trusted(seen, alignment.T_world_camera)
 
-    def places(self) -> Mapping[str, Array]:
+    def keyframes(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
 
-    def recall(self, places: Mapping[str, Array], scene: SceneMap) -> None:
-        self._keyframes.restore(places)
+    def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
+        self._keyframes.restore(keyframes)
         self._before = scene
 
     def _entered(self, seen: FrameFeatures, before: SceneMap) -> Pose:

@@ -77,12 +77,12 @@ def test_what_a_sensor_tells_is_up_in_the_map_and_in_its_file(fuser: str, tmp_pa
     assert found is not None
     assert np.degrees(np.arccos(wrong @ up)) == pytest.approx(20, abs=1)
     assert np.degrees(np.arccos(min(found @ up, 1.0))) < 0.01
-    assert (sensed.up_from(), unsensed.up_from(), Mapper(*stages).up_from()) == ("sensor", "surfaces", "")
+    assert (sensed.up_source(), unsensed.up_source(), Mapper(*stages).up_source()) == ("sensor", "surfaces", "")
     assert room_metrics(sensed.scene, sensed.mesh())["up_from"] == "sensor"
     sensed.save(tmp_path / "map.npz")
     again = load_map(tmp_path / "map.npz")
     np.testing.assert_array_equal(again.up(), found)
-    assert again.up_from() == "sensor"
+    assert again.up_source() == "sensor"
 
 
 def test_several_threads_share_a_mapper(room: CornerRoom) -> None:

@@ -236,7 +236,7 @@ class ForgetsOnce(GivenPose):
 
     asked: int = 0
 
-    def places(self) -> Mapping[str, Array]:
+    def keyframes(self) -> Mapping[str, Array]:
         self.asked += 1
         if self.asked == 1:
             raise MemoryError("no memory for features")

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.queries.text_search import BY, WITH_EMBEDDINGS, Answer, Found
+from framework.queries.text_search import BY, WITH_EMBEDDINGS, Match, QueryResult
 
 
 def main() -> None:
@@ -42,7 +42,7 @@ def main() -> None:
             print(f"nothing in this map is {asked.text!r}")
 
 
-def heading(answer: Answer, wanted: str | None) -> str:
+def heading(answer: QueryResult, wanted: str | None) -> str:
     """By what it was answered, and why by names where nobody asked for them."""
     if answer.by == "embeddings":
         return f"by embeddings of {answer.space}"
@@ -51,7 +51,7 @@ def heading(answer: Answer, wanted: str | None) -> str:
     return f"by class names and colours{why}"
 
 
-def table(found: Sequence[Found], measure: str) -> str:
+def table(found: Sequence[Match], measure: str) -> str:
     """For people: lengths in metres."""
     rows = [("id", "class", measure, "confidence", "colour", "position", "size")]
     for one in found:
@@ -67,7 +67,7 @@ def table(found: Sequence[Found], measure: str) -> str:
     )
 
 
-def entry(found: Found) -> dict[str, object]:
+def entry(found: Match) -> dict[str, object]:
     """For programs: lengths in metres."""
     return {
         "id": found.instance.id,

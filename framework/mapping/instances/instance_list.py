@@ -52,7 +52,7 @@ class Confirmation:
         """Of those that count, whatever their area."""
         return frozenset(np.flatnonzero(self.counts(table)).tolist())
 
-    def likeliest_classes(self, table: InstanceTable) -> dict[int, tuple[int, float]]:
+    def most_likely_classes(self, table: InstanceTable) -> dict[int, tuple[int, float]]:
         """The class and the confidence of those that count, by id, whatever their area."""
         counted = (record for record in table.records.values() if self.is_met(record))
         return {record.id: (int(record.class_evidence.argmax()), record.confidence) for record in counted}

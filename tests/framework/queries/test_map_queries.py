@@ -128,8 +128,8 @@ def test_what_changed_is_told_with_each_frame() -> None:
         added = mapper.add(frame)
         assert not added.lost
         assert known.isdisjoint(added.new)
-        assert known.issuperset(added.gone)
-        known = (known | set(added.new)) - set(added.gone)
+        assert known.issuperset(added.removed)
+        known = (known | set(added.new)) - set(added.removed)
         assert known == mapper.scene.instance_ids()
     assert known
 

@@ -106,19 +106,19 @@ def test_it_is_the_same_whenever_features_are_found(seconds: float) -> None:
 
     def waiting(frame: Frame, scene: SceneMap) -> Pose:
         pose = track(frame, scene)
-        at_once.places()
+        at_once.keyframes()
         return pose
 
     later._keyframes.extractor.extract, later._keyframes.nearest = slow, asked
     at_once.track = waiting
     expected, found = run(at_once, frames)[0], run(later, frames)[0]
     assert any(offered)
-    assert len(at_once.places()["poses"]) > 4
+    assert len(at_once.keyframes()["poses"]) > 4
     for pose, other in zip(found, expected, strict=True):
         assert (pose.lost, pose.reason) == (other.lost, other.reason)
         np.testing.assert_array_equal(pose.T_world_camera, other.T_world_camera)
-    for name, array in at_once.places().items():
-        np.testing.assert_array_equal(later.places()[name], array, err_msg=name)
+    for name, array in at_once.keyframes().items():
+        np.testing.assert_array_equal(later.keyframes()[name], array, err_msg=name)
 
 
 def test_a_tracker_is_pickled_on_its_way() -> None:
@@ -126,8 +126,8 @@ def test_a_tracker_is_pickled_on_its_way() -> None:
     tracker = VoxelHashingIcp()
     _, scene = run(tracker, frames[:-1])
     copied = pickle.loads(pickle.dumps(tracker))
-    for name, array in tracker.places().items():
-        np.testing.assert_array_equal(copied.places()[name], array, err_msg=name)
+    for name, array in tracker.keyframes().items():
+        np.testing.assert_array_equal(copied.keyframes()[name], array, err_msg=name)
     expected, found = (one.track(frames[-1], scene) for one in (tracker, copied))
     assert not expected.lost
     np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)

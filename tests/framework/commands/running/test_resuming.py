@@ -17,7 +17,7 @@ from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse, rotation_angle
-from framework.tracking.keyframes_file import read_places, write_places
+from framework.tracking.keyframes_file import read_keyframes, write_keyframes
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = pytest.mark.integration
@@ -31,8 +31,8 @@ def put_away(mapper: Mapper, place: Path) -> Path:
     """What a run leaves of its map."""
     place.mkdir()
     mapper.scene.save(place / "map.npz")
-    if places := mapper.pipeline.tracker.places():
-        write_places(place / "keyframes.npz", places)
+    if keyframes := mapper.pipeline.tracker.keyframes():
+        write_keyframes(place / "keyframes.npz", keyframes)
     return place
 
 
@@ -116,9 +116,9 @@ def test_a_lost_camera_enters_the_map_when_it_sees_what_is_there(tmp_path: Path)
         (("fuser.voxel_size=0.05",), "made with fuser.voxel_size 0.04, and cannot be gone on with by 0.05"),
         (("fuser.max_depth=4",), "fuser.max_depth"),
         (("fuser=label_count",), "keeps labels as"),
-        (("fuser=object_volumes",), "ObjectVolumes cannot go on"),
+        (("fuser=object_volumes",), "ObjectVolumes cannot resume"),
         (("tracker=voxel_hashing_icp",), "has left no keyframes"),
-        (("tracker=open3d_odometry",), "Open3dOdometry cannot find itself"),
+        (("tracker=open3d_odometry",), "Open3dOdometry cannot relocalize"),
     ],
 )
 def test_what_cannot_go_on_says_so(tmp_path: Path, room: CornerRoom, overrides: tuple[str, ...], said: str) -> None:
@@ -129,42 +129,42 @@ def test_what_cannot_go_on_says_so(tmp_path: Path, room: CornerRoom, overrides: 
 
 
 def test_a_map_that_is_not_there(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"map: there is no .*map\.npz: expected the directory of a run"):
+    with pytest.raises(DataError, match=r"resume_from: there is no .*map\.npz: expected the directory of a run"):
         Mapper(*GIVEN, f"resume_from={tmp_path}")
-    with pytest.raises(ConfigError, match="map must be a path"):
+    with pytest.raises(ConfigError, match="resume_from must be a path"):
         Mapper(*GIVEN, "resume_from=7")
 
 
 def test_keyframes_are_read_back_and_damaged_ones_refused(tmp_path: Path) -> None:
     desk, _ = mapped([DESK[k] for k in range(0, 30, 5)], *TRACKED)
-    places = desk.pipeline.tracker.places()
+    keyframes = desk.pipeline.tracker.keyframes()
     path = tmp_path / "keyframes.npz"
-    assert read_places(path) == {}
-    write_places(path, places)
-    back = read_places(path)
-    assert list(back) == sorted(places)
-    for name, array in places.items():
+    assert read_keyframes(path) == {}
+    write_keyframes(path, keyframes)
+    back = read_keyframes(path)
+    assert list(back) == sorted(keyframes)
+    for name, array in keyframes.items():
         np.testing.assert_array_equal(back[name], array)
         assert back[name].dtype == array.dtype
     again = Mapper(*TRACKED).pipeline.tracker
-    again.recall(back, desk.scene)
-    for name, array in again.places().items():
-        np.testing.assert_array_equal(array, places[name])
-    scaled = np.array(places["poses"]) * 2
+    again.load_keyframes(back, desk.scene)
+    for name, array in again.keyframes().items():
+        np.testing.assert_array_equal(array, keyframes[name])
+    scaled = np.array(keyframes["poses"]) * 2
     for damage in (
-        {"counts": places["counts"][:-1]},
-        {"counts": -np.asarray(places["counts"], np.int32)},
-        {"points_world": places["points_world"][:-1]},
+        {"counts": keyframes["counts"][:-1]},
+        {"counts": -np.asarray(keyframes["counts"], np.int32)},
+        {"points_world": keyframes["points_world"][:-1]},
         {"poses": scaled},
-        {"descriptors": np.asarray(places["descriptors"]).astype(np.int32)},
+        {"descriptors": np.asarray(keyframes["descriptors"]).astype(np.int32)},
     ):
         with pytest.raises(DataError):
-            Mapper(*TRACKED).pipeline.tracker.recall({**places, **damage}, desk.scene)
+            Mapper(*TRACKED).pipeline.tracker.load_keyframes({**keyframes, **damage}, desk.scene)
     with pytest.raises(DataError, match="keyframes are"):
-        Mapper(*TRACKED).pipeline.tracker.recall({"poses": places["poses"]}, desk.scene)
+        Mapper(*TRACKED).pipeline.tracker.load_keyframes({"poses": keyframes["poses"]}, desk.scene)
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(DataError, match=r"keyframes\.npz"):
-        read_places(path)
+        read_keyframes(path)
 
 
 def test_a_map_with_views_of_two_recordings_is_stored_and_read(tmp_path: Path, room: CornerRoom) -> None:

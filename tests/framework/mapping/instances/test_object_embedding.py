@@ -129,7 +129,7 @@ def test_a_map_that_is_gone_on_with_counts_on(tmp_path: Path) -> None:
     first = mapped("bayesian_tsdf", embeddings=EMBEDDINGS)
     first.scene.save(tmp_path / "map.npz")
     second: MapFuser = registered.built("fuser", "bayesian_tsdf", "fuser.voxel_size=0.08")
-    second.go_on(load_scene(tmp_path / "map.npz"))
+    second.resume(load_scene(tmp_path / "map.npz"))
     frame = room().frame(walk(4)[0], 0)
     fuse_masks(second, frame, masks_of(frame), [0.9, 0.8, 0.9], embeddings=EMBEDDINGS[[1, 1, 1]])
     turned = second.scene.instances()[1]
