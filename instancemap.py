@@ -35,61 +35,84 @@ as `Pipeline(detector, tracker, refiner, fuser).run(sequence)`, or are chosen by
 (CONTRIBUTING.md says how). Plugins import only `instancemap`, and their tests `instancemap.testing`.
 """
 
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 _own = Path(__file__).resolve().with_name("framework")
 _found = find_spec("framework")
-if _found is None or str(_own) not in [str(Path(place).resolve()) for place in _found.submodule_search_locations or ()]:
+if _found is None or _own not in [Path(path).resolve() for path in _found.submodule_search_locations or ()]:
     raise ImportError(
         f"the package 'framework' at {_found and _found.origin} stands in the way of InstanceMap's own at {_own}: "
         "rename it, or start Python elsewhere"
     )
 
 from framework import __version__
-from framework.api import *
-from framework.api import __all__ as _api
-from framework.config.validation import check_bounds
-from framework.data import Bool, Float32, Float64, FrameTruth, Int32, Int64, SceneTruth, SurfaceView, UInt8
-from framework.datasets.frames.sequence_reader import TO_THE_END, choose_frames
-from framework.files.search_paths import folder_of
-from framework.geometry import back_project, exp_se3, inverse, project, transform
-from framework.mapping.instance_map import InstanceMap
-from framework.mapping.instances.association import Association
-from framework.mapping.labels.label_evidence_kernels import Combine
-from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
-from framework.mapping.labels.pixel_lists import list_points_by_pixel
-from framework.refinement.selection import keep_points
-from framework.registry import assemble
+from framework.runtime.process_settings import configure_process
 
-__all__ = [
-    *_api,
-    "TO_THE_END",
-    "Association",
-    "Bool",
-    "Combine",
-    "Float32",
-    "Float64",
-    "FrameTruth",
-    "InstanceMap",
-    "Int32",
-    "Int64",
-    "LabelRule",
-    "LabeledVoxels",
-    "SceneTruth",
-    "SurfaceView",
-    "UInt8",
-    "assemble",
-    "back_project",
-    "check_bounds",
-    "choose_frames",
-    "exp_se3",
-    "folder_of",
-    "inverse",
-    "keep_points",
-    "list_points_by_pixel",
-    "project",
-    "transform",
-    "vote_for_best",
-]
 __path__ = [str(_own / "testing" / "public")]  # the folder of the submodule instancemap.testing
+_SHARED_WITH_PLUGINS = {
+    "Association": "framework.mapping.instances.association",
+    "Bool": "framework.data",
+    "Combine": "framework.mapping.labels.label_evidence_kernels",
+    "Float32": "framework.data",
+    "Float64": "framework.data",
+    "FrameTruth": "framework.data",
+    "InstanceMap": "framework.mapping.instance_map",
+    "Int32": "framework.data",
+    "Int64": "framework.data",
+    "LabelRule": "framework.mapping.labels.label_rule",
+    "LabeledVoxels": "framework.mapping.labels.label_rule",
+    "SceneTruth": "framework.data",
+    "SurfaceView": "framework.data",
+    "TO_THE_END": "framework.datasets.frames.sequence_reader",
+    "UInt8": "framework.data",
+    "assemble": "framework.registry",
+    "back_project": "framework.geometry",
+    "check_bounds": "framework.config.validation",
+    "choose_frames": "framework.datasets.frames.sequence_reader",
+    "exp_se3": "framework.geometry",
+    "folder_of": "framework.files.search_paths",
+    "inverse": "framework.geometry",
+    "keep_points": "framework.refinement.selection",
+    "list_points_by_pixel": "framework.mapping.labels.pixel_lists",
+    "project": "framework.geometry",
+    "transform": "framework.geometry",
+    "vote_for_best": "framework.mapping.labels.label_rule",
+}
+"""Modules of the names that plugins use, in addition to those of framework.api."""
+
+if TYPE_CHECKING:
+    from framework.api import *
+    from framework.api import __all__
+    from framework.config.validation import check_bounds
+    from framework.data import Bool, Float32, Float64, FrameTruth, Int32, Int64, SceneTruth, SurfaceView, UInt8
+    from framework.datasets.frames.sequence_reader import TO_THE_END, choose_frames
+    from framework.files.search_paths import folder_of
+    from framework.geometry import back_project, exp_se3, inverse, project, transform
+    from framework.mapping.instance_map import InstanceMap
+    from framework.mapping.instances.association import Association
+    from framework.mapping.labels.label_evidence_kernels import Combine
+    from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
+    from framework.mapping.labels.pixel_lists import list_points_by_pixel
+    from framework.refinement.selection import keep_points
+    from framework.registry import assemble
+
+
+def __getattr__(name: str) -> Any:
+    """Import the libraries with the first name that needs them, so that `configure_process` can run before."""
+    if name in _SHARED_WITH_PLUGINS:
+        return getattr(import_module(_SHARED_WITH_PLUGINS[name]), name)
+    if name == "__all__" or not name.startswith("_"):
+        from framework import api
+
+        if name == "__all__":
+            return [*api.__all__, *_SHARED_WITH_PLUGINS]
+        if name in api.__all__:
+            return getattr(api, name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return [*globals(), *__getattr__("__all__")]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -46,7 +45,8 @@ from framework.queries.map_queries import Map
 from framework.queries.text_search import Match, QueryResult, TextQuery, search
 from framework.registry import build
 from framework.runs.stored_runs import KEYFRAMES, MAP
-from framework.runtime.process_settings import Settings
+from framework.runtime.cpu_budget import limited_threads
+from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
 from framework.tracking.keyframes_file import read_keyframes
 
@@ -78,6 +78,7 @@ __all__ = [
     "SceneMap",
     "View",
     "Viewer",
+    "configure_process",
     "export",
     "load_map",
     "open_dataset",
@@ -124,7 +125,6 @@ def begin(config: DictConfig) -> Pipeline:
     if world is not None:
         begin_in(pipeline, checked_path("localize_in", world))
     compile_for_run()
-    gc.collect()  # of itself, it would stop one of the first hundreds of frames for longer than they take
     return pipeline
 
 
@@ -164,7 +164,7 @@ class Mapper(Map):
             if override.lstrip("+~").startswith(("dataset", "hydra", "experiment", "sequences", "launcher")):
                 raise ConfigError(f"Mapper: {override} is of a run on the command line; here the frames are yours")
         config = composed("~dataset", *words)
-        Settings.of(config).apply()
+        self._threads = Settings.of(config).threads
         self.pipeline = begin(config)
         warn_outside_domain(self.pipeline.detector, None)
         super().__init__(self.pipeline.fuser.scene)
@@ -196,7 +196,7 @@ class Mapper(Map):
         cannot be used, as one without a pose where poses are given, which leaves the map as it was, DataError for
         arrays that are no frame, and MapFullError at the end of `fuser.max_blocks`.
         """
-        with self.lock:
+        with self.lock, limited_threads(self._threads):
             frame = color if isinstance(color, Frame) else self._frame(color, depth, pose, camera, timestamp, up)
             self._camera = frame.camera
             self._frames += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import gc
+import logging
 import signal
 import time
 from collections.abc import Generator, Iterator, Mapping
@@ -29,13 +29,19 @@ from framework.interfaces import (
 from framework.live_view.guarded_viewer import GuardedViewer
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
-from framework.runtime.cpu_budget import CoreSharing
+from framework.runtime.cpu_budget import CoreSharing, parallel_kernels_are_thread_safe
 from framework.runtime.frame_stream import FrameStream, stream_of
 from framework.runtime.prefetch import Turns, map_ahead
 from framework.runtime.run_log import Journal, RunResult, StageTime
 from framework.runtime.signals import Interruption, signals_deferred
 
+log = logging.getLogger(__name__)
+
 WITHOUT_POSES = "add the sequence's poses, or choose a tracker that needs none, tracker=voxel_hashing_icp"
+WITHOUT_THREADS = (
+    "numba's threading layer is not thread-safe, so detection runs in the calling thread; call"
+    " instancemap.configure_process() before numba is imported"
+)
 
 
 @dataclass
@@ -85,7 +91,6 @@ class Pipeline:
         with (
             watched(self.viewer, self.fuser.scene, video.name, directory),
             journal,
-            sparing_what_is_there(),
             signals_deferred(signal.SIGINT) as interruption,
         ):
             try:
@@ -135,8 +140,12 @@ class Pipeline:
 
     def map_all(self, video: RGBDVideo, journal: Journal, interruption: Interruption) -> None:
         """The loop. Raises Interrupted between two frames when a signal has asked for it."""
-        sharing = CoreSharing(with_a_thread_ahead=self.prefetch > 0)
-        with closing(self.detect_ahead(video, journal, interruption, sharing)) as detected:
+        prefetch = self.prefetch
+        if prefetch > 0 and not parallel_kernels_are_thread_safe():
+            log.info(WITHOUT_THREADS)
+            prefetch = 0
+        sharing = CoreSharing(with_a_thread_ahead=prefetch > 0)
+        with closing(self.detect_ahead(video, journal, interruption, sharing, prefetch)) as detected:
             for frame, detections in detected:
                 with sharing.mapping():
                     self.map_and_show(frame, detections, journal)
@@ -157,7 +166,7 @@ class Pipeline:
         self.viewer.skip(str(error))
 
     def detect_ahead(
-        self, video: RGBDVideo, journal: Journal, interruption: Interruption, sharing: CoreSharing
+        self, video: RGBDVideo, journal: Journal, interruption: Interruption, sharing: CoreSharing, prefetch: int
     ) -> Generator[tuple[Frame, Detections]]:
         """The frames with their detections, in order and without those that cannot be used.
 
@@ -166,7 +175,7 @@ class Pipeline:
         video meanwhile is dropped, but for the newest frame.
         """
         stream = stream_of(video, lambda: interruption.asked is not None)
-        prefetch = self.prefetch if stream.most_ahead is None else min(self.prefetch, stream.most_ahead)
+        prefetch = prefetch if stream.most_ahead is None else min(prefetch, stream.most_ahead)
         workers = max(1, min(prefetch, sharing.cores)) if self.detector.concurrent else 1
         turns = Turns()
 
@@ -243,19 +252,3 @@ def watched(viewer: Viewer, scene: SceneMap, video: str, directory: Path) -> Ite
         yield
     finally:
         viewer.end()
-
-
-@contextmanager
-def sparing_what_is_there() -> Iterator[None]:
-    """Has Python's garbage collector go through nothing that is older than this, unless somebody else has seen to that.
-
-    The 300,000 objects of the imported libraries take it 40 ms, longer than a frame, and one frame would wait for it.
-    """
-    if gc.get_freeze_count():
-        yield
-        return
-    gc.freeze()
-    try:
-        yield
-    finally:
-        gc.unfreeze()

@@ -15,18 +15,16 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, TypeGuard, TypeVar, get_args, get_origin, get_type_hints
 
-from hydra._internal.config_repository import CachingConfigRepository
-from hydra._internal.defaults_list import create_defaults_list
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import DictConfig, ListConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.config.composition import config_directory
+from framework.config.composition import config_loader, running_loader
+from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
 from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError, InstanceMapError
-from framework.files.search_paths import CONF, PROJECT_ROOT
+from framework.files.search_paths import PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
 
 STAGES: Mapping[str, type[Any]] = {
@@ -126,14 +124,12 @@ def _refuse_unregistered(loader: Any, stage: str, target: str) -> None:
 @contextmanager
 def _options_loader() -> Iterator[Any]:
     """The loader of the Hydra that runs, where our configs are on its search path; else one for our configs."""
-    if GlobalHydra.instance().is_initialized():
-        loader = GlobalHydra.instance().config_loader()
-        paths = [str(element.path).removeprefix("file://") for element in loader.get_search_path().get_path()]
-        if str(CONF) in paths:
-            yield loader
-            return
-    with config_directory():
-        yield GlobalHydra.instance().config_loader()
+    running = running_loader()
+    if running is not None:
+        yield running
+        return
+    with config_loader() as loader:
+        yield loader
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:

@@ -21,7 +21,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.config.composition import InstalledConfigs, add_config_dir, one_line
+from framework.config.composition import FileConfigSource, InstalledConfigs, add_config_dir, one_line
+from framework.config.hydra_api import replace_file_source
 from framework.errors import ConfigError, InstanceMapError, PartialRunError
 from framework.runtime.signals import Interrupted
 
@@ -43,6 +44,7 @@ def directory_name(overrides: str) -> str:
     return f"{name[:180]}_{hashlib.sha256(name.encode()).hexdigest()[:16]}"
 
 
+replace_file_source(FileConfigSource)
 OmegaConf.register_new_resolver("directory_name", directory_name, replace=True)
 
 

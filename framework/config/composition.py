@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator
 from contextlib import contextmanager
+from copy import deepcopy
 from difflib import get_close_matches
 from functools import cache
 from importlib.metadata import entry_points
@@ -12,18 +13,16 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from hydra import compose, initialize_config_dir
-from hydra._internal.core_plugins import file_config_source
-from hydra._internal.sources_registry import SourcesRegistry
-from hydra.core.config_search_path import ConfigSearchPath, SearchPathQuery
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.plugins import Plugins
+from hydra.core.config_search_path import ConfigSearchPath
+from hydra.core.config_store import ConfigStore
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from hydra.plugins.config_source import ConfigResult
 from hydra.plugins.search_path_plugin import SearchPathPlugin
-from omegaconf import DictConfig, ListConfig
+from hydra.types import RunMode
+from omegaconf import DictConfig, ListConfig, open_dict
 from omegaconf.errors import ConfigAttributeError, ConfigKeyError, InterpolationResolutionError, OmegaConfBaseException
 
+from framework.config import hydra_api
 from framework.config.renamed_keys import rename_hint
 from framework.errors import ConfigError, DataError, printable
 from framework.files.atomic_write import read_text
@@ -33,11 +32,11 @@ from framework.files.yaml_file import LARGEST_FILE, check_yaml, yaml_faults
 log = logging.getLogger(__name__)
 
 
-def composed(*overrides: str, name: str = "config") -> DictConfig:
-    """A main config with these overrides. Raises ConfigError for a name or a value that there is not."""
+def composed(*overrides: str) -> DictConfig:
+    """The main config with these overrides. Raises ConfigError for a name or a value that there is not."""
     try:
-        with config_directory():
-            return compose(name, [*overrides])
+        with config_loader() as loader:
+            return loader.compose([*overrides])
     except (HydraException, OmegaConfBaseException, ValueError) as error:  # Hydra answers some faults with ValueError
         raise ConfigError(one_line(error)) from error
 
@@ -83,7 +82,7 @@ class InstalledConfigs(SearchPathPlugin):
             search_path.append(provider=package, path=f"file://{folder}")
 
 
-class FileConfigSource(file_config_source.FileConfigSource):
+class FileConfigSource(hydra_api.FileConfigSource):
     """Hydra's own reader of YAML in folders, but files are checked first. Hydra tells sources apart by their name."""
 
     def load_config(self, config_path: str) -> ConfigResult:
@@ -101,29 +100,75 @@ class FileConfigSource(file_config_source.FileConfigSource):
         return found
 
 
-Plugins.instance()  # registers Hydra's own sources
-SourcesRegistry.instance().types[FileConfigSource.scheme()] = FileConfigSource
+class HydraNodes(hydra_api.StructuredConfigSource):
+    """Hydra's own structured nodes, but nothing that the host has stored.
+
+    Hydra adds the basic launcher and sweeper only when it scans its plugins, which changes the host's store.
+    """
+
+    def __init__(self, provider: str, path: str) -> None:
+        super().__init__(provider, path)
+        self.store = object.__new__(ConfigStore)  # the class itself returns the host's
+        self.store.repo = {"hydra": deepcopy(ConfigStore.instance().repo["hydra"])}
+        for part in ("launcher", "sweeper"):
+            if "basic.yaml" not in self.store.repo["hydra"].get(part, {}):
+                self.store.store("basic", {}, f"hydra/{part}")
+
+
+HydraNodes.__name__ = "StructuredConfigSource"  # by which Hydra tells the schema's source
+
+
+class Repository(hydra_api.ConfigRepository):
+    """Finds configs in folders, packages and Hydra's own structured nodes, without Hydra's registries."""
+
+    def initialize_sources(self, config_search_path: ConfigSearchPath) -> None:
+        kinds = (FileConfigSource, hydra_api.ImportlibResourcesConfigSource, HydraNodes)
+        by_scheme = {kind.scheme(): kind for kind in kinds}
+        self.sources = [
+            by_scheme[self._get_scheme(str(element.path))](str(element.provider), str(element.path))
+            for element in config_search_path.get_path()
+        ]
+
+
+class ConfigLoader(hydra_api.ConfigLoaderImpl):
+    """Composes our configs, and those of the added folders, without Hydra's process-wide state."""
+
+    def __init__(self) -> None:
+        path = hydra_api.ConfigSearchPathImpl()
+        path.append("hydra", "pkg://hydra.conf")
+        path.append("main", f"file://{CONF}")
+        for plugin in hydra_api.search_path_plugins():
+            plugin().manipulate_search_path(path)
+        known = {element.path for element in path.get_path()}
+        for folder, provider in (installed_config_dirs() | dict.fromkeys(_added, "command-line")).items():
+            if f"file://{folder}" not in known:
+                path.append(provider, f"file://{folder}")
+        path.append("schema", "structured://")  # Hydra expects it last
+        self.config_search_path = path
+        self.repository = Repository(path)
+
+    def compose(self, overrides: list[str]) -> DictConfig:
+        """Return the main config without Hydra's part. Raises HydraException."""
+        config = self.load_configuration("config", overrides, RunMode.RUN, from_shell=False)
+        with open_dict(config):
+            del config["hydra"]
+        return config
 
 
 @contextmanager
-def config_directory() -> Iterator[None]:
-    """Has Hydra compose from our configs and the added ones, also inside of another program that uses it for itself."""
-    outer = GlobalHydra.instance().hydra
-    GlobalHydra.instance().clear()
-    try:
-        with initialize_config_dir(str(CONF), version_base="1.3"):
-            loader: Any = GlobalHydra.instance().config_loader()
-            known = {element.path for element in loader.get_search_path().get_path()}
-            folders = installed_config_dirs() | dict.fromkeys(_added, "command-line")
-            before = SearchPathQuery(provider="schema")  # which must stay the last, as Hydra's own --config-dir does it
-            for folder, provider in folders.items():
-                if f"file://{folder}" not in known:
-                    loader.get_search_path().prepend(provider=provider, path=f"file://{folder}", anchor=before)
-            if folders:
-                loader.repository.initialize_sources(loader.get_search_path())
-            yield
-    finally:
-        GlobalHydra.instance().hydra = outer
+def config_loader() -> Iterator[ConfigLoader]:
+    """The loader of our configs; while the body runs, Hydra has the version base that they are written for."""
+    with hydra_api.version_base("1.3"):
+        yield ConfigLoader()
+
+
+def running_loader() -> Any | None:
+    """The loader of the Hydra application that runs in this process, if our configs are on its search path."""
+    hydra = hydra_api.running()
+    if hydra is None:
+        return None
+    paths = [str(element.path).removeprefix("file://") for element in hydra.config_loader.get_search_path().get_path()]
+    return hydra.config_loader if str(CONF) in paths else None
 
 
 def one_line(error: BaseException) -> str:

@@ -34,6 +34,44 @@ def stand_back() -> None:
         os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), STANDING_BACK)
 
 
+def parallel_kernels_are_thread_safe() -> bool:
+    """Return whether two threads may run parallel kernels at the same time.
+
+    numba's workqueue layer ends the process when they do. numba picks a layer when it starts its threads, as here.
+    """
+    numba.get_num_threads()
+    return str(numba.threading_layer()) in ("omp", "tbb")
+
+
+@contextmanager
+def kernel_threads(threads: int) -> Iterator[None]:
+    """Run the kernels that the calling thread calls with this number of threads."""
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
+
+
+@contextmanager
+def limited_threads(threads: int) -> Iterator[None]:
+    """Limit the kernels and torch networks that the calling thread runs; 0 = no limit."""
+    if threads == 0:
+        yield
+        return
+    torch = sys.modules.get("torch")
+    before = torch.get_num_threads() if torch else 0
+    with kernel_threads(min(threads, numba.config.NUMBA_NUM_THREADS)):
+        if torch:
+            torch.set_num_threads(threads)
+        try:
+            yield
+        finally:
+            if torch:
+                torch.set_num_threads(before)
+
+
 class CoreSharing:
     """How many threads the kernels of either side have, by what the latest frames have cost it."""
 
@@ -47,7 +85,7 @@ class CoreSharing:
     @contextmanager
     def ahead(self, workers: int = 1) -> Iterator[None]:
         """Around what one of so many workers does ahead with one frame."""
-        with self._with_threads(self.cores if self._alone else max(self.cores_ahead() // workers, 1)):
+        with kernel_threads(self.cores if self._alone else max(self.cores_ahead() // workers, 1)):
             began = time.thread_time()
             yield
             self._note(self._ahead, time.thread_time() - began)
@@ -56,7 +94,7 @@ class CoreSharing:
     def mapping(self) -> Iterator[None]:
         """Around the mapping of one frame."""
         threads = self.cores if self._alone else max(self.cores - self.cores_ahead(), 1)
-        with self._with_threads(threads):
+        with kernel_threads(threads):
             began = time.thread_time()
             yield
             self._note(self._mapping, threads * (time.thread_time() - began))
@@ -75,13 +113,3 @@ class CoreSharing:
     def _note(self, spent: deque[float], seconds: float) -> None:
         with self._lock:
             spent.append(seconds)
-
-    @contextmanager
-    def _with_threads(self, threads: int) -> Iterator[None]:
-        """For the kernels that the calling thread calls."""
-        before = numba.get_num_threads()
-        numba.set_num_threads(threads)
-        try:
-            yield
-        finally:
-            numba.set_num_threads(before)

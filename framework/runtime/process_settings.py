@@ -1,23 +1,101 @@
-"""What the top of a config says to all stages: seed, device and threads."""
+"""Process-wide settings: environment, threads, seeds, memory. The command line applies them; a library must not."""
 
 from __future__ import annotations
 
+import atexit
+import gc
+import logging
 import os
 import random
+import shutil
 import sys
-from collections.abc import Callable
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.abc import MetaPathFinder
-from importlib.machinery import ModuleSpec
-from types import ModuleType
-from typing import Any
-
-from omegaconf import DictConfig
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from framework.errors import ConfigError
 
+if TYPE_CHECKING:
+    from omegaconf import DictConfig
+
+log = logging.getLogger(__name__)
+
 MOST = {"seed": 2**63 - 1, "threads": 4096, "prefetch": 1000}  # torch takes no larger seed; no machine has more cores
 DEVICES = ("auto", "cpu", "cuda")
+
+ENVIRONMENT = {
+    # The detection threads and the mapping thread launch parallel kernels at the same time. Of numba's threading layers
+    # only OpenMP and TBB support that. OpenMP is always installed, because torch requires it.
+    "NUMBA_THREADING_LAYER": "omp",
+    # Idle OpenMP threads spin by default and take the cores from other threads. A few microseconds of spinning pay off
+    # between the kernels of one stage.
+    "OMP_WAIT_POLICY": "passive",
+    "GOMP_SPINCOUNT": "10000",
+    # Threads of OpenBLAS (numpy, scipy and OpenCV each bring a copy) spin for 2^26 cycles by default. Those of OpenCV
+    # took a core for 30 ms after each keyframe. The value is the exponent.
+    "OPENBLAS_THREAD_TIMEOUT": "14",
+}
+"""Environment variables that libraries read when they are loaded; values that the user has set are kept."""
+
+
+def set_environment() -> None:
+    """Set ENVIRONMENT in this process. It takes effect only before numpy and numba are imported.
+
+    numba stores compiled kernels next to the code or in the user's cache, and fails where it can write to neither, such
+    as in a read-only container. There, this process gets a temporary cache with an unpredictable name.
+    """
+    for name, value in ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
+    home = os.environ.get("XDG_CACHE_HOME") or os.environ.get("HOME") or os.environ.get("USERPROFILE") or "/"
+    if "NUMBA_CACHE_DIR" not in os.environ and not any(map(_is_writable, (Path(__file__).parent, Path(home)))):
+        os.environ["NUMBA_CACHE_DIR"] = tempfile.mkdtemp(prefix="instancemap-kernels-")
+        atexit.register(shutil.rmtree, os.environ["NUMBA_CACHE_DIR"], ignore_errors=True)
+
+
+def _is_writable(folder: Path) -> bool:
+    """Return whether the folder, or its nearest existing parent, can be written."""
+    existing = next((path for path in (folder, *folder.parents) if path.exists()), Path())
+    return os.access(existing, os.W_OK)
+
+
+def configure_process(threads: int = 0, seed: int | None = None) -> None:
+    """Apply the process-wide settings of the command line to this process.
+
+    `import instancemap`, `Mapper` and `Pipeline` change nothing process-wide. Call this function at the start of a
+    program that may do so: detection then runs in parallel with mapping on every platform, and frames take less time.
+
+        import instancemap
+
+        instancemap.configure_process()
+        from instancemap import Mapper
+
+    It sets environment variables (`NUMBA_THREADING_LAYER`, `OMP_WAIT_POLICY`, `GOMP_SPINCOUNT`,
+    `OPENBLAS_THREAD_TIMEOUT`, `OMP_NUM_THREADS`), the thread counts of numba, OpenCV, torch, OpenMP and BLAS, and the
+    malloc thresholds of glibc. Libraries read the environment when they are loaded, so call it before you import numpy
+    or numba; otherwise a warning lists the variables without effect.
+
+    Args:
+        threads: Threads of each library; 0 = all cores of this process.
+        seed: Seed of the global generators of Python, numpy and torch (if loaded); None = leave them as they are.
+
+    Raises:
+        ConfigError: `threads` or `seed` is out of range.
+    """
+    settings = Settings(0 if seed is None else seed, "auto", threads)
+    late = [name for name in ENVIRONMENT if name not in os.environ] if {"numpy", "numba"} & sys.modules.keys() else []
+    set_environment()
+    if late:
+        log.warning(
+            "configure_process: expected a call before numpy and numba are imported; %s may have no effect: call it"
+            " before these imports, or set the variables before Python starts",
+            ", ".join(late),
+        )
+    settings.limit_threads()
+    if seed is not None:
+        settings.seed_generators()
 
 
 def available_cores() -> int:
@@ -48,60 +126,52 @@ class Settings:
         return cls(seed=config.seed, device=config.device, threads=config.threads, prefetch=prefetch)
 
     def apply(self) -> None:
-        """Limits the threads of the libraries, and seeds the random states that they keep for themselves.
+        """Limit the threads of the libraries and seed their global generators, in a process of the command line.
 
-        The project's own code draws from generators seeded with `seed`; this is for what third-party plugins do.
-        Open3D's own (TBB) threads have no switch: only the affinity of the process limits them.
+        The project's own code draws from generators seeded with `seed`; the global ones are for third-party plugins.
+        Call it again when the stages are built: torch is only configured if it is loaded, which takes seconds.
         """
+        self.limit_threads()
+        self.seed_generators()
+
+    def limit_threads(self) -> None:
+        """Open3D's own (TBB) threads have no switch: only the affinity of the process limits them."""
         import cv2
         import numba
-        import numpy as np
         from threadpoolctl import threadpool_limits
 
+        from framework.runtime.memory import keep_freed_memory
+
+        keep_freed_memory()
         threads = self.threads or available_cores()
         numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
         cv2.setNumThreads(threads)
         threadpool_limits(threads)  # OpenMP and BLAS, as far as they are loaded
+        os.environ["OMP_NUM_THREADS"] = str(threads)  # libraries that are loaded later, such as torch, read it
+        if torch := sys.modules.get("torch"):
+            torch.set_num_threads(threads)
+
+    def seed_generators(self) -> None:
+        """Seed Python, numpy and, if it is loaded, torch."""
+        import numpy as np
+
         random.seed(self.seed)
         np.random.seed(self.seed % 2**32)  # noqa: NPY002
-        os.environ["OMP_NUM_THREADS"] = str(threads)  # read by those that are loaded later
-
-        def set_up(torch: ModuleType) -> None:
-            torch.set_num_threads(threads)
+        if torch := sys.modules.get("torch"):
             torch.manual_seed(self.seed)
 
-        _once_imported("torch", set_up)  # it takes seconds to load, and many a run needs none
 
+@contextmanager
+def frozen_garbage_collector() -> Iterator[None]:
+    """Exclude all objects that exist now from garbage collection while the body runs, unless some already are.
 
-def _once_imported(name: str, set_up: Callable[[ModuleType], None]) -> None:
-    """Calls `set_up` with the module: at once where it has been imported, else when it is."""
-    for finder in [finder for finder in sys.meta_path if isinstance(finder, _Awaited) and finder.name == name]:
-        sys.meta_path.remove(finder)
-    if name in sys.modules:
-        set_up(sys.modules[name])
-    else:
-        sys.meta_path.insert(0, _Awaited(name, set_up))
-
-
-@dataclass
-class _Awaited(MetaPathFinder):
-    """Finds a module as Python does, and sets it up when it has been executed."""
-
-    name: str
-    set_up: Callable[[ModuleType], None]
-
-    def find_spec(self, fullname: str, path: Any, target: ModuleType | None = None) -> ModuleSpec | None:
-        if fullname != self.name:
-            return None
-        others = (other.find_spec(fullname, path, target) for other in sys.meta_path if other is not self)
-        spec = next(filter(None, others), None)
-        if spec is not None and spec.loader is not None:
-            execute = spec.loader.exec_module
-
-            def execute_and_set_up(module: ModuleType) -> None:  # who only asks for the spec executes nothing
-                sys.meta_path.remove(self)
-                execute(module)
-                self.set_up(module)
-
-            spec.loader.exec_module = execute_and_set_up  # type: ignore[method-assign]
-        return spec
+    The 300,000 objects of the imported libraries take the collector 40 ms, longer than a frame.
+    """
+    if gc.get_freeze_count():
+        yield
+        return
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()

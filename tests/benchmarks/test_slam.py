@@ -17,8 +17,8 @@ from framework.data import Detections, Float64, Frame, Pose
 from framework.datasets.rgbd_folder import RgbdFolder
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse
-from framework.pipeline import sparing_what_is_there
 from framework.registry import assemble
+from framework.runtime.process_settings import frozen_garbage_collector
 from framework.synthetic.sequence import Synthetic
 from plugins.detectors.ground_truth import GroundTruthDetector
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
@@ -146,7 +146,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
             spent["short"].append(short.seconds["track"] + short.seconds["fuse"])
         return (frame := walk[k], detector.detect(frame)), {}
 
-    with sparing_what_is_there():  # as a run does
+    with frozen_garbage_collector():  # as a run does
         benchmark.pedantic(long, setup=begin_frame, rounds=WALK)
     keep_books()
     drift = np.linalg.norm((inverse(walk[WALK - 1].T_world_camera) @ long.poses[-1].T_world_camera)[:3, 3])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import logging
 import os
 import signal
@@ -303,37 +302,6 @@ def test_runs_outside_the_main_thread(room: CornerRoom) -> None:
     thread.start()
     thread.join()
     assert results[0].frames == 6
-
-
-@dataclass
-class Collecting(GivenPose):
-    """Collects garbage at every frame, and notes how many objects are spared."""
-
-    def __post_init__(self) -> None:
-        self.spared: list[int] = []
-        self.garbage: list[int] = []
-
-    def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        circle: list[object] = []
-        circle.append(circle)
-        del circle
-        self.garbage.append(gc.collect())
-        self.spared.append(gc.get_freeze_count())
-        return super().track(frame, scene)
-
-
-def test_garbage_is_collected_among_what_a_run_makes(room: CornerRoom) -> None:
-    tracker = Collecting()
-    pipeline(tracker=tracker).run(room)
-    assert min(tracker.spared) > 10_000, "what was imported"
-    assert min(tracker.garbage) >= 1
-    assert gc.get_freeze_count() == 0
-    gc.freeze()
-    try:
-        pipeline().run(room)
-        assert gc.get_freeze_count() > 10_000, "as it was"
-    finally:
-        gc.unfreeze()
 
 
 @dataclass

@@ -16,10 +16,11 @@ from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
 from framework.config import composition
-from framework.config.composition import add_config_dir, config_directory
+from framework.config.composition import add_config_dir
 from framework.config.validation import check_bounds
 from framework.data import Detections, Frame
 from framework.errors import ConfigError, DataError
+from framework.files.search_paths import CONF
 from framework.interfaces import Detector, PoseTracker, RGBDSequence, RGBDVideo
 from framework.registry import GROUPS, STAGES, assemble, build, find_class, parameter_fields
 
@@ -240,7 +241,7 @@ def test_what_no_option_registers_is_not_imported(
 ) -> None:
     """The options are those of Hydra's search path, also where a stored config is read and no Hydra runs."""
     monkeypatch.setattr(composition, "_added", [])
-    with config_directory() if hydra_runs else nullcontext():
+    with initialize_config_dir(str(CONF), version_base="1.3") if hydra_runs else nullcontext():
         assert said in fault(_target_=target)
         assert build(Detector, OmegaConf.create({"_target_": "plugins.detectors.none.NoDetections"})).classes
     assert not {"this", "talkative", "talkative.one"} & set(sys.modules)

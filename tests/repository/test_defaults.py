@@ -8,12 +8,12 @@ import zipfile
 from pathlib import Path
 
 import pytest
-from hydra import compose
+from hydra import compose, initialize_config_dir
 from hydra.core.global_hydra import GlobalHydra
 from hydra.types import RunMode
 from omegaconf import DictConfig
 
-from framework.config.composition import composed, config_directory
+from framework.config.composition import composed
 from framework.files.search_paths import CONF, PROJECT_ROOT
 from framework.registry import GROUPS, STAGES
 from framework.reporting.markup import SCRIPTS, STYLE
@@ -29,7 +29,7 @@ TIMED = {"table1_runtime", "figure3_stage_times"}
 
 def chosen(*overrides: str, main: str = "config") -> dict[str, str]:
     """The choices that Hydra makes by these overrides, by group; those of the composed config must agree."""
-    with config_directory():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         config: DictConfig = compose(main, [*overrides], return_hydra_config=True)
     choices = {stage: str(config.hydra.runtime.choices[stage]) for stage in ("dataset", "detector")}
     node = registered.composed("detector", choices["detector"]).detector
@@ -82,7 +82,7 @@ def test_without_a_dataset_as_from_python_it_is_the_one_of_photographs() -> None
 
 def test_each_job_of_a_sweep_over_datasets_has_its_own_default() -> None:
     """The launcher composes each job from the sweep's own config and the job's overrides."""
-    with config_directory():
+    with initialize_config_dir(str(CONF), version_base="1.3"):
         loader = GlobalHydra.instance().config_loader()
         sweep = loader.load_configuration("config", ["dataset=synthetic,rgbd_folder"], RunMode.MULTIRUN)
         jobs = [loader.load_sweep_config(sweep, [f"dataset={name}"]) for name in ("synthetic", "rgbd_folder")]

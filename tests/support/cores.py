@@ -10,6 +10,8 @@ import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from framework.runtime.process_settings import set_environment
+
 ALL = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
 
 
@@ -37,3 +39,4 @@ def all_cores() -> Iterator[None]:
 
 
 _share_among_processes()
+set_environment()  # as the command line does

@@ -17,14 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hydra._internal.config_repository import CachingConfigRepository
-from hydra.core.global_hydra import GlobalHydra
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from framework.commands.command_line import arguments, one_line_errors
-from framework.config.composition import config_directory, one_line
+from framework.config.composition import config_loader, one_line
+from framework.config.hydra_api import CachingConfigRepository
 from framework.errors import ConfigError, DataError
 from framework.registry import (
     GROUPS,
@@ -64,8 +63,7 @@ class Option:
 
 def registered(*stages: str, only: str | None = None) -> list[Option]:
     """The options of these config groups, by stage and name, or those with the name that is asked for."""
-    with config_directory():
-        loader: Any = GlobalHydra.instance().config_loader()
+    with config_loader() as loader:
         files = CachingConfigRepository(loader.repository)  # of all options: they share most of what they are made of
         return [
             _option(files, stage, name)
@@ -77,8 +75,8 @@ def registered(*stages: str, only: str | None = None) -> list[Option]:
 
 def options_of(stage: str) -> list[str]:
     """The names of the stage's options, whether they can be used or not."""
-    with config_directory():
-        return list(GlobalHydra.instance().config_loader().get_group_options(stage))
+    with config_loader() as loader:
+        return list(loader.get_group_options(stage))
 
 
 def _option(files: CachingConfigRepository, stage: str, name: str) -> Option:

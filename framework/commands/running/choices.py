@@ -6,12 +6,11 @@ from collections.abc import Collection, Sequence
 from difflib import get_close_matches
 from math import prod
 
-from hydra import compose
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, ValueType
 from hydra.errors import HydraException
 
-from framework.config.composition import config_directory
+from framework.config.composition import config_loader
 from framework.errors import ConfigError
 
 MANY = 1_000_000  # where glob() asks the disk
@@ -57,8 +56,8 @@ def fault_of_first_run(words: Sequence[str]) -> HydraException | None:
     """
     overrides = [word for word in words if word.startswith("~") or ("=" in word and not word.startswith("-"))]
     try:
-        with config_directory():
-            compose("config", single_run(overrides))
+        with config_loader() as loader:
+            loader.compose(single_run(overrides))
     except HydraException as error:
         return error
     return None

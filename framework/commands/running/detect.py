@@ -47,9 +47,11 @@ def job(config: DictConfig) -> None:
     from framework.runtime.process_settings import Settings
     from framework.vocabulary.label_spaces import COCO
 
-    Settings.of(config).apply()
+    settings = Settings.of(config)
+    settings.apply()
     sequence = build(RGBDSequence, config.dataset)
     detector = with_cache(build(Detector, config.detector), config)
+    settings.apply()  # to torch, if the detector has loaded it
     write_detections(out, detector, sequence)
     how = f"detector=precomputed detector.path={out}"
     if detector.classes != COCO:

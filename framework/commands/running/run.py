@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import sys
 from collections.abc import Mapping
@@ -66,10 +67,13 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
     from framework.interfaces import RGBDSequence, RGBDVideo
     from framework.registry import STAGES, build
     from framework.runs.run_directory import RunRecord, reason
-    from framework.runtime.process_settings import Settings
+    from framework.runtime.process_settings import Settings, frozen_garbage_collector
 
-    Settings.of(config).apply()
+    settings = Settings.of(config)
+    settings.apply()
     pipeline = begin(config)
+    settings.apply()  # to torch, if a stage has loaded it
+    gc.collect()  # of itself, it would stop one of the first hundreds of frames for longer than they take
     video = build(RGBDVideo, config.get("dataset"))  # after the stages: making up a room takes longest
     compile_for_run()  # what renders it
     record = RunRecord.begin(directory, config, choices)
@@ -81,7 +85,8 @@ def run(config: DictConfig, directory: Path, choices: Mapping[str, str | None]) 
 
         warn_of_poses(video)
     with signals_deferred(*ENDING) as interruption:
-        result = pipeline.run_to_any_end(video, directory)
+        with frozen_garbage_collector():
+            result = pipeline.run_to_any_end(video, directory)
         with interruption.second_ends_at_once("once the record is written"):
             fault = record.write(video, result, cache_metrics(pipeline.detector))
     if fault is None:

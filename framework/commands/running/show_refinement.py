@@ -42,9 +42,11 @@ def job(config: DictConfig) -> None:
     from framework.registry import build  # here, so that such faults are answered before the heavy libraries load
     from framework.runtime.process_settings import Settings
 
-    Settings.of(config).apply()
+    settings = Settings.of(config)
+    settings.apply()
     sequence = build(RGBDSequence, config.dataset)
     detector = with_cache(build(Detector, config.detector), config)
+    settings.apply()  # to torch, if the detector has loaded it
     refiner = build(ClusterRefiner, config.refiner)
     position, frame, detections = detected(sequence, detector, config.frame)
     if len(detections) == 0:

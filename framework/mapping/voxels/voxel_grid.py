@@ -26,7 +26,7 @@ import numpy.typing as npt
 from framework.data import Int32, UInt8
 from framework.errors import MapFullError
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS, NO_KEY, insert_blocks, rehash
-from framework.runtime.memory import PagesAhead, keep_freed_memory
+from framework.runtime.memory import PagesAhead
 
 try:
     import resource
@@ -95,7 +95,6 @@ class VoxelGrid:
     """Owns the arrays of the grid and makes them grow. The kernels work on `self.grid`."""
 
     def __init__(self, voxel_size: float, max_truncation: float, max_blocks: int) -> None:
-        keep_freed_memory()
         self.max_blocks = max_blocks
         self.block_count = 0
         self.region_count = 0

@@ -105,9 +105,9 @@ def test_a_process_that_forked_asks_a_thread_of_its_own() -> None:
 FAULTS = """
 import os, resource, sys
 import numpy as np
-from framework.mapping.voxels.voxel_grid import VoxelGrid
+from framework.runtime.memory import keep_freed_memory
 if sys.argv[1] == "kept":
-    VoxelGrid(0.01, 0.05, 10)
+    keep_freed_memory()
 for k in range(20):
     if k == 10:
         before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt

@@ -1,0 +1,71 @@
+"""The private parts of Hydra that this project uses. All other modules import them from here.
+
+Tested with the versions in TESTED; `hydra-core>=1.3.8,<1.4` in pyproject.toml has to match them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import RLock
+from typing import Any
+
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.config_repository import CachingConfigRepository, ConfigRepository
+from hydra._internal.config_search_path_impl import ConfigSearchPathImpl
+from hydra._internal.core_plugins.file_config_source import FileConfigSource
+from hydra._internal.core_plugins.importlib_resources_config_source import ImportlibResourcesConfigSource
+from hydra._internal.core_plugins.structured_config_source import StructuredConfigSource
+from hydra._internal.defaults_list import create_defaults_list
+from hydra._internal.sources_registry import SourcesRegistry
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.plugins import Plugins
+from hydra.core.singleton import Singleton
+from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.version import VersionBase, setbase
+
+__all__ = [
+    "CachingConfigRepository",
+    "ConfigLoaderImpl",
+    "ConfigRepository",
+    "ConfigSearchPathImpl",
+    "FileConfigSource",
+    "ImportlibResourcesConfigSource",
+    "StructuredConfigSource",
+    "create_defaults_list",
+]
+
+TESTED = ("1.3.8",)
+
+_composing = RLock()
+
+
+@contextmanager
+def version_base(version: str) -> Iterator[None]:
+    """Give Hydra this version base while the body runs; the host's is restored."""
+    with _composing:
+        before = Singleton._instances.pop(VersionBase, None)
+        setbase(version)
+        try:
+            yield
+        finally:
+            del Singleton._instances[VersionBase]
+            if before is not None:
+                Singleton._instances[VersionBase] = before
+
+
+def running() -> Any | None:
+    """The Hydra application that runs in this process; unlike GlobalHydra.instance(), this creates nothing."""
+    return getattr(Singleton._instances.get(GlobalHydra), "hydra", None)
+
+
+def search_path_plugins() -> list[Any]:
+    """The search path plugins that Hydra has found, in a process that has had it look for plugins."""
+    plugins: Any = Singleton._instances.get(Plugins)
+    return [] if plugins is None else list(plugins.discover(SearchPathPlugin))
+
+
+def replace_file_source(source: type[FileConfigSource]) -> None:
+    """Make this process's Hydra read YAML files with `source`. Only for a process of the command line."""
+    Plugins.instance()  # registers Hydra's own sources
+    SourcesRegistry.instance().types[source.scheme()] = source
