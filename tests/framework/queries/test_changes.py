@@ -178,7 +178,7 @@ def test_the_command_lists_changes(
     assert len(written) > 5
     (tmp_path / "second" / "metrics.json").unlink()
     assert not diff.in_world(tmp_path / "second", tmp_path / "first")
-    (tmp_path / "second" / "config.yaml").write_text(f"world: {tmp_path / 'first'}\n")
+    (tmp_path / "second" / "config.yaml").write_text(f"localize_in: {tmp_path / 'first'}\n")
     assert diff.in_world(tmp_path / "second", tmp_path / "first")
     monkeypatch.setattr("sys.argv", ["instancemap diff", str(tmp_path), str(tmp_path / "second")])
     with pytest.raises(SystemExit):

@@ -181,7 +181,7 @@ def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
     assert not is_recorded(directory, OmegaConf.create(config | changed | about_speed))
     assert caplog.messages == [
         f"run again: the times in {directory} are of other settings or another machine: "
-        "threads=4, ahead=2, detection_cache=off, processor=a, cpus=4"
+        "threads=4, prefetch=2, detection_cache=off, processor=a, cpus=4"
     ]
 
 

@@ -176,7 +176,13 @@ def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
     """With whatever else that changes no result: it is not in the name of a run's directory."""
     _, first = swept(tmp_path, "seed=1,2")
     assert set(first) == {"seed=1,tracker=fake", "seed=2,tracker=fake"}
-    harmless = ("threads=1", "ahead=0", "detection_cache=read_write", f"detection_cache_dir={tmp_path}", "viewer=none")
+    harmless = (
+        "threads=1",
+        "prefetch=0",
+        "detection_cache=read_write",
+        f"detection_cache_dir={tmp_path}",
+        "viewer=none",
+    )
     done, second = swept(tmp_path, "seed=1,2,3", "skip_completed=true", "debug=false", *harmless)
     assert done.stderr.count("kept: the complete record in") == 2
     assert set(second) == {*first, "seed=3,tracker=fake"}
@@ -186,7 +192,7 @@ def test_a_sweep_without_an_experiment_is_resumed(tmp_path: Path) -> None:
 def test_runs_that_differ_in_what_changes_no_result_have_places_of_their_own(tmp_path: Path) -> None:
     """As those of a sweep that times them; workers name them alike."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
-    _, first = swept(tmp_path, "threads=1,2", "ahead=0")
+    _, first = swept(tmp_path, "threads=1,2", "prefetch=0")
     assert set(first) == {"threads=1,tracker=fake", "threads=2,tracker=fake"}
     done, second = swept(tmp_path, "threads=1,2", "skip_completed=true", *BY_JOBLIB)
     assert second == first
