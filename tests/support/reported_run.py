@@ -17,7 +17,7 @@ CONFIG: dict[str, Any] = {
     "seed": 0,
     "device": "cpu",
     "threads": 0,
-    "ahead": 0,
+    "prefetch": 0,
     "detection_cache": "off",
     "dataset": {"_target_": "tests.support.scenes.corner_room.CornerRoom", "frames": 6},
     "detector": {"_target_": "tests.support.scenes.corner_room.SphereDetector"},

@@ -31,7 +31,6 @@ def test_stored_config_old_parameter_names_new_key() -> None:
 def test_configs_contain_no_renamed_key() -> None:
     config = OmegaConf.to_container(composed("dataset=desk"))
     assert isinstance(config, dict)
-    flat = {key for key in config} | {
-        f"{g}.{key}" for g, node in config.items() if isinstance(node, dict) for key in node
-    }
+    groups = {group: node for group, node in config.items() if isinstance(node, dict)}
+    flat = {*config, *(f"{group}.{key}" for group, node in groups.items() for key in node)}
     assert not flat & RENAMED.keys()

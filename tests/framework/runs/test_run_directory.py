@@ -311,7 +311,12 @@ def test_the_headline_tells_what_matters() -> None:
 
 def test_the_config_hash_is_of_what_changes_results() -> None:
     config = {"seed": 0, "fuser": {"voxel_size": 0.01, "block_limit": 9}}
-    same = {"debug": True, "ahead": 0, "hydra": {"run": {"dir": "/x"}}, "fuser": {"block_limit": 9, "voxel_size": 0.01}}
+    same = {
+        "debug": True,
+        "prefetch": 0,
+        "hydra": {"run": {"dir": "/x"}},
+        "fuser": {"block_limit": 9, "voxel_size": 0.01},
+    }
     assert provenance.config_hash(config) == provenance.config_hash(config | same)
     assert provenance.config_hash(config) != provenance.config_hash(config | {"seed": 1})
     assert len(provenance.config_hash(config)) == 64

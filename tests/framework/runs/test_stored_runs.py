@@ -154,7 +154,7 @@ def test_a_record_of_other_code_is_kept_with_a_warning(
     assert "this is abcdef0" in told.getMessage()
 
 
-SETTINGS = {"threads": 4, "ahead": 2, "detection_cache": "off"}
+SETTINGS = {"threads": 4, "prefetch": 2, "detection_cache": "off"}
 MACHINE = {"environment.processor": "a", "environment.cpus": 4}
 
 
@@ -165,7 +165,7 @@ def record_of(directory: Path, config: dict[str, object], monkeypatch: pytest.Mo
     write(directory, config_hash=config_hash(config), inputs_sha256=inputs_sha256(config), **MACHINE)
 
 
-@pytest.mark.parametrize("changed", [{"threads": 1}, {"ahead": 0}, {"detection_cache": "read_write"}])
+@pytest.mark.parametrize("changed", [{"threads": 1}, {"prefetch": 0}, {"detection_cache": "read_write"}])
 def test_times_of_other_settings_are_no_record_of_an_experiment_about_speed(
     directory: Path, changed: dict[str, object], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

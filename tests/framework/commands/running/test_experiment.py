@@ -249,7 +249,7 @@ def test_what_is_wrong_with_a_sweep_is_told_before_its_first_run(
 def test_a_run_without_experiment_is_left_alone() -> None:
     config, choices = composed(["refiner=kmeans"])
     assert "row" not in config
-    assert not config.get("resume")
+    assert not config.get("skip_completed")
     assert choices["refiner"] == "kmeans"
 
 
@@ -258,7 +258,7 @@ def test_what_an_experiment_compares_its_runs_for_changes_no_result() -> None:
         "row": "a",
         "rows": {"a": []},
         "sequences": {"all": "b"},
-        "resume": True,
+        "skip_completed": True,
         "table": {"average_over": ["seed"]},
         "figure": {"zoom": True},
     }
