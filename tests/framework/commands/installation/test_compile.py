@@ -28,9 +28,9 @@ def compiling(cache: Path, *words: str) -> subprocess.Popen[str]:
 
 
 def test_a_second_call_has_nothing_to_compile(tmp_path: Path) -> None:
-    first, _ = compiling(tmp_path, "allocation._unpack", "masks._bounds").communicate()
+    first, _ = compiling(tmp_path, "allocation_kernels.unpack", "binary_masks_kernels.mask_bounds").communicate()
     assert first.startswith("2 of 2 kernels compiled in ")
-    second, _ = compiling(tmp_path, "allocation._unpack", "masks._bounds").communicate()
+    second, _ = compiling(tmp_path, "allocation_kernels.unpack", "binary_masks_kernels.mask_bounds").communicate()
     assert second == "all 2 kernels are compiled\n"
 
 
