@@ -44,7 +44,6 @@ RENAMED = {
     "table.base": "table.baseline",
     "table.by": "table.group_by",
     "table.over": "table.average_over",
-    "tracker.candidates": "tracker.relocalization_candidates",
     "tracker.finest": "tracker.finest_scale",
     "tracker.max_behind": "tracker.max_occluded",
     "viewer.every": "viewer.frame_interval",

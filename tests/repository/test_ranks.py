@@ -42,7 +42,7 @@ def experiment(root: Path, figures: Figures, iou: float = 0.5, scenes: Sequence[
     root.mkdir(parents=True)
     rows = {row: [f"refiner={row}"] for row in figures}
     over = ["seed", "dataset.scene"] if scenes else ["seed"]
-    table = {"over": over, "columns": [AP50]}
+    table = {"average_over": over, "columns": [AP50]}
     (root / "multirun.yaml").write_text(OmegaConf.to_yaml(OmegaConf.create({"table": table, "rows": rows})))
     for row, values in figures.items():
         for k, value in enumerate(values):

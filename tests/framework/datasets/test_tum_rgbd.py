@@ -183,7 +183,7 @@ def test_of_images_with_one_timestamp_the_first_is_taken(folder: Path, caplog: p
 
 
 def test_nothing_that_belongs_together_is_a_fault(folder: Path) -> None:
-    with pytest.raises(DataError, match=r"within dataset\.max_difference \(0\.01 s\)"):
+    with pytest.raises(DataError, match=r"within dataset\.max_time_difference \(0\.01 s\)"):
         TumRgbd(folder, max_time_difference=0.01)
 
 
@@ -300,5 +300,5 @@ def test_images_of_another_size(folder: Path) -> None:
 
 @pytest.mark.parametrize("value", [0.0, -1.0, 1.5, float("nan")])
 def test_the_tolerance_is_checked(folder: Path, value: float) -> None:
-    with pytest.raises(ConfigError, match=r"dataset\.max_difference must be in \(0, 1\] s"):
+    with pytest.raises(ConfigError, match=r"dataset\.max_time_difference must be in \(0, 1\] s"):
         TumRgbd(folder, max_time_difference=value)

@@ -65,7 +65,7 @@ def test_the_room_stands_on_its_floor(room: UprightRoom) -> None:
     np.testing.assert_allclose(room.T_room_world[:3, :3] @ Y_UP[:, 2], (0, 0, 1), atol=1e-12)
     table, cube, _ = room.objects
     assert (table.name, cube.name) == ("dining_table_1", "cube_2")
-    assert (table.baseline, table.top, cube.base, cube.top) == pytest.approx((0, 0.75, 0.75, 0.95), abs=1e-5)
+    assert (table.base, table.top, cube.base, cube.top) == pytest.approx((0, 0.75, 0.75, 0.95), abs=1e-5)
     assert sorted(table.box.extent[:2]) == pytest.approx([0.8, 1.2], abs=1e-4)
     assert table.probability == pytest.approx(0.9)
 

@@ -183,7 +183,7 @@ def test_scene_truth_lies_on_the_exact_surface(exact):
         ({"seed": -1}, "seed"),
         ({"start": 240}, "dataset.start"),
         ({"stride": 0}, "dataset.stride"),
-        ({"share": 0.0}, "dataset.frame_fraction"),
+        ({"frame_fraction": 0.0}, "dataset.frame_fraction"),
     ],
 )
 def test_parameters_are_checked_before_any_work(values, name):

@@ -168,15 +168,15 @@ def option(folder: Path, text: str) -> OptionContract:
     return Own()
 
 
-OWN = "_target_: plugins.refiners.largest_component.LargestComponent\ngap: {} # m\ngap_per_depth: 0.02 # m per m\n"
+OWN = "_target_: plugins.refiners.largest_component.LargestComponent\nmax_gap: {} # m\ngap_per_depth: 0.02 # m per m\n"
 
 
 @pytest.mark.parametrize(
     ("text", "listed", "defaults"),
     [
-        (OWN.format(0.03) + "reach: 2 # px\n", True, True),
-        (OWN.format(0.04) + "reach: 2 # px\n", True, False),
-        (OWN.format(0.03) + "reach: 2\n", False, True),
+        (OWN.format(0.03) + "connection_radius: 2 # px\n", True, True),
+        (OWN.format(0.04) + "connection_radius: 2 # px\n", True, False),
+        (OWN.format(0.03) + "connection_radius: 2\n", False, True),
         (OWN.format(0.03), False, True),
     ],
 )

@@ -104,7 +104,7 @@ def test_one_class_a_detection_leaves_the_rest_to_the_others(tmp_path, spread, e
     """A score of 0.4 is less than the even share of two classes, with spread 1."""
     with caplog.at_level("INFO"):
         found = suppressed(tmp_path, class_spread=spread).detect(frame())
-    assert "n.onnx gives one class a detection" in caplog.text
+    assert "n.onnx reports one class per detection" in caplog.text
     whole = tiny(tmp_path).detect(frame())
     np.testing.assert_array_equal(found.masks, whole.masks)
     np.testing.assert_allclose(found.scores, whole.scores)

@@ -86,7 +86,7 @@ def test_a_video_that_begins_black_begins_with_its_first_features(frames: list[F
 
 
 def test_bounds() -> None:
-    for bound in ({"min_inliers": 3}, {"max_ratio": 0.0}, {"relocalization_candidates": 0}, {"max_error": -1.0}):
+    for bound in ({"min_inliers": 3}, {"max_ratio": 0.0}, {"candidates": 0}, {"max_error": -1.0}):
         with pytest.raises(ConfigError, match=next(iter(bound))):
             PycolmapPnp(**bound)
 

@@ -235,7 +235,7 @@ def test_the_motion_of_a_jump_is_not_expected_to_go_on() -> None:
 def test_images_too_small_for_the_levels_are_refused_in_one_line() -> None:
     camera = Camera(30, 23, 25.0, 25.0, 14.5, 11.0)
     frame = Frame(0, 0.0, np.zeros((23, 30, 3), np.uint8), np.ones((23, 30), np.float32), camera)
-    with pytest.raises(DataError, match=r"30x23 px are too small for tracker\.finest=0\.5"):
+    with pytest.raises(DataError, match=r"30x23 px are too small for tracker\.finest_scale=0\.5"):
         VoxelHashingIcp(finest_scale=0.5).track(frame, BayesianTsdf().scene)
 
 

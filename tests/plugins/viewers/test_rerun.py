@@ -247,8 +247,8 @@ def test_a_missing_package_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     ("parameter", "said"),
     [
-        ("frame_interval=0", r"every must be in \[1, 1e\+06\], found 0"),
-        ("mesh_interval=nan", "mesh_every must be in"),
+        ("frame_interval=0", r"frame_interval must be in \[1, 1e\+06\], found 0"),
+        ("mesh_interval=nan", "mesh_interval must be in"),
         ("memory_limit=lots", "memory_limit must be like 2GB or 25%, found lots"),
         ("mode=WINDOWS", "mode"),
         ("port=80", "port must be in"),

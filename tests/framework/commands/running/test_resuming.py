@@ -188,5 +188,5 @@ def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
     assert own.scene.voxel_count == pytest.approx(alone.scene.voxel_count, rel=0.05)
     with pytest.raises(ConfigError, match="resume_from and localize_in"):
         Mapper(*TRACKED, f"localize_in={tmp_path / 'first'}", f"resume_from={tmp_path / 'first'}")
-    with pytest.raises(DataError, match="world: there is no"):
+    with pytest.raises(DataError, match="localize_in: there is no"):
         Mapper(*TRACKED, f"localize_in={tmp_path}")
