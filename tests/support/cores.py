@@ -16,11 +16,16 @@ ALL = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [
 
 
 def _share_among_processes() -> None:
-    """Before numba is loaded, which else could never use a second thread."""
+    """Before numba is loaded, which else could never use a second thread.
+
+    numba gives the thread that starts its OpenMP threads its own number of threads. Torch uses the same OpenMP and
+    would otherwise use another number in a new thread, where networks would round differently.
+    """
     number = int(os.environ.get("PYTEST_XDIST_WORKER", "gw0").removeprefix("gw"))
     processes = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     if ALL and processes > 1:
-        os.environ.setdefault("NUMBA_NUM_THREADS", str(len(ALL)))
+        for variable in ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS"):
+            os.environ.setdefault(variable, str(len(ALL)))
         os.sched_setaffinity(0, ALL[number::processes] or ALL)
 
 
