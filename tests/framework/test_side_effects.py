@@ -13,6 +13,8 @@ import pytest
 from framework.errors import ConfigError
 from framework.runtime.process_settings import ENVIRONMENT, configure_process
 
+pytestmark = pytest.mark.integration
+
 CHECKOUT = Path(__file__).resolve().parents[2]
 
 PROBE = '''

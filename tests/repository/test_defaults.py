@@ -20,6 +20,8 @@ from framework.reporting.markup import SCRIPTS, STYLE
 from plugins.detectors.maskrcnn2go import SHA256, MaskRCNN2Go
 from tests.support import registered
 
+pytestmark = pytest.mark.integration
+
 DESK = PROJECT_ROOT / "data" / "desk"
 WEIGHTS = Path("plugins/detectors/maskrcnn2go_int8")
 EXPERIMENTS = sorted(path.stem for path in (CONF / "experiment").glob("*.yaml"))

@@ -12,6 +12,8 @@ from framework.training import room_pictures
 from framework.training.room_pictures import RoomPictures, pictures, render_room, room_folder
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
+pytestmark = pytest.mark.integration
+
 
 @pytest.fixture(scope="module")
 def seen() -> list[tuple[np.ndarray, np.ndarray, dict[int, str]]]:

@@ -39,6 +39,7 @@ def network() -> MaskRCNN:
     return MaskRCNN(TINY)
 
 
+@pytest.mark.integration
 def test_it_learns(pictures: RoomPictures, tmp_path: Path) -> None:
     schedule = Schedule(steps=40, batch=2, learning_rate=3e-3, warmup=5, checkpoint_every=40, budget=Budget(50, 30, 16))
     trainer = Trainer(network(), pictures, schedule, tmp_path, "cpu")
@@ -51,6 +52,7 @@ def test_it_learns(pictures: RoomPictures, tmp_path: Path) -> None:
     assert not trainer.trained().training
 
 
+@pytest.mark.integration
 def test_a_stopped_run_goes_on_as_if_it_had_not_been(
     pictures: RoomPictures, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

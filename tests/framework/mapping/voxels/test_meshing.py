@@ -19,6 +19,7 @@ from framework.synthetic.room import RoomKind
 from framework.synthetic.sequence import Synthetic
 from plugins.detectors.none import NoDetections
 from plugins.fusers.bayesian_tsdf import BayesianTsdf
+from tests.support.rendered_frames import rendered_frames
 from tests.support.scenes.analytic_scene import room, walk
 
 pytestmark = pytest.mark.integration
@@ -225,8 +226,7 @@ def test_the_mesh_of_a_furnished_room_lies_on_its_surface() -> None:
     sequence = Synthetic(kind=RoomKind.LIVING_ROOM, frames=240, stride=12, noise=0.0)
     fuser = assemble(BayesianTsdf, voxel_size=0.01)
     nothing = NoDetections()
-    for k in range(len(sequence)):
-        frame = sequence[k]
+    for frame in rendered_frames(sequence):
         assert frame.T_world_camera is not None
         pose = Pose(frame.T_world_camera)
         fuser.fuse(frame, pose, lift(nothing.detect(frame), frame, pose))
