@@ -1,4 +1,4 @@
-"""What can go wrong in a way that the user can mend. Each error is one line: expected, found, where, what to do."""
+"""Exceptions for user-correctable errors. Each message is one line: expected, found, file or key, fix."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-LONGEST_WORD = 200  # characters of what was given, such as a name, that a message repeats
-LONGEST_MESSAGE = 1000  # characters; a list of all options or of many labels has some 500
+LONGEST_WORD = 200  # characters of an input, such as a name, that a message repeats
+LONGEST_MESSAGE = 1000  # characters; a list of all options or labels has about 500
 
 _LONG_WORD = re.compile(rf"\S{{{LONGEST_WORD + 1},}}")
 
 
 class InstanceMapError(Exception):
-    """Base of every known error. `python -m framework` prints it as one line; `debug=true` adds the traceback.
+    """Base of every known error. The command line prints it as one line; `debug=true` adds the traceback.
 
-    Its message is what can be printed, and no longer than a person reads, whatever a file or a name was made of.
+    The message is printable and of limited length, whatever input it repeats.
     """
 
     def __init__(self, message: object = "") -> None:
@@ -25,19 +25,19 @@ class InstanceMapError(Exception):
 
 
 class ConfigError(InstanceMapError):
-    """A configuration names something that does not exist or gives a parameter a value that it cannot have."""
+    """An unknown name, or an invalid value of a parameter."""
 
 
 class DataError(InstanceMapError):
-    """Input that cannot be used: a file is missing, corrupt or inconsistent, or an array has the wrong form."""
+    """Unusable input: a missing, corrupt or inconsistent file, or an array of the wrong form."""
 
 
 class FrameError(DataError):
-    """One frame cannot be used and the rest of its sequence can: the pipeline counts it in `frames_skipped`."""
+    """One unusable frame of a usable sequence: the pipeline counts it in `frames_skipped`."""
 
 
 class NoPoseError(FrameError):
-    """No pose is given for this frame, which is normal where motion capture has gaps: skipped, and told in the end."""
+    """A frame without a pose, which is normal where motion capture has gaps: skipped, reported at the end."""
 
 
 class MapFullError(InstanceMapError):
@@ -45,29 +45,33 @@ class MapFullError(InstanceMapError):
 
 
 class PartialRunError(InstanceMapError):
-    """A run ended early, and the record of what it had mapped is written. `__cause__` is what ended it."""
+    """A run that ended early and has written its outputs. `__cause__` is the reason."""
 
 
 def printable(message: object) -> str:
-    """A message with what cannot be printed as its code, such as \\n, and with the middle left out of what is long."""
+    """Return a message with unprintable characters escaped, and the middle of long words and texts omitted."""
     text = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(message))
     return _shortened(_LONG_WORD.sub(lambda match: _shortened(match[0], LONGEST_WORD), text), LONGEST_MESSAGE)
 
 
 def _shortened(text: str, most: int) -> str:
-    return (
-        text if len(text) <= most else f"{text[: most // 2]}...{text[len(text) - most // 4 :]} ({len(text)} characters)"
-    )
+    if len(text) <= most:
+        return text
+    return f"{text[: most // 2]}...{text[len(text) - most // 4 :]} ({len(text)} characters)"
 
 
-def in_one_line(said: object) -> str:
-    """What a library says of a fault, for a message of ours; the kind of the fault where it says nothing."""
-    return " ".join(str(said).split()) or type(said).__name__
+def in_one_line(message: object) -> str:
+    """Return the message of another library's error on one line; the error's class if it is empty."""
+    return " ".join(str(message).split()) or type(message).__name__
+
+
+def first_line(error: BaseException) -> str:
+    return str(error).partition("\n")[0] or type(error).__name__
 
 
 @contextmanager
 def errors_of(where: object) -> Iterator[None]:
-    """Put the file, or the place in it, before the message of a DataError that is raised within."""
+    """Prepend the file, or the place in it, to the message of a DataError."""
     try:
         yield
     except DataError as error:

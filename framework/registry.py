@@ -1,4 +1,4 @@
-"""Config nodes become checked plugins: the only place where a name in a config turns into code that runs."""
+"""Builds plugins from config nodes: the only place where a name in a config becomes code that runs."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import importlib.util
 import inspect
 import pkgutil
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from importlib.machinery import ModuleSpec
@@ -23,7 +23,7 @@ from omegaconf.errors import OmegaConfBaseException
 from framework.config.composition import config_loader, running_loader
 from framework.config.hydra_api import CachingConfigRepository, create_defaults_list
 from framework.config.renamed_keys import rename_hint
-from framework.errors import ConfigError, InstanceMapError
+from framework.errors import ConfigError, InstanceMapError, first_line
 from framework.files.search_paths import PROJECT_ROOT
 from framework.interfaces import ClusterRefiner, Detector, MapFuser, PoseTracker, RGBDVideo, Viewer
 
@@ -34,28 +34,31 @@ STAGES: Mapping[str, type[Any]] = {
     "refiner": ClusterRefiner,
     "fuser": MapFuser,
 }
-"""The config groups whose choice a result depends on, and the interface that their options implement."""
+"""Config groups that results depend on, and the interface that their options implement."""
 
 GROUPS: Mapping[str, type[Any]] = {**STAGES, "viewer": Viewer}
 """All config groups whose options are plugins."""
 
-REGISTER = "; a class of your own needs a YAML {stage}/NAME.yaml in a folder that --config-dir names"
+REGISTER = "; register a class of your own with a YAML {stage}/NAME.yaml in a folder that --config-dir names"
 
 Plugin = TypeVar("Plugin")
 
 
-def build(interface: type[Plugin], node: DictConfig | None) -> Plugin:
-    """The plugin that a config node describes: `_target_` names the class, every other key is a parameter of it.
+def build(interface: Callable[..., Plugin], node: DictConfig | None) -> Plugin:
+    """Build the plugin that a config node describes: `_target_` names the class, the other keys are its parameters.
 
-    The class must be one that an option of the stage names: those of this project, of installed packages and, in a run,
-    of --config-dir; where no Hydra with our configs runs (from Python, or when a stored run is evaluated anew), also
-    those of `framework.config.composition.add_config_dir`. Only then is its module imported. A class that is not a
-    concrete dataclass implementing `interface` is rejected, so a config cannot run unregistered code. Interpolations
-    in the node are resolved against the config that it belongs to.
+    The class must be the `_target_` of a registered option of the stage: of this project, an installed package, or
+    --config-dir (without a running Hydra: `framework.config.composition.add_config_dir`). Only then is its module
+    imported. A class that is not a concrete dataclass implementing `interface` is rejected, so a config cannot run
+    unregistered code. Interpolations in the node are resolved against the config that contains it.
+
+    Args:
+        interface: The class that the plugin implements. Not `type[Plugin]`, which excludes abstract classes.
+        node: The config of the plugin.
 
     Raises:
-        ConfigError: the class or a parameter is wrong; one line that names the stage, the plugin and what is wrong.
-        InstanceMapError: what the plugin itself raises, with the stage and the plugin in front.
+        ConfigError: The class or a parameter is wrong; names the stage and the plugin.
+        InstanceMapError: Raised by the plugin itself; the stage and the plugin are prepended.
     """
     stage = stage_of(interface)
     if not isinstance(node, DictConfig) or OmegaConf.is_missing(node, "_target_") or not node.get("_target_"):
@@ -64,20 +67,31 @@ def build(interface: type[Plugin], node: DictConfig | None) -> Plugin:
         )
     target = str(node["_target_"])
     with _options_loader() as loader:
-        _refuse_unregistered(loader, stage, target)
+        if target not in _targets(loader, stage, target):
+            hint = _did_you_mean(target, list(_targets(loader, stage, target))) or REGISTER.format(stage=stage)
+            raise ConfigError(f"{stage} {target}: no registered option of {stage} has this _target_{hint}")
     plugin_class = find_class(interface, target)
     where = f"{stage} {target}"
     arguments = parameters(where, plugin_class, node)
     try:
-        return assemble(plugin_class, **arguments)
+        with _errors_at(where):
+            plugin: Plugin = assemble(plugin_class, **arguments)
+    except (ImportError, ValueError) as error:
+        raise ConfigError(f"{where}: {first_line(error)}") from error
+    return plugin
+
+
+@contextmanager
+def _errors_at(where: str) -> Iterator[None]:
+    """Prepend `where` to the message of an InstanceMapError, and keep its class."""
+    try:
+        yield
     except InstanceMapError as error:
         raise type(error)(f"{where}: {error}") from error
-    except (ImportError, ValueError) as error:
-        raise ConfigError(f"{where}: {_first_line(error)}") from error
 
 
 def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
-    """The plugin with these parameters; those of its parts are given as if they were its own."""
+    """Return the plugin with these parameters, which include those of its parts."""
     parts = {
         name: assemble(part, **{key: values.pop(key) for key in parameter_fields(part) if key in values})
         for name, (_, part) in _fields(plugin_class).items()
@@ -87,9 +101,10 @@ def assemble(plugin_class: type[Plugin], /, **values: Any) -> Plugin:
 
 
 def parameter_fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
-    """The parameters of a plugin by name, each its field and type; a part's parameters stand in its place.
+    """Return the field and type of each parameter of a plugin by name.
 
-    A part is a field whose type is a dataclass. Raises ConfigError when two parameters have one name.
+    A part (a field whose type is a dataclass) is replaced by its own parameters. Raises ConfigError for a duplicate
+    name.
     """
     found: dict[str, tuple[dataclasses.Field[Any], Any]] = {}
     for name, (field, kind) in _fields(plugin_class).items():
@@ -105,27 +120,20 @@ def _is_part(kind: object) -> TypeGuard[type[Any]]:
 
 
 def _fields(plugin_class: type) -> dict[str, tuple[dataclasses.Field[Any], Any]]:
-    """The fields that a plugin or a part is made with, and their types."""
     hints = get_type_hints(plugin_class)
     return {field.name: (field, hints[field.name]) for field in dataclasses.fields(plugin_class) if field.init}
 
 
-def stage_of(interface: type) -> str:
-    """The config group whose options implement `interface`, or one that it is a kind of."""
+def stage_of(interface: Callable[..., object]) -> str:
+    """Return the config group whose options implement `interface`, or a base class of it."""
+    assert isinstance(interface, type)
     return next(stage for stage, of in GROUPS.items() if issubclass(interface, of))
-
-
-def _refuse_unregistered(loader: Any, stage: str, target: str) -> None:
-    if target not in _targets(loader, stage, target):
-        hint = _did_you_mean(target, list(_targets(loader, stage, target))) or REGISTER.format(stage=stage)
-        raise ConfigError(f"{stage} {target}: no registered option of {stage} has this _target_{hint}")
 
 
 @contextmanager
 def _options_loader() -> Iterator[Any]:
-    """The loader of the Hydra that runs, where our configs are on its search path; else one for our configs."""
-    running = running_loader()
-    if running is not None:
+    """Yield the loader of the running Hydra if our configs are on its search path, else a new one."""
+    if (running := running_loader()) is not None:
         yield running
         return
     with config_loader() as loader:
@@ -133,7 +141,7 @@ def _options_loader() -> Iterator[Any]:
 
 
 def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
-    """The classes that the stage's options name, first of those options whose names `sought` has in it."""
+    """Yield the classes that the stage's options name, first of the options whose name is part of `sought`."""
     inheriting = []
     files: Any = CachingConfigRepository(loader.repository)
     for name in sorted(loader.get_group_options(stage), key=lambda name: name not in sought):
@@ -142,34 +150,35 @@ def _targets(loader: Any, stage: str, sought: str) -> Iterator[str]:
             yield str(own["_target_"])
         else:
             inheriting.append(name)
-    for name in inheriting:  # from another option, which was asked, or from what is none
-        with suppress(HydraException):  # of an option that cannot be used
+    for name in inheriting:
+        with suppress(HydraException):  # of a broken option
             for path, package in composition(files, stage, name).items():
                 if package == stage:
                     yield str(files.load_config(path).config.get("_target_"))
 
 
 def composition(files: Any, stage: str, name: str) -> dict[str, str]:
-    """The configs that an option of a stage is made of, in order, and where each belongs: packages by path.
+    """Return the packages of the configs that an option of a stage consists of, by path, in order.
 
-    They are looked for where a run would choose the option: one that overrides the choice of another stage, as a
-    dataset may, composes nowhere else. `files` is a loader's repository, which Hydra would read anew for every option,
-    and its own configs with it. Raises HydraException for an option that cannot be used.
+    They are composed as in a run, because an option may override the choice of another stage. `files` is the caching
+    repository of a loader. Raises HydraException for a broken option.
     """
     own = files.load_config(f"{stage}/{name}")
-    if not own.defaults_list and own.header.get("package") is None:  # it is itself, and Hydra would take 10 ms for that
+    if not own.defaults_list and own.header.get("package") is None:  # a single file: skip Hydra's 10 ms
         return {f"{stage}/{name}": stage}
     chosen = OverridesParser.create().parse_overrides([f"{stage}={name}"])
     entries: Any = create_defaults_list(files, "config", chosen, prepend_hydra=False, skip_missing=False).defaults
     return {entry.config_path: entry.package for entry in entries if entry.package.partition(".")[0] == stage}
 
 
-def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
-    """The class that `target` ("package.module.Class") names.
+def find_class(interface: Callable[..., Plugin], target: str) -> type[Plugin]:
+    """Import the class that `target` ("package.module.Class") names.
 
-    Raises ConfigError unless it can be imported and is a concrete dataclass that implements `interface`.
+    Raises ConfigError unless it is a concrete dataclass that implements `interface`.
     """
-    where = f"{stage_of(interface)} {target}"
+    assert isinstance(interface, type)
+    stage = stage_of(interface)
+    where = f"{stage} {target}"
     module_name, _, class_name = target.rpartition(".")
     if not module_name:
         raise ConfigError(f"{where}: _target_ must be package.module.Class")
@@ -178,30 +187,28 @@ def find_class(interface: type[Plugin], target: str) -> type[Plugin]:
     if found is None:
         fitting = [name for name, value in vars(module).items() if _implements(value, interface)]
         raise ConfigError(f"{where}: module {module_name} has no {class_name}{_did_you_mean(class_name, fitting)}")
-    if _implements(found, GROUPS[stage_of(interface)]) and not _implements(found, interface):
-        what = (inspect.getdoc(interface) or "").partition("\n")[0].removesuffix(".")
-        raise ConfigError(f"{where}: here it must be of the kind {interface.__name__} ({what})")
     if not _implements(found, interface):
         kind = "a class that does not" if isinstance(found, type) else f"a {type(found).__name__}"
+        if _implements(found, GROUPS[stage]):
+            what = (inspect.getdoc(interface) or "").partition("\n")[0].removesuffix(".")
+            raise ConfigError(f"{where}: here it must be of the kind {interface.__name__} ({what})")
         raise ConfigError(f"{where}: expected a class that implements {interface.__name__}, found {kind}")
     if "__dataclass_fields__" not in vars(found):
         raise ConfigError(f"{where}: a plugin must be a dataclass, and {class_name} is not decorated with @dataclass")
     if inspect.isabstract(found):
         missing = ", ".join(sorted(found.__abstractmethods__))
         raise ConfigError(f"{where}: {class_name} does not implement {missing} of {interface.__name__}")
-    try:
+    with _errors_at(where):
         parameter_fields(found)
-    except ConfigError as error:
-        raise ConfigError(f"{where}: {error}") from error
     plugin_class: type[Plugin] = found
     return plugin_class
 
 
 def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, Any]:
-    """The keyword arguments that `node` gives to `plugin_class`, each with the type of its dataclass field.
+    """Return the keyword arguments for `plugin_class` from `node`, each with the type of its dataclass field.
 
-    Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing mandatory value: a
-    field's metadata may say `where` such a value is to be had.
+    Raises ConfigError, starting with `where`, for an unknown parameter, a wrong type or a missing value. The metadata
+    `where` of a field is a hint on how to obtain its value.
     """
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
@@ -213,13 +220,14 @@ def parameters(where: str, plugin_class: type, node: DictConfig) -> dict[str, An
         needed = " ".join(f"{stage}.{name}=..." for name in missing)
         hints = [str(fields[name][0].metadata["where"]) for name in missing if "where" in fields[name][0].metadata]
         raise ConfigError(f"{where}: {', '.join(missing)} must be given: {'; '.join([needed, *hints])}")
-    return {name: plugins[name] if name in stages else _plain(schema[name]) for name in fields}
+    values = {name: plugins[name] if name in stages else schema[name] for name in fields}
+    return {name: list(value) if isinstance(value, ListConfig) else value for name, value in values.items()}
 
 
 def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
-    """Raises ConfigError where an option, by itself, gives a parameter that there is not, or a value of a wrong type.
+    """Raise ConfigError if an option has an unknown parameter or a value of a wrong type.
 
-    What depends on other configs, and what only a user has, is left out.
+    Skips values that depend on other configs or that the user has to set.
     """
     plugins = plugin_fields(plugin_class)
     settled = [key for key in map(str, node) if key not in plugins and not OmegaConf.is_interpolation(node, key)]
@@ -227,42 +235,40 @@ def check_option(where: str, plugin_class: type, node: DictConfig) -> None:
 
 
 def _taken(where: str, plugin_class: type, node: DictConfig) -> tuple[DictConfig, dict[str, Any]]:
-    """A plugin's parameters and, where it holds others, those: what `node` gives, defaults for the rest."""
+    """Return the values of a plugin's parameters (with defaults), and the plugins that it contains."""
     stages = plugin_fields(plugin_class)
     fields = parameter_fields(plugin_class)
+    typed = [
+        (name, kind, dataclasses.field(default=field.default, default_factory=field.default_factory))
+        for name, (field, kind) in fields.items()
+        if name not in stages
+    ]
     try:
-        schema = _schema(plugin_class.__name__, {name: of for name, of in fields.items() if name not in stages})
+        schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(plugin_class.__name__, typed))
     except OmegaConfBaseException as error:
         raise ConfigError(
-            f"{where}: parameters must be bool, int, float, str, Path, Enum or list[str]: {_first_line(error)}"
+            f"{where}: parameters must be bool, int, float, str, Path, Enum or list[str]: {first_line(error)}"
         ) from error
-    names = list(fields)
     plugins: dict[str, Any] = {}
-    for key in node:
+    for key in map(str, node):
         if key == "_target_" or OmegaConf.is_missing(node, key):
             continue
-        if key not in names:
-            hint = rename_hint(f"{where.split()[0]}.{key!s}")
-            suggestion = f"; {hint}" if hint else _did_you_mean(str(key), names, "it has")
-            raise ConfigError(f"{where}: there is no parameter {str(key)!r}{suggestion}")
+        if key not in fields:
+            hint = rename_hint(f"{where.split()[0]}.{key}")
+            suggestion = f"; {hint}" if hint else _did_you_mean(key, list(fields), "it has")
+            raise ConfigError(f"{where}: there is no parameter {key!r}{suggestion}")
         if key in stages:
-            given = _plugin if holds_one(plugin_class, str(key)) else _plugins
-            plugins[str(key)] = given(f"{where}: {key}", stages[str(key)], node[key])
+            plugins[key] = _inner(f"{where}: {key}", stages[key], node[key], holds_one(plugin_class, key))
             continue
         try:
             schema[key] = node[key]
         except OmegaConfBaseException as error:
-            raise ConfigError(f"{where}: {key}: {_first_line(error)}") from error
+            raise ConfigError(f"{where}: {key}: {first_line(error)}") from error
     return schema, plugins
 
 
-def _plain(value: Any) -> Any:
-    """A list as Python has it."""
-    return list(value) if isinstance(value, ListConfig) else value
-
-
 def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
-    """The fields that hold another plugin, or several by name (Mapping[str, interface]), and their interfaces."""
+    """Return the interfaces of the fields that hold a plugin, or several by name (Mapping[str, interface])."""
     found = {}
     for name, hint in get_type_hints(plugin_class).items():
         of = get_args(hint)
@@ -274,84 +280,67 @@ def plugin_fields(plugin_class: type) -> dict[str, type[Any]]:
 
 
 def holds_one(plugin_class: type, name: str) -> bool:
-    """Whether a field that holds plugins holds one, and not several by name."""
+    """Return true if a field that holds plugins holds one, and not several by name."""
     return get_type_hints(plugin_class)[name] in STAGES.values()
 
 
-def _schema(name: str, fields: Mapping[str, tuple[dataclasses.Field[Any], Any]]) -> DictConfig:
-    """A config that takes what fits these fields, with their defaults."""
-    kept = [
-        (key, hint, dataclasses.field(default=field.default, default_factory=field.default_factory))
-        for key, (field, hint) in fields.items()
-    ]
-    schema: DictConfig = OmegaConf.structured(dataclasses.make_dataclass(name, kept))
-    return schema
-
-
-def _plugin(where: str, interface: type[Plugin], node: Any) -> Plugin:
-    """The plugin that a config in another one's describes."""
-    try:
-        return build(interface, node)
-    except InstanceMapError as error:
-        raise type(error)(f"{where}: {error}") from error
-
-
-def _plugins(where: str, interface: type[Plugin], node: Any) -> dict[str, Plugin]:
-    """The plugins that a mapping of configs describes, in its order; what is null is left out."""
+def _inner(where: str, interface: type[Any], node: Any, one: bool) -> Any:
+    """Build the plugin in another one's config, or the mapping of plugins by name, without those that are null."""
+    if one:
+        with _errors_at(where):
+            return build(interface, node)
     if not isinstance(node, DictConfig):
         raise ConfigError(f"{where}: expected plugins by name, found {_shown(node)}")
     found = {}
     for name in map(str, node):
         if node[name] is not None:
-            try:
+            with _errors_at(f"{where}.{name}"):
                 found[name] = build(interface, node[name])
-            except InstanceMapError as error:
-                raise type(error)(f"{where}.{name}: {error}") from error
     return found
 
 
 def _import(where: str, module_name: str) -> ModuleType:
     if module_name not in sys.modules:
-        _found(where, module_name)
+        _check_module(where, module_name)
     try:
         return importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise ConfigError(f"{where}: {module_name} needs the package {error.name!r}, which is not installed") from error
-    except Exception as error:  # whatever a third party's module does at import
+    except Exception as error:  # third-party code
         kind = type(error).__name__
-        raise ConfigError(f"{where}: {module_name} cannot be imported: {kind}: {_first_line(error)}") from error
+        raise ConfigError(f"{where}: {module_name} cannot be imported: {kind}: {first_line(error)}") from error
 
 
-def _found(where: str, module_name: str) -> ModuleSpec:
-    """Where a module is. Nothing is imported for it, as importlib.util.find_spec would its packages."""
+def _check_module(where: str, module_name: str) -> None:
+    """Raise ConfigError if a module does not exist. Unlike importlib.util.find_spec, this imports no packages."""
     package, *inner = module_name.split(".")
+    name = package
     try:
-        spec, name = importlib.util.find_spec(package), package
-    except ValueError:  # no name, or one that is taken by what is no module
-        spec, name = None, package
+        spec = importlib.util.find_spec(package)
+    except ValueError:  # not a name, or the name of something else
+        spec = None
     if package == "plugins" and spec is not None:
-        _refuse_another(spec)
+        _check_plugins_package(spec)
     for part in inner:
         if spec is None:
             break
-        beside = list(spec.submodule_search_locations or [])
+        folders = list(spec.submodule_search_locations or [])
         name = f"{name}.{part}"
-        specs = [finder.find_spec(name) for finder in map(pkgutil.get_importer, beside) if finder]
+        specs = [finder.find_spec(name) for finder in map(pkgutil.get_importer, folders) if finder]
         spec = next((spec for spec in specs if spec and spec.loader), next(filter(None, specs), None))
         if spec is None:
-            close = _did_you_mean(part, [module.name for module in pkgutil.iter_modules(beside)])
+            close = _did_you_mean(part, [module.name for module in pkgutil.iter_modules(folders)])
             raise ConfigError(f"{where}: there is no module {name}{close}")
     if spec is None:
         raise ConfigError(f"{where}: there is no module {name}")
-    return spec
 
 
-def _refuse_another(plugins: ModuleSpec) -> None:
-    """Raises InstanceMapError when the user has a package called `plugins`, and Python finds it before ours."""
+def _check_plugins_package(plugins: ModuleSpec) -> None:
+    """Raise InstanceMapError if Python finds another package `plugins` before ours."""
     found = Path([*(plugins.submodule_search_locations or []), str(plugins.origin)][0]).resolve()
     if found != PROJECT_ROOT / "plugins":
         raise InstanceMapError(
-            f"the package 'plugins' at {found} stands in the way of InstanceMap's own at {PROJECT_ROOT / 'plugins'}: "
+            f"the package 'plugins' at {found} hides InstanceMap's own at {PROJECT_ROOT / 'plugins'}: "
             "rename it or start elsewhere"
         )
 
@@ -365,10 +354,6 @@ def _did_you_mean(name: str, known: list[str], otherwise: str = "") -> str:
     if close:
         return f"; did you mean {close[0]!r}?"
     return f"; {otherwise} {', '.join(known) or 'none'}" if otherwise else ""
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).partition("\n")[0] or type(error).__name__
 
 
 def _shown(node: Any) -> str:

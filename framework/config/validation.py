@@ -9,7 +9,7 @@ from typing import Any
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.errors import ConfigError
+from framework.errors import ConfigError, first_line
 
 MOST_DETECTIONS = 1000  # of an image, each with a mask of its size; COCO's evaluation takes 100
 MOST_PROPOSALS = 100_000  # that a network looks at
@@ -75,7 +75,6 @@ def checked_block(kind: type, name: str, node: Any) -> dict[str, Any]:
     try:
         content = OmegaConf.to_container(OmegaConf.merge(OmegaConf.structured(kind), OmegaConf.create(dict(node))))
     except OmegaConfBaseException as error:
-        first_line = str(error).partition("\n")[0]
-        raise ConfigError(f"{name}: {first_line}") from error
+        raise ConfigError(f"{name}: {first_line(error)}") from error
     assert isinstance(content, dict)
     return {str(key): value for key, value in content.items()}

@@ -26,6 +26,13 @@ class Check:
     detail: str
     fix: str = ""  # the command that fixes it; "" = none is needed or known
 
+    @classmethod
+    def of(cls, name: str, passed: bool, detail: str, fix: str = "", required: bool = False) -> Check:
+        """Return the result of a check, with its fix if it failed."""
+        if passed:
+            return cls(name, Status.OK, detail)
+        return cls(name, Status.ERROR if required else Status.MISSING, detail, fix)
+
 
 def run_checks(*checks: Callable[[], Iterable[Check]]) -> list[Check]:
     """Return all results; a check that raises becomes an error of its own."""
@@ -42,9 +49,9 @@ def one_line(error: BaseException) -> str:
     return anonymous(f"{type(error).__name__}: {' '.join(str(error).split())}".removesuffix(": "))[:300]
 
 
-def anonymous(text: str) -> str:
+def anonymous(text: str | Path) -> str:
     """Return the text without the user's home and name, so that it can be pasted into an issue."""
-    home = str(Path.home())
+    home, text = str(Path.home()), str(text)
     if home != "/":
         text = text.replace(home, "~")
     try:

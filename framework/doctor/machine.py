@@ -12,7 +12,7 @@ from pathlib import Path
 
 from framework.doctor.check_result import Check, Status, anonymous
 
-MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB, a benchmark of rooms gigabytes
+MIN_DISK_GB = 2.0  # a run writes 20 to 200 MB, a synthetic benchmark gigabytes
 MIN_MEMORY_GIB = 2.0  # the demo takes 1.2
 SYSTEM_LIBRARIES = {
     "libGL.so.1": ("libgl1", "Open3D"),
@@ -23,65 +23,51 @@ SYSTEM_LIBRARIES = {
 }
 """Debian package and user of each library. Open3D is required."""
 
-PROGRAMS = {"git": "the commit in run directories", "chromium": "tests of HTML pages"}
-FOLDER_FIXES = {
-    "outputs": "set hydra.run.dir=DIR and hydra.sweep.dir=DIR",
-    "cache": "set the environment variable XDG_CACHE_HOME",
-    "temporary": "set the environment variable TMPDIR",
-}
 PREFIXES = ("HF_", "INSTANCEMAP_", "NUMBA_", "OMP_", "TRANSFORMERS_", "CUDA_VISIBLE", "XDG_CACHE", "PYTHONPATH")
 
 
 def hardware() -> Iterator[Check]:
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    name = names[0] if names else platform.processor() or platform.machine()
-    yield Check("processor", Status.OK, f"{cores} of {os.cpu_count()} cores, {name}")
+    from framework.runs.provenance import processor
+    from framework.runtime.process_settings import available_cores
+
+    yield Check("processor", Status.OK, f"{available_cores()} of {os.cpu_count()} cores, {processor()}")
     if Path("/proc/meminfo").exists():
         sizes = dict(line.split(":") for line in Path("/proc/meminfo").read_text().splitlines() if ":" in line)
         total, free = (int(sizes[key].split()[0]) / 2**20 for key in ("MemTotal", "MemAvailable"))
-        enough = free >= MIN_MEMORY_GIB
-        fix = "" if enough else "close other programs, or set fuser.voxel_size=0.02 (one eighth of the map's memory)"
-        yield Check("memory", Status.OK if enough else Status.MISSING, f"{free:.1f} of {total:.1f} GiB free", fix)
+        fix = "close other programs, or set fuser.voxel_size=0.02 (one eighth of the map's memory)"
+        yield Check.of("memory", free >= MIN_MEMORY_GIB, f"{free:.1f} of {total:.1f} GiB free", fix)
 
 
 def disk() -> Iterator[Check]:
     import platformdirs
 
-    cache = platformdirs.user_cache_path("instancemap", appauthor=False)
-    for name, folder in (("outputs", Path.cwd()), ("cache", cache), ("temporary", Path(tempfile.gettempdir()))):
-        existing = next(path for path in (folder, *folder.parents) if path.exists())
+    for name, folder, fix in (
+        ("outputs", Path.cwd(), "set hydra.run.dir=DIR and hydra.sweep.dir=DIR"),
+        ("cache", platformdirs.user_cache_path("instancemap", appauthor=False), "set XDG_CACHE_HOME"),
+        ("temporary", Path(tempfile.gettempdir()), "set TMPDIR"),
+    ):
+        existing, writable = writable_parent(folder)
         free = shutil.disk_usage(existing).free / 1e9
-        writable = os.access(existing, os.W_OK)
-        detail = f"{free:.1f} GB free in {anonymous(str(folder))}" + ("" if writable else ", not writable")
-        enough = free >= MIN_DISK_GB and writable
-        yield Check(name, Status.OK if enough else Status.MISSING, detail, "" if enough else FOLDER_FIXES[name])
+        detail = f"{free:.1f} GB free in {anonymous(folder)}" + ("" if writable else ", not writable")
+        yield Check.of(name, free >= MIN_DISK_GB and writable, detail, fix)
+
+
+def writable_parent(folder: Path) -> tuple[Path, bool]:
+    """Return the folder or its nearest existing parent, and true if it is writable."""
+    existing = next(path for path in (folder, *folder.parents) if path.exists())
+    return existing, os.access(existing, os.W_OK)
 
 
 def system_libraries() -> Iterator[Check]:
-    if platform.system() != "Linux":
-        return
-    for file, (package, user) in SYSTEM_LIBRARIES.items():
+    for file, (package, user) in SYSTEM_LIBRARIES.items() if platform.system() == "Linux" else ():
         try:
-            ctypes.CDLL(file)
+            found = bool(ctypes.CDLL(file))
         except OSError:
-            status = Status.ERROR if user == "Open3D" else Status.MISSING
-            yield Check(package, status, f"{file} not found, needed by {user}", f"apt-get install {package}")
-        else:
-            yield Check(package, Status.OK, f"{file}, needed by {user}")
-
-
-def programs() -> Iterator[Check]:
-    for name, user in PROGRAMS.items():
-        found = shutil.which(name)
-        if found:
-            yield Check(name, Status.OK, f"{anonymous(found)}, for {user}")
-        else:
-            yield Check(name, Status.MISSING, f"not found, for {user}", f"apt-get install {name}")
+            found = False
+        detail = f"{file}{'' if found else ' not found'}, needed by {user}"
+        yield Check.of(package, found, detail, f"apt-get install {package}", required=user == "Open3D")
 
 
 def environment() -> Iterator[Check]:
-    found = {name: value for name, value in sorted(os.environ.items()) if name.startswith(PREFIXES)}
-    for name, value in found.items():
-        yield Check(name, Status.OK, anonymous(value) or '""')
+    for name in sorted(name for name in os.environ if name.startswith(PREFIXES)):
+        yield Check(name, Status.OK, anonymous(os.environ[name]) or '""')

@@ -4,77 +4,65 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from framework.doctor.check_result import Check, Status, anonymous
+import yaml
+
+from framework.doctor.check_result import Check, anonymous
 from framework.files.search_paths import CONF, PROJECT_ROOT
 
 INCLUDED = "plugins/"  # prefix of the paths of included weights
 MODEL_ID = re.compile(r"[A-Za-z0-9][\w.-]*/[\w.-]+")  # on huggingface.co
 
 
-def included() -> Iterator[Check]:
+def included_and_hub() -> Iterator[Check]:
+    """Check the weights that come with the project, and the cache of huggingface_hub for the model ids of options."""
+    from framework.detection.hub.hub_model import forbidden_by
+
     choices = _content(CONF / "config.yaml")["defaults"]
-    assert isinstance(choices, list)
     default = next(choice["detector"] for choice in choices if isinstance(choice, dict) and "detector" in choice)
+    offline = f", but {forbidden_by()} is set" if forbidden_by() else ""
     for name, value in _named():
-        path = PROJECT_ROOT / value
-        if not value.startswith(INCLUDED):
-            continue
-        if size := _size(path):
-            yield Check(name, Status.OK, f"included, {size / 1e6:.1f} MB")
-        else:
-            status = Status.ERROR if name == default else Status.MISSING
+        if value.startswith(INCLUDED):
+            size = _size(PROJECT_ROOT / value)
+            detail = f"included, {size / 1e6:.1f} MB" if size else f"{anonymous(PROJECT_ROOT / value)} is missing"
             fix = "pip install --force-reinstall --no-deps instancemap"
-            yield Check(name, status, f"{anonymous(str(path))} is missing", fix)
+            yield Check.of(name, size > 0, detail, fix, required=name == default)
+        elif MODEL_ID.fullmatch(value):
+            folder = _hub_cache() / f"models--{value.replace('/', '--')}"
+            size = max(map(_complete_size, folder.glob("snapshots/*/")), default=0)
+            detail = f"{value} is {'partly' if folder.exists() else 'not'} downloaded{offline}"
+            if size:
+                detail = f"{value}, {size / 1e6:.0f} MB in {anonymous(folder.parent)}"
+            yield Check.of(name, size > 0, detail, f"instancemap detector={name.partition('.')[0]}")
 
 
 def published() -> Iterator[Check]:
     from framework.detection.mask_rcnn.published_weights import OFFLINE, PUBLISHED
 
+    offline = f", but {OFFLINE} is set" if os.environ.get(OFFLINE) else ""
     for name, network in PUBLISHED.items():
-        if size := _size(network.file):
-            yield Check(name, Status.OK, f"{size / 1e6:.0f} MB in {anonymous(str(network.file.parent))}")
-        else:
-            size_text = f", {network.megabytes} MB" if network.megabytes else ""
-            offline = f", but {OFFLINE} is set" if os.environ.get(OFFLINE) else ""
-            fix = f"instancemap detector=mask_rcnn detector.weights={name}"
-            yield Check(name, Status.MISSING, f"not downloaded{size_text}, {network.licence}{offline}", fix)
-
-
-def hugging_face() -> Iterator[Check]:
-    """Check the cache of huggingface_hub for the model ids that options name."""
-    from framework.detection.hub.hub_model import forbidden_by
-
-    variable = forbidden_by()
-    offline = f", but {variable} is set" if variable else ""
-    for name, model in _named():
-        if model.startswith(INCLUDED) or not MODEL_ID.fullmatch(model):
-            continue
-        folder = _hub_cache() / f"models--{model.replace('/', '--')}"
-        if size := max(map(_complete_size, folder.glob("snapshots/*/")), default=0):
-            yield Check(name, Status.OK, f"{model}, {size / 1e6:.0f} MB in {anonymous(str(folder.parent))}")
-        else:
-            state = "partly" if folder.exists() else "not"
-            fix = f"instancemap detector={name.partition('.')[0]}"
-            yield Check(name, Status.MISSING, f"{model} is {state} downloaded{offline}", fix)
+        size = _size(network.file)
+        expected = f", {network.megabytes} MB" if network.megabytes else ""
+        detail = f"not downloaded{expected}, {network.licence}{offline}"
+        if size:
+            detail = f"{size / 1e6:.0f} MB in {anonymous(network.file.parent)}"
+        yield Check.of(name, size > 0, detail, f"instancemap detector=mask_rcnn detector.weights={name}")
 
 
 def _named() -> Iterator[tuple[str, str]]:
     """Yield the weight paths and model ids of every option, by option, or by option.parameter if it has several."""
     for path in sorted((CONF / "detector").glob("*.yaml")):
-        values = {key: str(value) for key, value in _content(path).items() if MODEL_ID.match(str(value))}
-        values = {key: value for key, value in values.items() if isinstance(_content(path)[key], str)}
+        content = _content(path).items()
+        values = {key: value for key, value in content if isinstance(value, str) and MODEL_ID.match(value)}
         for key, value in values.items():
             yield path.stem if len(values) == 1 else f"{path.stem}.{key}", value
 
 
-def _content(path: Path) -> Mapping[str, object]:
-    import yaml
-
-    found: Mapping[str, object] = yaml.safe_load(path.read_text(encoding="utf-8"))
-    return found
+def _content(path: Path) -> dict[str, Any]:
+    return dict(yaml.safe_load(path.read_text(encoding="utf-8")))
 
 
 def _hub_cache() -> Path:

@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from functools import cache
-from importlib.metadata import PackageNotFoundError, metadata, packages_distributions, version
+from importlib.metadata import PackageNotFoundError, metadata, version
 from pathlib import Path
 from typing import Any
 
 from packaging.requirements import Requirement
-from packaging.utils import canonicalize_name
 
-from framework.doctor.check_result import Check, Status
+from framework.doctor.check_result import Check
+from framework.doctor.isolated import Outcomes
 
 PYPROJECT = Path(__file__).resolve().parents[2] / "pyproject.toml"
+MODULES = {
+    "hydra-core": "hydra",
+    "opencv-python-headless": "cv2",
+    "pillow": "PIL",
+    "pyyaml": "yaml",
+    "scikit-learn": "sklearn",
+}
+"""Import names of the packages whose import name differs."""
 
 
 @cache
@@ -34,49 +42,28 @@ def declared() -> tuple[str, list[Requirement], dict[str, list[Requirement]]]:
     return str(found["Requires-Python"]), required, extras
 
 
-@cache
-def modules() -> dict[str, str]:
-    """Return the import name of each required package that is installed."""
-    names: dict[str, list[str]] = {}
-    for module, packages in packages_distributions().items():
-        for package in packages:
-            names.setdefault(canonicalize_name(package), []).append(module)
-    found = {}
-    for line in declared()[1]:
-        package = canonicalize_name(line.name)
-        public = sorted(name for name in names.get(package, []) if not name.startswith("_"))
-        if public:
-            own = package.replace("-", "_")
-            found[line.name] = own if own in public else public[0]
-    return found
+def import_statement(package: str) -> str:
+    return f"import {MODULES.get(package, package.replace('-', '_'))}"
 
 
-def libraries(answers: Mapping[str, Mapping[str, Any]]) -> Iterator[Check]:
-    """Check every required package; `answers` holds the import errors by module."""
+def libraries(outcomes: Outcomes) -> Iterator[Check]:
+    """Check every required package, and the outcome of its import."""
     for line in declared()[1]:
         fits, detail = _installed(line)
-        error = answers.get(modules().get(line.name, ""), {}).get("error")
-        if not fits:
-            yield Check(line.name, Status.ERROR, detail, f"pip install '{line.name}{line.specifier}'")
-        elif error:
+        fix = f"pip install '{line.name}{line.specifier}'"
+        _, error = outcomes[import_statement(line.name)]
+        if fits and error:
             fix = f"pip install --force-reinstall --no-deps '{line.name}=={detail}'"
-            yield Check(line.name, Status.ERROR, f"{detail}, import fails: {error}", fix)
-        else:
-            yield Check(line.name, Status.OK, detail)
+            detail = f"{detail}, import fails: {error}"
+        yield Check.of(line.name, fits and not error, detail, fix, required=True)
 
 
 def extras() -> Iterator[Check]:
     """Check every extra that users can install."""
     for name, lines in declared()[2].items():
-        yield extra(name, lines)
-
-
-def extra(name: str, lines: Sequence[Requirement]) -> Check:
-    found = {line.name: _installed(line) for line in lines}
-    detail = ", ".join(f"{package} {detail}" for package, (_, detail) in found.items())
-    if all(fits for fits, _ in found.values()):
-        return Check(name, Status.OK, detail)
-    return Check(name, Status.MISSING, detail, f"pip install 'instancemap[{name}]'")
+        found = {line.name: _installed(line) for line in lines}
+        detail = ", ".join(f"{package} {detail}" for package, (_, detail) in found.items())
+        yield Check.of(name, all(fits for fits, _ in found.values()), detail, f"pip install 'instancemap[{name}]'")
 
 
 def _installed(line: Requirement) -> tuple[bool, str]:

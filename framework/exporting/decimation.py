@@ -1,31 +1,31 @@
-"""Meshes with fewer triangles: flat pictures stay what they are, and a huge map takes no longer than a large one."""
+"""Cuts, joins and decimates meshes. Decimation keeps the texture of flat surfaces, and is fast for huge maps."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from framework.data import Float32, Float64, InstanceMesh, Int32, Int64
-from framework.exporting.submeshes import corners_of, joined, submesh
+from framework.data import Bool, Float32, Float64, InstanceMesh, Int32, Int64
 
-OBJECTS_SHARE = 0.5  # of the triangles, that the objects may have
-FEWEST = 4  # triangles, of a closed surface
-QUADRIC_STEP = 2.5  # quadric decimation takes time by the square of this ratio: what has more is clustered first
-LEFT_TO_QUADRIC = 1.8  # triangles after clustering, by those that are wanted
-FEW = 20_000  # triangles: for fewer nothing is clustered; cubes would be as large as a thing, and the time is short
-RELIEF = 0.03  # m, by which white stands out from black
+OBJECTS_SHARE = 0.5  # of the triangles, for objects
+FEWEST = 4  # triangles of a closed surface
+QUADRIC_STEP = 2.5  # quadric decimation is quadratic in the ratio of triangles: larger meshes are clustered first
+LEFT_TO_QUADRIC = 1.8  # ratio of triangles after clustering and after quadric decimation
+FEW = 20_000  # triangles, below which a mesh is not clustered: cells would be as large as objects
+RELIEF = 0.03  # m between white and black
 BRIGHTNESS = np.array([0.299, 0.587, 0.114])  # of red, green and blue, ITU-R BT.601
-COARSER = 1.3  # from one cell to the next one that is tried
+COARSER = 1.3  # ratio of two cell sizes that are tried
 
 
 def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """The mesh with at most so many triangles, at least FEWEST; one that has no more is returned as it is.
+    """Return the mesh with at most so many triangles (at least FEWEST).
 
-    Edges are collapsed where that changes the surface least: Garland and Heckbert, "Surface Simplification Using
-    Quadric Error Metrics", SIGGRAPH 1997, by Open3D. Meshes that are much too large are clustered in cubes before.
+    Method: Garland and Heckbert, "Surface Simplification Using Quadric Error Metrics", SIGGRAPH 1997, of Open3D, after
+    vertex clustering of meshes that are much larger.
     """
     most = max(triangles, FEWEST)
     wanted = max(most, FEW)
@@ -40,9 +40,9 @@ def decimated(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """The same, with the objects kept finer than what is around them.
+    """Decimate a mesh, its objects less than the rest.
 
-    The two are decimated apart, so that their border stays where it is; vertices around objects lose their labels.
+    The two are decimated separately, which keeps their border; vertices outside objects lose their labels.
     """
     owners = triangle_labels(mesh.triangles, mesh.instance_ids)
     of_object = owners > 0
@@ -50,7 +50,7 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
     objects = min(counts[0], max(int(OBJECTS_SHARE * triangles), triangles - counts[1]))
     ids = mesh.instance_ids.copy()
     corners = mesh.triangles[of_object]
-    bare = ids[corners] == 0  # on the border: a coarse triangle may have no others
+    bare = ids[corners] == 0  # on the border; a coarse triangle may have only such corners
     ids[corners[bare]] = np.broadcast_to(owners[of_object, None], corners.shape)[bare]
     found = submesh(replace(mesh, instance_ids=ids), corners_of(mesh, of_object), of_object)
     around = submesh(replace(mesh, instance_ids=np.zeros_like(ids)), corners_of(mesh, ~of_object), ~of_object)
@@ -58,9 +58,9 @@ def with_finer_objects(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_of_triangle: int) -> InstanceMesh:
-    """The mesh with vertices that are near to each other made one, until it is small enough.
+    """Cluster vertices until the mesh is small enough.
 
-    Unlike the collapsing of edges this always comes to an end: triangles that share no vertex have no edge in common.
+    Unlike collapsing edges, this also reduces triangles without a common edge.
     """
     cell = 0.5 * _cell(mesh, max(1, len(mesh.triangles)))
     while bytes_of_vertex * len(mesh.vertices) + bytes_of_triangle * len(mesh.triangles) > most_bytes:
@@ -70,15 +70,15 @@ def clustered(mesh: InstanceMesh, most_bytes: int, bytes_of_vertex: int, bytes_o
 
 
 def triangle_labels(triangles: Int32, labels: Int32) -> Int32:
-    """(F,) the label that two corners have, else that of the first; triangles (F, 3), labels (V,)."""
+    """Return (F,) the label of at least two corners, else of the first; triangles (F, 3), labels (V,)."""
     corners = labels[triangles]
     return np.where(corners[:, 1] == corners[:, 2], corners[:, 1], corners[:, 0])
 
 
 def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
-    """Edges collapsed by quadrics, on a relief in which what is bright stands out: else flat pictures would be lost.
+    """Collapse edges by quadrics on a relief of the brightness, which preserves the texture of flat surfaces.
 
-    Vertices that are left go back to the nearest ones of the mesh, so place, colour and labels are those of a vertex.
+    Each remaining vertex is replaced by the nearest original one, with its color and labels.
     """
     model = _open3d(mesh)
     model.compute_vertex_normals()
@@ -99,14 +99,14 @@ def _collapsed(mesh: InstanceMesh, triangles: int) -> InstanceMesh:
 
 
 def _cell(mesh: InstanceMesh, count: int) -> float:
-    """The side of the cubes, m, that leave about `count` triangles: two for each square of a surface."""
+    """Return the cell size, m, that leaves about `count` triangles: two per square of the surface."""
     a, b, c = mesh.vertices[mesh.triangles].transpose(1, 0, 2)
     area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
     return max(float(np.sqrt(2 * area / count)), 1e-4)
 
 
 def _open3d(mesh: InstanceMesh) -> Any:
-    import open3d as o3d  # here: it takes half a second to load
+    import open3d as o3d  # takes half a second to load
 
     model = o3d.geometry.TriangleMesh(_vectors(mesh.vertices), o3d.utility.Vector3iVector(mesh.triangles))
     model.vertex_colors = _vectors(mesh.colors / 255.0)
@@ -120,7 +120,7 @@ def _vectors(rows: Float32 | Float64) -> Any:
 
 
 def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
-    """What Open3D made of a mesh, each vertex with the labels of the nearest one there."""
+    """Convert a mesh of Open3D, each vertex with the labels of the nearest one of `mesh`."""
     model.remove_unreferenced_vertices()
     kept = np.asarray(model.vertices).astype(np.float32).reshape(-1, 3)
     nearest = _nearest(mesh.vertices, kept)
@@ -130,7 +130,41 @@ def _relabeled(model: Any, mesh: InstanceMesh) -> InstanceMesh:
 
 
 def _nearest(places: Float32 | Float64, asked: Float32 | Float64) -> Int64:
-    """(N,) which of the places (M, 3) is the nearest to each of those asked for (N, 3)."""
+    """Return (N,) the index of the nearest of the places (M, 3) to each of those asked for (N, 3)."""
     if not len(asked):
         return np.zeros(0, np.int64)
     return np.asarray(cKDTree(places, balanced_tree=False).query(asked)[1])
+
+
+def submesh(mesh: InstanceMesh, kept: Bool, triangles: Bool | None = None) -> InstanceMesh:
+    """Return the mesh of some vertices (V,) and triangles (F,); None = all triangles between these vertices."""
+    number = np.cumsum(kept, dtype=np.int32) - 1
+    chosen = kept[mesh.triangles].all(axis=1) if triangles is None else triangles
+    return InstanceMesh(
+        mesh.vertices[kept],
+        number[mesh.triangles[chosen]].astype(np.int32),
+        mesh.colors[kept],
+        mesh.instance_ids[kept],
+        mesh.class_ids[kept],
+        mesh.classes,
+    )
+
+
+def corners_of(mesh: InstanceMesh, triangles: Bool) -> Bool:
+    """Return (V,), true for the vertices of the triangles (F,)."""
+    used = np.zeros(len(mesh.vertices), np.bool_)
+    used[mesh.triangles[triangles]] = True
+    return used
+
+
+def joined(meshes: Sequence[InstanceMesh]) -> InstanceMesh:
+    """Join at least one mesh of the same map."""
+    starts = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
+    return InstanceMesh(
+        np.concatenate([mesh.vertices for mesh in meshes]),
+        np.concatenate([mesh.triangles + start for mesh, start in zip(meshes, starts, strict=True)]).astype(np.int32),
+        np.concatenate([mesh.colors for mesh in meshes]),
+        np.concatenate([mesh.instance_ids for mesh in meshes]),
+        np.concatenate([mesh.class_ids for mesh in meshes]),
+        meshes[0].classes,
+    )

@@ -1,33 +1,40 @@
-"""A run's exports: which files there are, and what is in each."""
+"""Exports of a run: the files and their contents."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+import trimesh
+
 from framework.config.validation import require
+from framework.data import InstanceMesh
 from framework.errors import ConfigError, DataError
-from framework.exporting.floor_plan import write_floor_plan
-from framework.exporting.geojson import write_geojson
+from framework.exporting.decimation import joined
+from framework.exporting.floor_plan import write_floor_plan, write_geojson
 from framework.exporting.glb import glb
-from framework.exporting.mesh_files import write_parts_obj, write_parts_ply
-from framework.exporting.object_meshes import Coloring, Part, object_parts, parts
+from framework.exporting.object_meshes import Coloring, Part, object_parts, part_colors, parts
 from framework.exporting.occupancy import plan, write_ros_map
 from framework.exporting.scene_graph import write_scene_graph
 from framework.exporting.upright_room import UprightRoom, read_room
 from framework.exporting.usd import Collision, check_usd, write_usd
 from framework.files.atomic_write import written_whole
+from framework.geometry import transform
+from framework.runs.mesh_file import write_mesh
 from framework.runs.run_directory import LIKELY
 
 log = logging.getLogger(__name__)
 
+OBJ_DIGITS = 5  # decimal places of an OBJ file: 0.01 mm
+
 
 class ExportFormat(Enum):
-    """What a run is exported to."""
+    """File formats of exports."""
 
     GLB = "glb"
     PLY = "ply"
@@ -38,20 +45,20 @@ class ExportFormat(Enum):
 
 
 MESHES = {ExportFormat.GLB: ".glb", ExportFormat.PLY: ".ply", ExportFormat.USD: ".usdc", ExportFormat.OBJ: ".obj"}
-"""Formats of surfaces, and how the names of their files end."""
+"""File extensions of surface formats."""
 
 
 @dataclass(frozen=True)
 class Chosen:
-    """What of a room is exported, and how."""
+    """Options of an export."""
 
     objects: Sequence[str] = ()  # ids or classes; () = the whole room
-    min_confidence: float = LIKELY  # in [0, 1]; LIKELY = what pictures show
-    triangles: int | None = None  # >= 4, of the scene and of each object's own file; None = as many as there are
+    min_confidence: float = LIKELY  # of an object, in [0, 1]; LIKELY = as in figures
+    triangles: int | None = None  # limit for the scene and for each object's own file, >= 4; None = no limit
     coloring: Coloring = Coloring.APPEARANCE
     collision: Collision = Collision.HULL
-    resolution: float = 0.05  # m, in [0.01, 1], of a plan's cells
-    robot_height: float = 1.0  # m, in [0.1, 3], of the robot that a place is free for
+    resolution: float = 0.05  # cell size of a plan, m, in [0.01, 1]
+    robot_height: float = 1.0  # clearance of free space, m, in [0.1, 3]
 
     def __post_init__(self) -> None:
         for name, low, high in (("min_confidence", 0.0, 1.0), ("resolution", 0.01, 1.0), ("robot_height", 0.1, 3.0)):
@@ -62,7 +69,7 @@ class Chosen:
 
     @classmethod
     def named(cls, objects: Sequence[str | int] = (), **choices: Any) -> Chosen:
-        """The same with words for what is one of several: `coloring="class"`. Raises ConfigError for others."""
+        """Return the options with enumeration members by value: `coloring="class"`. Raises ConfigError."""
         for name, kind in (("coloring", Coloring), ("collision", Collision)):
             if name in choices:
                 choices[name] = one_of(kind, name, choices[name])
@@ -75,7 +82,7 @@ Option = TypeVar("Option", bound=Enum)
 
 
 def one_of(kind: type[Option], name: str, value: object) -> Option:
-    """The member with this value. Raises ConfigError, which lists them, where there is none."""
+    """Return the member with this value. Raises ConfigError, which lists all values."""
     found = next((option for option in kind if option.value == value), None)
     if found is None:
         raise ConfigError(f"{name} must be one of {', '.join(option.value for option in kind)}, found {value!r:.60}")
@@ -90,10 +97,10 @@ def export(
     up: Sequence[float] | None = None,
     floor: float | None = None,
 ) -> list[Path]:
-    """Writes what a run found in other programs' formats, into `out`, None = `export` in the run's directory.
+    """Write a run in the formats of other programs, to `out` (default: `export` in the run directory).
 
-    Returns the files, each written whole or not at all; the same run gives the same bytes. `up` (3,) and `floor`, m
-    along up, say what the run's record does not tell. Raises DataError where there is no run, or not what is asked for.
+    `up` (3,) and `floor` (m along up) replace what the run directory does not contain. The same run gives the same
+    bytes. Returns the files, which are written atomically. Raises DataError.
     """
     formats, chosen = list(dict.fromkeys(formats)), chosen or Chosen()
     if ExportFormat.USD in formats:
@@ -104,8 +111,7 @@ def export(
     directory = run / "export" if out is None else out
     directory.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
-    surfaces = [one for one in formats if one in MESHES]
-    if surfaces:
+    if surfaces := [one for one in formats if one in MESHES]:
         written += _write_surfaces(room, surfaces, directory, chosen)
     asked = [one for one in formats if one not in MESHES]
     found = plan(room, chosen.resolution, chosen.robot_height) if asked and room.floor_known else None
@@ -120,47 +126,65 @@ def export(
 
 
 def _check_known(run: Path, room: UprightRoom, formats: Sequence[ExportFormat]) -> None:
-    """Raises DataError where a run does not tell what a format needs; surfaces do without."""
+    """Raise DataError if a run lacks the up direction or floor height that a format needs."""
     flat = [one.value for one in formats if one not in MESHES]
     if not room.up_known and flat:
-        raise DataError(f"{run} does not tell which way is up, which {flat[0]} needs: --up X Y Z --floor M say it")
+        raise DataError(f"{run} has no up direction, which {flat[0]} needs: set --up X Y Z --floor M")
     if not room.up_known:
-        log.warning("%s does not tell which way is up: the world's z is taken for it; --up X Y Z says another", run)
+        log.warning("%s has no up direction: the world's z is used; set another with --up X Y Z", run)
     elif not room.floor_known and ExportFormat.FLOORPLAN in formats:
-        raise DataError(f"{run} does not tell how high the floor is, which floorplan needs: --floor M says it")
+        raise DataError(f"{run} has no floor height, which floorplan needs: set --floor M")
     elif not room.floor_known and ExportFormat.GRAPH in formats:
-        log.warning("%s does not tell how high the floor is: the graph is without floor, walls and rooms", run)
+        log.warning("%s has no floor height: the graph omits floor, walls and rooms", run)
 
 
 def _write_surfaces(room: UprightRoom, formats: Sequence[ExportFormat], directory: Path, chosen: Chosen) -> list[Path]:
-    """The scene, unless some objects only are asked for, and each object by itself."""
-    files: list[tuple[str, list[Part]]] = []
+    """Write the scene, unless only some objects are chosen, and each object on its own."""
+    files: dict[str, list[Part]] = {}
     if not chosen.objects:
         if not len(room.mesh.triangles):
             raise DataError("nothing was mapped: there is no surface to export")
-        files.append(("scene", parts(room, chosen.triangles)))
-    files += [(f"objects/{part.name}", [part.alone]) for part in object_parts(room, chosen.triangles)]
+        files["scene"] = parts(room, chosen.triangles)
+    files |= {f"objects/{part.name}": [part.alone] for part in object_parts(room, chosen.triangles)}
     written = []
     for kind in formats:
-        write = _writer(kind, chosen)
-        for name, shown in files:
+        for name, shown in files.items():
             path = directory / f"{name}{MESHES[kind]}"
             path.parent.mkdir(exist_ok=True)
-            write(path, shown)
+            _write_parts(path, kind, shown, chosen)
             written.append(path)
     return written
 
 
-def _writer(kind: ExportFormat, chosen: Chosen) -> Callable[[Path, Sequence[Part]], None]:
-    if kind is ExportFormat.PLY:
-        return lambda path, shown: write_parts_ply(path, shown, chosen.coloring)
-    if kind is ExportFormat.OBJ:
-        return lambda path, shown: write_parts_obj(path, shown, chosen.coloring)
+def _write_parts(path: Path, kind: ExportFormat, shown: Sequence[Part], chosen: Chosen) -> None:
     if kind is ExportFormat.USD:
-        return lambda path, shown: write_usd(path, shown, chosen.coloring, chosen.collision)
-    return lambda path, shown: _write_glb(path, shown, chosen.coloring)
+        write_usd(path, shown, chosen.coloring, chosen.collision)
+    elif kind is ExportFormat.GLB:
+        with written_whole(path) as temporary:
+            temporary.write_bytes(glb(shown, chosen.coloring))
+    elif kind is ExportFormat.OBJ:
+        with written_whole(path) as temporary:
+            temporary.write_text(_obj(_placed(shown, chosen.coloring)))
+    else:
+        write_mesh(path, joined(list(_placed(shown, chosen.coloring).values())))
 
 
-def _write_glb(path: Path, shown: Sequence[Part], coloring: Coloring) -> None:
-    with written_whole(path) as temporary:
-        temporary.write_bytes(glb(shown, coloring))
+def _placed(shown: Sequence[Part], coloring: Coloring) -> dict[str, InstanceMesh]:
+    """Return the meshes of parts by name, in the room's frame and with their colors."""
+    meshes = {}
+    for part, colors in zip(shown, part_colors(shown, coloring), strict=True):
+        vertices = transform(part.T_room_part, part.mesh.vertices.astype(np.float64)).astype(np.float32)
+        meshes[part.name] = replace(part.mesh, vertices=vertices, colors=colors)
+    return meshes
+
+
+def _obj(meshes: Mapping[str, InstanceMesh]) -> str:
+    """Return an OBJ file with the meshes under their names; `v` lines include an sRGB color: x y z r g b."""
+    scene = trimesh.Scene()
+    for name, mesh in meshes.items():
+        if len(mesh.triangles):
+            shape = trimesh.Trimesh(mesh.vertices, mesh.triangles, vertex_colors=mesh.colors, process=False)
+            scene.add_geometry(shape, name, name)
+    export_obj: Callable[..., str] = trimesh.exchange.obj.export_obj
+    text = export_obj(scene, include_normals=False, digits=OBJ_DIGITS, header=None)
+    return f"# InstanceMap; metres, z up; colours behind the vertices: x y z r g b\n{text}\n"

@@ -1,11 +1,13 @@
-"""floor_plan.png: a room from above for people, with the footprints of objects, their names and a scale bar."""
+"""Floor plans: an image with outlines of objects, their names and a scale bar, and the outlines as GeoJSON."""
 
 from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -14,11 +16,11 @@ from matplotlib.patches import Patch, Polygon, Rectangle
 from matplotlib.patheffects import withStroke
 from matplotlib.transforms import Bbox
 
-from framework.data import UInt8
-from framework.exporting.geojson import outline
+from framework.data import Float64, UInt8
 from framework.exporting.occupancy import Plan
 from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.files.atomic_write import written_whole
+from framework.files.json_file import write_json
 from framework.rendering.palette import FAINT_INK, INK, PAPER
 
 UNSEEN, FLOOR, FREE, OCCUPIED, WALL = (214, 216, 218), (240, 232, 206), PAPER, (150, 154, 160), INK
@@ -30,32 +32,30 @@ TONES = {
     "not seen": UNSEEN,
 }
 DPI = 150
-TINT = 0.6  # of an object's colour in its cells
-DARKER = 0.65  # and in its outline
-LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # inches of paper, of the plan
-FOOT = 0.72  # inches below it, for what the tones mean
+TINT = 0.6  # share of an object's color in its cells
+DARKER = 0.65  # factor of an outline's color
+LONGER_SIDE, SHORTEST_SIDE = 9.0, 4.5  # of the plan, inches
+FOOT = 0.72  # height of the legend, inches
 EDGE = 0.15  # inches
 TEXT_PT, SMALL_PT = 8.0, 7.0
-BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # m, that a scale bar may have
-BAR_SHARE = 0.25  # of the plan's width, at most
+BARS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)  # possible lengths of the scale bar, m
+BAR_SHARE = 0.25  # maximum length of the scale bar by the plan's width
 MOVES = ((0, 0), (0, 1), (0, -1), (0, 2), (0, -2), (0.6, 1), (-0.6, 1), (0.6, -1), (-0.6, -1))
-"""How a name moves aside, in its own widths and heights."""
+"""Offsets of a name that are tried, in its own widths and heights."""
+COORDINATES = "metres in the room: x, y; z is up, and the floor at 0. They are not longitude and latitude."
+DIGITS = 4  # decimal places, of meters
 
 
 def write_floor_plan(path: Path, room: UprightRoom, plan: Plan, robot_height: float) -> None:
-    """Draws the plan to a PNG; the same room gives the same bytes."""
+    """Draw the plan as a PNG file; the same room gives the same bytes."""
     with warnings.catch_warnings(), written_whole(path) as temporary:
-        warnings.filterwarnings(
-            "ignore", "Glyph .* missing from font", UserWarning
-        )  # of names; they are drawn as boxes
-        figure = _drawn(room, plan, robot_height)
-        figure.savefig(temporary, dpi=DPI)
+        warnings.filterwarnings("ignore", "Glyph .* missing from font", UserWarning)  # drawn as boxes
+        _drawn(room, plan, robot_height).savefig(temporary, dpi=DPI)
 
 
 def tones(plan: Plan) -> UInt8:
-    """(H, W, 3) RGB of the cells, row 0 with the lowest y."""
-    image = np.empty((*plan.shape, 3), np.uint8)
-    image[:] = UNSEEN
+    """Return (H, W, 3) RGB of the cells, row 0 with the lowest y."""
+    image = np.tile(np.array(UNSEEN, np.uint8), (*plan.shape, 1))
     for chosen, tone in ((plan.floor, FLOOR), (plan.free, FREE), (plan.occupied, OCCUPIED), (plan.wall, WALL)):
         image[chosen] = tone
     return image
@@ -68,14 +68,10 @@ def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
     page = width + 2 * EDGE, height + FOOT + EDGE
     figure = Figure(page, facecolor=_share(PAPER))
     FigureCanvasAgg(figure)
-    axes = figure.add_axes(
-        (EDGE / page[0], FOOT / page[1], width / page[0], height / page[1]), facecolor=_share(UNSEEN)
-    )
+    frame = EDGE / page[0], FOOT / page[1], width / page[0], height / page[1]
+    axes = figure.add_axes(frame, facecolor=_share(UNSEEN), xticks=[], yticks=[])
     axes.set_aspect("equal", adjustable="datalim")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    for side in axes.spines.values():
-        side.set_visible(False)
+    axes.spines[:].set_visible(False)
     image = tones(plan)
     for one in room.objects:
         image[plan.highest == one.id] = (1 - TINT) * np.array(PAPER) + TINT * one.color
@@ -88,14 +84,14 @@ def _drawn(room: UprightRoom, plan: Plan, robot_height: float) -> Figure:
 
 
 def _draw_outlines(axes: Axes, room: UprightRoom) -> None:
-    """The hulls of the objects, the low ones first, so that what stands on another is seen."""
+    """Draw the outlines of the objects, low ones first, so that objects on top of others stay visible."""
     for one in sorted(room.objects, key=lambda one: (one.top, one.id)):
         dark = _share([round(DARKER * channel) for channel in one.color.tolist()])
         axes.add_patch(Polygon(outline(room, one), fill=False, edgecolor=dark, linewidth=1.0, joinstyle="round"))
 
 
 def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
-    """The large ones first; a name moves aside for those already there, and is left to its number at last."""
+    """Write class and id at each object, large ones first, only the id if there is no space, else nothing."""
     figure = axes.figure
     assert isinstance(figure, Figure)
     renderer = FigureCanvasAgg(figure).get_renderer()
@@ -105,7 +101,7 @@ def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
         words = (f"{one.class_name} {one.id}", str(one.id))
         for text, moves in zip(words, (MOVES, ((0, 0), *MOVES[1:5])), strict=True):
             center_x, center_y, _ = one.box.center.tolist()
-            said = axes.text(
+            label = axes.text(
                 center_x,
                 center_y,
                 text.replace("$", r"\$"),
@@ -115,17 +111,16 @@ def _draw_names(axes: Axes, objects: Sequence[RoomObject]) -> None:
                 va="center",
                 path_effects=[withStroke(linewidth=2.2, foreground=_share(PAPER))],
             )
-            box = said.get_window_extent(renderer)
-            place = axes.transData.transform(one.box.center[:2])
-            moved = [box.translated(x * box.width, y * box.height) for x, y in moves]
-            free = next((k for k, at in enumerate(moved) if _fits(at, taken, inside)), None)
+            box = label.get_window_extent(renderer)
+            shifts = [(x * box.width, y * box.height) for x, y in moves]
+            free = next((shift for shift in shifts if _fits(box.translated(*shift), taken, inside)), None)
             if free is not None:
-                shift = np.array(moves[free]) * (box.width, box.height)
-                x, y = axes.transData.inverted().transform(place + shift).tolist()
-                said.set_position((x, y))
-                taken.append(moved[free])
+                place = axes.transData.transform(one.box.center[:2]) + free
+                x, y = axes.transData.inverted().transform(place).tolist()
+                label.set_position((x, y))
+                taken.append(box.translated(*free))
                 break
-            said.remove()
+            label.remove()
 
 
 def _fits(box: Bbox, taken: Sequence[Bbox], inside: Bbox) -> bool:
@@ -135,7 +130,7 @@ def _fits(box: Bbox, taken: Sequence[Bbox], inside: Bbox) -> bool:
 
 
 def _draw_bar(axes: Axes) -> None:
-    """A scale bar in the lower left corner, on a patch of paper."""
+    """Draw a scale bar in the lower left corner."""
     (left, right), (bottom, top) = axes.get_xlim(), axes.get_ylim()
     length = max([bar for bar in BARS if bar <= BAR_SHARE * (right - left)], default=BARS[0])
     unit = 0.012 * (right - left)
@@ -167,6 +162,47 @@ def _draw_foot(figure: Figure, page: tuple[float, float], plan: Plan, robot_heig
 
 
 def _share(color: Sequence[int]) -> tuple[float, float, float]:
-    """An RGB colour as matplotlib takes it."""
+    """Return an RGB color as matplotlib expects it."""
     red, green, blue = (channel / 255 for channel in color)
     return red, green, blue
+
+
+def write_geojson(path: Path, room: UprightRoom) -> None:
+    """Write the outline of each object as a GeoJSON polygon, counterclockwise.
+
+    RFC 7946 defines coordinates as longitude and latitude; these are meters, as the file states.
+    """
+    write_json(
+        path,
+        {
+            "type": "FeatureCollection",
+            "coordinates_are": COORDINATES,
+            "T_room_world": room.T_room_world.tolist(),
+            "features": [_feature(room, one) for one in room.objects],
+        },
+    )
+
+
+def outline(room: UprightRoom, one: RoomObject) -> Float64:
+    """Return (N, 2) m, the convex hull of an object on the floor, counterclockwise; its box if that has no area."""
+    points = room.mesh.vertices[one.vertices, :2]
+    hull = cv2.convexHull(np.ascontiguousarray(points), clockwise=False)[:, 0].astype(np.float64)
+    return hull if len(hull) >= 3 else one.footprint
+
+
+def _feature(room: UprightRoom, one: RoomObject) -> dict[str, Any]:
+    ring = np.round(outline(room, one), DIGITS).tolist()
+    return {
+        "type": "Feature",
+        "id": one.id,
+        "properties": {
+            "name": one.name,
+            "class": one.class_name,
+            "probability": one.probability,
+            "confidence": one.confidence,
+            "base": round(one.base, DIGITS),
+            "top": round(one.top, DIGITS),
+            "box": np.round(one.footprint, DIGITS).tolist(),
+        },
+        "geometry": {"type": "Polygon", "coordinates": [[*ring, ring[0]]]},
+    }

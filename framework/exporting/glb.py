@@ -6,7 +6,7 @@ objects or classes are lit. The rest of the room shows its front only, so that o
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -47,7 +47,7 @@ def glb(shown: Sequence[Part], coloring: Coloring = Coloring.APPEARANCE) -> byte
 
 def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
     """Nodes as a GLB file; the same nodes give the same bytes. Light falls on them where they are `lit`."""
-    scene = trimesh.Scene(base_frame="world")
+    scene: Any = trimesh.Scene(base_frame="world")
     for node in nodes:
         extras = dict(node.extras)
         if not len(node.triangles):
@@ -63,7 +63,8 @@ def glb_of(nodes: Sequence[Node], lit: bool) -> bytes:
     def finish(tree: dict[str, Any]) -> None:
         _with_materials(tree, lit, {node.name for node in nodes if node.one_sided})
 
-    return bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=lit, tree_postprocessor=finish))
+    export: Callable[..., bytes] = trimesh.exchange.gltf.export_glb
+    return bytes(export(scene, include_normals=lit, tree_postprocessor=finish))
 
 
 def _node(part: Part, colors: UInt8) -> Node:

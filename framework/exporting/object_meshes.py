@@ -9,8 +9,7 @@ from enum import Enum
 import numpy as np
 
 from framework.data import Float32, Float64, InstanceMesh, UInt8
-from framework.exporting.decimation import decimated
-from framework.exporting.submeshes import corners_of, submesh
+from framework.exporting.decimation import corners_of, decimated, submesh
 from framework.exporting.upright_room import RoomObject, UprightRoom
 from framework.geometry import inverse, transform
 from framework.runtime.progress import Progress

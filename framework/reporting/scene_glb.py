@@ -7,10 +7,9 @@ from collections.abc import Mapping
 import numpy as np
 
 from framework.data import Float32, Float64, InstanceMesh
-from framework.exporting.decimation import clustered, triangle_labels
+from framework.exporting.decimation import clustered, corners_of, submesh, triangle_labels
 from framework.exporting.glb import T_GLTF_ROOM, Node, glb_of
 from framework.exporting.object_meshes import REST
-from framework.exporting.submeshes import corners_of, submesh
 from framework.exporting.upright_room import plain_name, upright
 
 MOST_BYTES = 9_500_000  # of the file; browsers of phones still turn it

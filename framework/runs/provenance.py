@@ -73,7 +73,7 @@ def environment() -> dict[str, str | int]:
     return {
         "environment.python": platform.python_version(),
         "environment.platform": platform.platform(),
-        "environment.processor": _processor(),
+        "environment.processor": processor(),
         "environment.cpus": available_cores(),
         "environment.instancemap": framework.__version__,
         **{f"environment.{package}": _version(package) for package in PACKAGES},
@@ -90,7 +90,8 @@ def _git(directory: Path, *arguments: str) -> str | None:
     return done.stdout.strip() if done.returncode == 0 else None
 
 
-def _processor() -> str:
+def processor() -> str:
+    """Return the name of the processor."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text().splitlines() if cpuinfo.exists() else []
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]

@@ -14,7 +14,7 @@ from typing import Any, TypeGuard
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from framework.errors import DataError
+from framework.errors import DataError, first_line
 from framework.files.atomic_write import MOST_TEXT, is_there, read_bytes
 from framework.files.json_file import read_json
 from framework.files.yaml_file import load_yaml
@@ -177,7 +177,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         content = OmegaConf.to_container(load_yaml(path), resolve=False)
     except OmegaConfBaseException as error:
-        raise DataError(f"{path} cannot be read: {_first_line(error)}") from error
+        raise DataError(f"{path} cannot be read: {first_line(error)}") from error
     if not isinstance(content, dict):
         raise DataError(f"{path} must hold keys and values, found a list")
     return {str(key): _with_text_keys(value) for key, value in content.items()}
@@ -237,7 +237,3 @@ def _why_incomplete(directory: Path) -> str:
     if matches and matches[-1]["level"] in ("ERROR", "CRITICAL"):
         return f"failed: {matches[-1]['message']}"
     return "not complete: running, or killed"
-
-
-def _first_line(error: BaseException) -> str:
-    return str(error).partition("\n")[0] or type(error).__name__

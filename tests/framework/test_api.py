@@ -160,7 +160,7 @@ def test_it_works_inside_of_another_program_that_uses_hydra(tmp_path: Path) -> N
 @pytest.mark.parametrize("fuser", registered.names("fuser"))
 def test_any_map_is_read_back(fuser: str, room: CornerRoom, tmp_path: Path) -> None:
     config = composed("~dataset", f"fuser={fuser}", "fuser.voxel_size=0.04")
-    made: MapFuser = build(MapFuser, config.fuser)  # type: ignore[type-abstract]
+    made: MapFuser = build(MapFuser, config.fuser)
     detector = registered.built("detector", "ground_truth")
     for frame in room:
         pose = instancemap.Pose(frame.T_world_camera)

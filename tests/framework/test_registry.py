@@ -260,7 +260,7 @@ def test_another_package_called_plugins_is_named(tmp_path: Path) -> None:
     environment = os.environ | {"PYTHONPATH": f"{tmp_path}:{CHECKOUT}"}
     done = subprocess.run(line, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 1
-    said = f"the package 'plugins' at {tmp_path}/plugins stands in the way of InstanceMap's own at {CHECKOUT}/plugins: "
+    said = f"the package 'plugins' at {tmp_path}/plugins hides InstanceMap's own at {CHECKOUT}/plugins: "
     assert f"{said}rename it or start elsewhere" in done.stderr
     assert len(done.stderr.splitlines()) == 1
     assert "imported" not in done.stdout
@@ -274,6 +274,6 @@ def test_every_stage_has_its_interface() -> None:
 def test_a_video_of_the_wrong_kind_is_named() -> None:
     """`check` and `detect` want frames in any order; a run takes a live video as well."""
     live = "tests.support.scenes.corner_room.LiveRoom"
-    assert find_class(RGBDVideo, live).__name__ == "LiveRoom"  # type: ignore[type-abstract]
+    assert find_class(RGBDVideo, live).__name__ == "LiveRoom"
     with pytest.raises(ConfigError, match=r"LiveRoom: here it must be of the kind RGBDSequence \(A recorded or"):
-        find_class(RGBDSequence, live)  # type: ignore[type-abstract]
+        find_class(RGBDSequence, live)

@@ -4,18 +4,21 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import platform
+import shutil
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict
+from functools import partial, update_wrapper
 from pathlib import Path
 from typing import Any
 
 import framework
 from framework.doctor import machine, networks, packages
 from framework.doctor.check_result import Check, Status, anonymous, run_checks
-from framework.doctor.isolated import probe_all
+from framework.doctor.isolated import ACCELERATION, KERNELS, Outcomes, run_all
+
+LEGEND = "ok: available   --: missing, optional   !!: missing or broken, required by the default stages"
 
 
 def main() -> None:
@@ -34,26 +37,18 @@ def main() -> None:
 
 def examine() -> dict[str, list[Check]]:
     """Return the results by section. Downloads, compiles and writes nothing."""
-    from_torch = ["torch", "gpu()", "int8()"]  # torch takes as long to import as all others: they run in parallel
-    others = [module for module in packages.modules().values() if module not in from_torch]
-    answers = probe_all([from_torch, [*others, "kernels()"]])
-
-    def libraries() -> Iterator[Check]:
-        yield from packages.libraries(answers)
-
-    def acceleration() -> Iterator[Check]:
-        yield from _acceleration(answers)
-
-    def kernels() -> Iterator[Check]:
-        yield from _kernels(answers["kernels()"])
-
+    imports = [packages.import_statement(line.name) for line in packages.declared()[1]]
+    outcomes = run_all([ACCELERATION, KERNELS, *imports])
+    libraries, acceleration, kernels = (
+        update_wrapper(partial(check, outcomes), check) for check in (packages.libraries, _acceleration, _kernels)
+    )
     return {
         "InstanceMap": run_checks(_version),
         "Python and machine": run_checks(_python, machine.hardware, acceleration),
         "Libraries": run_checks(libraries),
         "Extras (optional)": run_checks(packages.extras),
-        "Networks": run_checks(networks.included, networks.published, networks.hugging_face),
-        "System libraries and programs": run_checks(machine.system_libraries, machine.programs),
+        "Networks": run_checks(networks.included_and_hub, networks.published),
+        "System libraries": run_checks(machine.system_libraries),
         "Compiled kernels": run_checks(kernels),
         "Disk": run_checks(machine.disk),
         "Environment variables": run_checks(machine.environment),
@@ -67,7 +62,7 @@ def _version() -> Iterator[Check]:
     found = code_version()
     modified = " with local changes" if found["git_dirty"] is True else ""
     commit = "no checkout" if found["git_commit"] == UNKNOWN else f"{str(found['git_commit'])[:12]}{modified}"
-    yield Check("commit", Status.OK, commit)
+    yield Check.of("commit", shutil.which("git") is not None, commit, "apt-get install git")
 
 
 def _python() -> Iterator[Check]:
@@ -75,40 +70,34 @@ def _python() -> Iterator[Check]:
 
     wanted, version = packages.declared()[0], platform.python_version()
     fits = SpecifierSet(wanted).contains(version, prereleases=True)
-    fix = "" if fits else f"create an environment with Python {wanted}"
-    yield Check("Python", Status.OK if fits else Status.ERROR, f"{version} in {anonymous(sys.prefix)}", fix)
+    fix = f"create an environment with Python {wanted}"
+    yield Check.of("Python", fits, f"{version} in {anonymous(sys.prefix)}", fix, required=True)
     yield Check("platform", Status.OK, platform.platform())
 
 
-def _acceleration(answers: Mapping[str, Mapping[str, Any]]) -> Iterator[Check]:
-    gpu, int8 = answers["gpu()"], answers["int8()"]
-    if gpu.get("gpus"):
-        yield Check("GPU", Status.OK, ", ".join(gpu["gpus"]))
-    elif Path("/proc/driver/nvidia/version").exists():
-        fix = "install a torch build for your driver: https://pytorch.org/get-started/locally"
-        yield Check("GPU", Status.MISSING, gpu.get("error", "torch does not use the NVIDIA driver"), fix)
-    else:
-        yield Check("GPU", Status.MISSING, gpu.get("error", "no CUDA device; networks run on the CPU"))
-    supported = bool(int8.get("supported"))
-    detail = int8.get("error", "VNNI" if supported else "no VNNI; maskrcnn2go runs in float32, three times slower")
-    yield Check("8-bit integers", Status.OK if supported else Status.MISSING, detail)
+def _acceleration(outcomes: Outcomes) -> Iterator[Check]:
+    answer, error = outcomes[ACCELERATION]
+    found: dict[str, Any] = json.loads(answer) if answer else {"gpus": [], "int8": False}
+    has_driver = Path("/proc/driver/nvidia/version").exists()
+    detail = "torch does not use the NVIDIA driver" if has_driver else "none; networks run on the CPU"
+    fix = "install a torch build for your driver: https://pytorch.org/get-started/locally" if has_driver else ""
+    yield Check.of("GPU", bool(found["gpus"]), ", ".join(found["gpus"]) or error or detail, fix)
+    detail = "VNNI" if found["int8"] else error or "no VNNI; maskrcnn2go runs in float32, three times slower"
+    yield Check.of("8-bit integers", found["int8"], detail)
 
 
-def _kernels(answer: Mapping[str, Any]) -> Iterator[Check]:
-    if "error" in answer:
-        yield Check("kernels", Status.ERROR, answer["error"])
+def _kernels(outcomes: Outcomes) -> Iterator[Check]:
+    answer, error = outcomes[KERNELS]
+    if error:
+        yield Check("kernels", Status.ERROR, error)
         return
-    for name, command in (("default stages", "instancemap compile"), ("other stages", "instancemap compile --all")):
-        compiled, count = answer[name]
-        complete = compiled == count
-        detail = f"{compiled} of {count} kernels compiled"
-        yield Check(name, Status.OK if complete else Status.MISSING, detail, "" if complete else command)
-    folder = Path(answer["folder"])
-    existing = next(path for path in (folder, *folder.parents) if path.exists())
-    writable = os.access(existing, os.W_OK)
-    detail = anonymous(str(folder)) + ("" if writable else " is not writable: every process compiles its kernels")
-    fix = "" if writable else "set the environment variable NUMBA_CACHE_DIR"
-    yield Check("kernel cache", Status.OK if writable else Status.MISSING, detail, fix)
+    found = json.loads(answer)
+    commands = {"default stages": "instancemap compile", "other stages": "instancemap compile --all"}
+    for (name, command), (compiled, count) in zip(commands.items(), found["counts"], strict=True):
+        yield Check.of(name, compiled == count, f"{compiled} of {count} kernels compiled", command)
+    _, writable = machine.writable_parent(Path(found["folder"]))
+    detail = anonymous(found["folder"]) + ("" if writable else " is not writable: every process compiles its kernels")
+    yield Check.of("kernel cache", writable, detail, "set the environment variable NUMBA_CACHE_DIR")
 
 
 def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
@@ -118,11 +107,9 @@ def _as_text(sections: Mapping[str, list[Check]], errors: int) -> str:
         width = max((len(check.name) for check in checks), default=0)
         for check in checks:
             lines.append(f"  {check.status.value}  {check.name:<{width}}  {check.detail}".rstrip())
-            if check.fix:
-                lines.append(f"      {'':<{width}}  fix: {check.fix}")
+            lines += [f"      {'':<{width}}  fix: {check.fix}"] if check.fix else []
         lines.append("")
-    lines.append("ok: available   --: missing, optional   !!: missing or broken, required by the default stages")
-    lines.append(f"{errors} required checks failed." if errors else "All required checks passed.")
+    lines += [LEGEND, f"{errors} required checks failed." if errors else "All required checks passed."]
     return "\n".join(lines).encode("ascii", "backslashreplace").decode()
 
 

@@ -69,7 +69,7 @@ def line_of(option: Path, content: bytes) -> str:
     option.write_bytes(content)
     began = time.process_time()
     try:
-        build(Detector, composed("~dataset", "detector=mine").get("detector"))  # type: ignore[type-abstract]
+        build(Detector, composed("~dataset", "detector=mine").get("detector"))
     except InstanceMapError as error:
         line = str(error)
     else:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from framework.data import Camera, InstanceMesh
-from framework.exporting.submeshes import joined
+from framework.exporting.decimation import joined
 from framework.reporting.visibility import LOOKS, sightings, spread_out
 
 CAMERA = Camera(200, 150, 150.0, 150.0, 99.5, 74.5)

@@ -134,8 +134,8 @@ def test_every_row_of_every_experiment_composes_and_is_another(experiment: str) 
         resolved = OmegaConf.to_container(config, resolve=True)
         assert isinstance(resolved, dict)
         hashes[row] = config_hash({str(key): value for key, value in resolved.items()})
-        build(ClusterRefiner, config.refiner)  # type: ignore[type-abstract]
-        build(MapFuser, config.fuser)  # type: ignore[type-abstract]
+        build(ClusterRefiner, config.refiner)
+        build(MapFuser, config.fuser)
         assert choices["experiment"] == experiment
         assert config.dataset.seed == 1
         assert config.row == row
