@@ -1,21 +1,21 @@
-"""The contracts: four stages that plugins fill in, the map that they build, the video that feeds them, who watches.
+"""The interfaces between the pipeline and its plugins.
 
     frame --> Detector --> lift to 3D --> ClusterRefiner --> MapFuser --> SceneMap
       '-----> PoseTracker ----'                                 |
                   ^                                             |
                   '------------- view of the map ---------------'
 
-A plugin is a dataclass that implements one of these interfaces. Its dataclass fields are its parameters (bool, int,
-float, str, Path, Enum or list[str], with unit and bounds beside the default), checked in `__post_init__`; whatever else
-it keeps is assigned there as a plain attribute, never declared as a field. What several plugins do by the same
-parameters is a part, a field of another dataclass that has these and the methods; in a config they are the plugin's
-own. A field may be another plugin, or several by name. One YAML file in the stage's config group registers it.
+A plugin is a dataclass that implements one of these interfaces. Its fields are its parameters: bool, int, float, str,
+Path, Enum or list[str], with unit and bounds next to the default, validated in `__post_init__`. Assign other state
+there as plain attributes. A field may also be a component (a dataclass whose fields become parameters of the plugin),
+another plugin, or a mapping of plugins. A YAML file in the config group of the stage registers the plugin.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Generator, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from framework.data import (
@@ -36,60 +36,58 @@ from framework.data import (
 from framework.errors import ConfigError
 
 FrameReader = Callable[[], Frame]
-"""Reads a frame that is there. Raises FrameError when it cannot be used."""
+"""Reads one available frame. Raises FrameError if the frame is unusable."""
 
 
 class RGBDVideo(ABC):
-    """Where frames come from: a recording (`RGBDSequence`), or a camera that runs (`LiveVideo`)."""
+    """A source of frames: a stored sequence (`RGBDSequence`) or a running camera (`LiveVideo`)."""
 
-    name: str  # for tables: the scene
-    annotation: str = ""  # for tables: which release of the true instances; "" = there is but one
-    domain: str = ""  # what its pictures are, as a detector may ask: "rendered rooms"; "" = photographs, or not known
+    name: str  # of the scene, for tables
+    annotation: str = ""  # release of the ground truth, for tables; "" = there is only one
+    domain: str = ""  # of the images, compared with that of a detector: "rendered rooms"; "" = photographs, or unknown
 
     def has_poses(self) -> bool:
-        """Whether any of the frames may have a true pose; some of them may lack it. Asked before any frame is read."""
+        """Return whether frames may have true poses. Called before any frame is read; some frames may lack one."""
         return True
 
     def scene_truth(self) -> SceneTruth | None:
-        """The true instances of the chosen frames' scene, None where nobody labelled it."""
+        """Return the true instances visible in the selected frames, or None if there is no annotation."""
         return None
 
 
 class RGBDSequence(RGBDVideo):
-    """A recorded or rendered RGB-D video, read frame by frame.
+    """A recorded or rendered RGB-D sequence with random access.
 
-    Every one has the parameters `start`, `stop`, `stride` and `frame_fraction`, which choose from the frames that
-    there are.
+    Every implementation has the parameters `start`, `stop`, `stride` and `frame_fraction`, which select frames.
     """
 
     camera: Camera
 
     @abstractmethod
     def __len__(self) -> int:
-        """The number of frames chosen."""
+        """Return the number of selected frames."""
 
     @abstractmethod
     def __getitem__(self, k: int) -> Frame:
-        """Frame k of the chosen ones, 0 <= k < len. Raises FrameError when that frame cannot be read.
-
-        A run asks for one after the other in their order, from whatever thread.
-        """
+        """Return selected frame k, 0 <= k < len; called in order, from any thread. Raises FrameError if unusable."""
 
     def __iter__(self) -> Iterator[Frame]:
         return (self[k] for k in range(len(self)))
 
 
 class LiveVideo(RGBDVideo):
-    """An RGB-D video that goes on while it is mapped. What comes while nobody has time for it is dropped."""
+    """A camera stream that is mapped while it runs. If mapping falls behind, frames are dropped."""
 
     @abstractmethod
     def frames(self) -> Generator[FrameReader | None]:
-        """The frames as they come, and None at least ten times a second while none does; ends with the video.
+        """Yield a reader for each new frame, and None at least ten times a second while there is no frame.
 
-        Frames have growing numbers, and for a timestamp the time when they were there, s since 1970 by this computer's
-        clock. Each is read once or not at all, in another thread, while the iterator waits for the next one. The device
-        or folder is opened when the first is asked for, and given back when the iterator is closed, which may happen
-        wherever it yields. Raises DataError when it cannot be opened, or fails.
+        Frame indices increase. Timestamps are capture times, s since 1970 on this computer's clock. Each reader is
+        called at most once, in another thread, while the generator waits. The device is opened with the first `next`
+        and closed with the generator, which may happen at any yield.
+
+        Raises:
+            DataError: the device cannot be opened, or fails.
         """
 
     def has_poses(self) -> bool:
@@ -99,26 +97,28 @@ class LiveVideo(RGBDVideo):
 class Detector(ABC):
     """Finds object instances in one image."""
 
-    classes: tuple[str, ...]  # names of the columns of class_probabilities; known once the detector is built
-    concurrent: bool = False  # whether several threads may call `detect` at once; each then keeps about a core busy
+    classes: tuple[str, ...]  # names of the columns of class_probabilities; set by the constructor
+    concurrent: bool = False  # whether threads may call `detect` at the same time; each call uses about one core
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:
-        """The objects in `frame`. The same frame gives the same detections, in whatever order frames come."""
+        """Return the objects in `frame`. The result depends on the frame alone, not on the order of frames."""
 
 
 class PoseTracker(ABC):
     """Estimates the camera pose."""
 
-    pose_source: str = "tracked"  # for tables; `ground_truth` of a tracker that returns the sequence's own poses
+    pose_source: str = "tracked"  # for tables; `ground_truth` for a tracker that returns the poses of the sequence
 
     @abstractmethod
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """The pose of `frame`; called once per frame, in order. `scene` is read only.
+        """Return the pose of `frame`; called once per frame, in order. `scene` is read only.
 
-        `Pose.lost` says that the tracker cannot tell; the frame is then not integrated. The first frame defines the
-        world: its true pose where known, else the identity. A tracker of given poses raises NoPoseError for a frame
-        that has none: the frame is skipped.
+        Set `Pose.lost` if the pose cannot be estimated; the frame is then not integrated. The first frame defines the
+        world frame: its true pose if known, otherwise the identity.
+
+        Raises:
+            NoPoseError: the tracker returns given poses, and this frame has none. The frame is skipped.
         """
 
     def keyframes(self) -> Mapping[str, Array]:
@@ -140,13 +140,13 @@ class PoseTracker(ABC):
 
 
 class ClusterRefiner(ABC):
-    """Cleans, splits or merges this frame's point clusters."""
+    """Cleans, splits or merges the point clusters of one frame."""
 
     @abstractmethod
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        """Points in, points out. `pixels` say where in `frame` each point was seen; N may change.
+        """Return the refined clusters; their number may change. `pixels` are the pixels of `frame` of each point.
 
-        Clusters that are `exact` never get here: `framework.refinement.refine` passes them on.
+        `framework.refinement.refine` bypasses this method for clusters that are `exact`.
         """
 
 
@@ -157,9 +157,10 @@ class MapFuser(ABC):
 
     @abstractmethod
     def fuse(self, frame: Frame, pose: Pose, clusters: PointClusters) -> None:
-        """Integrates `frame`, seen from `pose`, with the evidence of its `clusters`.
+        """Integrate `frame`, taken at `pose`, and the evidence of its `clusters`.
 
-        Raises MapFullError when the map's block budget is reached.
+        Raises:
+            MapFullError: the block budget of the map is reached.
         """
 
     def resume(self, scene: SceneMap) -> None:
@@ -171,113 +172,106 @@ class MapFuser(ABC):
         raise ConfigError(f"fuser: {type(self).__name__} cannot resume a stored map; choose another fuser")
 
 
+@dataclass(frozen=True)
+class MapStatistics:
+    """The size of a map."""
+
+    voxels: int  # allocated
+    bytes: int  # of the arrays
+    evictions: int = 0  # label slots of voxels that were given to another label
+
+
+@dataclass(frozen=True)
+class Gravity:
+    """The direction of gravity in the world frame of a map."""
+
+    up: Float64 | None = None  # (3,) unit vector against gravity; None = unknown
+    source: str = ""  # "sensor" or "surfaces"; "" = unknown
+
+
 class SceneMap(ABC):
-    """What a fuser builds."""
+    """The map that a fuser builds.
+
+    Implement `classes` and the six abstract members. Override the other six if the map knows more, or has a faster way.
+    """
 
     classes: tuple[str, ...]  # the label space; empty until the first frame is fused
 
     @property
     @abstractmethod
-    def voxel_count(self) -> int:
-        """Voxels allocated."""
-
-    @property
-    @abstractmethod
-    def byte_count(self) -> int:
-        """Bytes that the map's arrays take."""
+    def statistics(self) -> MapStatistics:
+        """The size of the map; read once per frame."""
 
     @property
     def depth_range(self) -> tuple[float, float]:
-        """m: readings that are nearer or farther leave nothing in the map."""
+        """(nearest, farthest) depth, m, that is integrated."""
         return 0.0, float("inf")
 
     @property
-    def evictions(self) -> int:
-        """How often a voxel had to forget a label for want of room; a map that never forgets leaves it at 0."""
-        return 0
-
-    @property
     def embedding_space(self) -> str:
-        """What the `embedding` of its objects is of, as in Detections; "" where none has one."""
+        """The space of `Instance.embedding`, as in Detections; "" if there are no embeddings."""
         return ""
 
-    @property
-    def instance_count(self) -> int:
-        """The number of objects found so far; asked often, for the progress bar: override it where it can be cheap."""
-        return len(self.instances())
-
     def instance_ids(self) -> frozenset[int]:
-        """Their ids; asked after each frame by who maps frames as they come: override it where it can be cheap."""
+        """Return the ids of the objects found so far; called after each frame of a `Mapper`."""
         return frozenset(self.instances())
 
     def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
         """Return the most likely class of each object (an index into `classes`) and its confidence, by id.
 
-        Viewers call it about once per second; override it if the map has a faster way.
+        Viewers call it about once per second.
         """
         found = self.instances().values()
         return {one.id: (int(one.class_probabilities.argmax()), one.confidence) for one in found}
 
+    def gravity(self) -> Gravity:
+        """Return the direction of gravity in the world frame."""
+        return Gravity()
+
     @abstractmethod
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """What `camera` would see of the map, by ray-casting. Raises DataError where T_world_camera is no pose."""
+        """Return the view of the map from a camera. Raises DataError if T_world_camera is not a pose."""
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        """The surface that `camera` would see where it reads `depth` (H, W) m: what a tracker compares a frame with.
+        """Return the surface near the measured `depth` (H, W) m, which a tracker compares with the frame.
 
-        A map may begin its search at the readings, and show nothing where there is none and nothing far behind them.
+        A map may start the search at the readings, and omit pixels without a reading and surfaces far behind it.
         """
         return self.render(camera, T_world_camera)
 
     @abstractmethod
     def mesh(self) -> InstanceMesh:
-        """The surface, with colour, instance and class for each vertex."""
-
-    def up(self) -> Float64 | None:
-        """The unit vector (3,) against gravity in the world, None where the map does not tell."""
-        return None
-
-    @property
-    def up_is_sensed(self) -> bool:
-        """Whether `up` is what a sensor told of the frames, and not found in the surface."""
-        return False
-
-    def up_source(self) -> str:
-        """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
-        if self.up() is None:
-            return ""
-        return "sensor" if self.up_is_sensed else "surfaces"
+        """Return the surface, with color, instance and class of each vertex."""
 
     @abstractmethod
     def instances(self) -> Mapping[int, Instance]:
-        """The objects found so far, by id. Vertex indices refer to `mesh()` of the same map."""
+        """Return the objects found so far, by id. Vertex indices refer to `mesh()`."""
 
     @abstractmethod
     def save(self, path: Path | str) -> None:
-        """Writes the map to one file, whole or not at all."""
+        """Write the map to one file, atomically."""
 
     @classmethod
     @abstractmethod
     def load(cls, path: Path | str) -> SceneMap:
-        """The map that `save` wrote. Raises DataError when the file is not such a map or was damaged."""
+        """Return the map in a file of `save`. Raises DataError if the file is damaged or of another kind."""
 
 
 class Viewer:
-    """Shows a run while it goes on. This one shows nothing; a viewer has the verbs that it needs.
+    """Shows a run while it is in progress. This class shows nothing; override the methods that a viewer needs.
 
-    All are called by the loop, which waits for them: what takes time belongs into a thread of its own
-    (`framework.live_view.drawing_thread`). Read the map only within a call, while it is not being written.
-    Whatever a viewer does, it changes no result.
+    The pipeline waits for each call, so do slow work in a thread (`framework.live_view.drawing_thread`). Read the map
+    only within a call. A viewer never changes results.
     """
 
     def begin(self, scene: SceneMap, video: str, directory: Path) -> None:
-        """A video begins; files go to `directory`. Raises ConfigError where it cannot be shown."""
+        """Start a video; write files to `directory`. Raises ConfigError if it cannot be shown."""
 
     def show(self, frame: Frame, detections: Detections, pose: Pose, stage_ms: Mapping[str, float]) -> None:
-        """A frame is in the map, or its pose is lost. `stage_ms`: what each stage took, by its name."""
+        """Show a frame that was integrated, or whose pose is lost. `stage_ms` is the time of each stage, by name."""
 
     def skip(self, reason: str) -> None:
-        """A frame cannot be used."""
+        """Report an unusable frame."""
 
     def end(self) -> None:
-        """No frame follows, however the run ended; called once after `begin`."""
+        """Finish, however the run ended; called once after `begin`."""

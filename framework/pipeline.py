@@ -104,7 +104,7 @@ class Pipeline:
                 raise journal.stopped_by
             if isinstance(video, LiveVideo) and journal.stopped_by is interruption.asked:
                 journal.stopped_by = None  # that is how it ends; a second signal is another Interrupted
-        elif journal.frames_in_map == 0 or self.fuser.scene.voxel_count == 0:
+        elif journal.frames_in_map == 0 or self.fuser.scene.statistics.voxels == 0:
             raise DataError(f"{video.name}: {self.why_nothing(journal)}")
         return replace(journal.result(), keyframes=keyframes)
 

@@ -1,14 +1,11 @@
-"""A volume of one object: a TSDF that grows where the object's masks show it, and how often each voxel was in them.
+"""The volume of one object: a TSDF that grows where the object's masks are, and mask counts of its voxels.
 
-After Fusion++ (McCormac et al. 2018): a voxel counts the observations in which a mask of the object lay over it and
-those in which none did. Its foreground probability is the mean of the Beta distribution that they make of the uniform
-one, and the object's surface is where that is above 1/2. So a mask that bleeds now and then does no harm where the same
-place is seen again later; one that always bleeds does.
+After Fusion++ (McCormac et al. 2018): a voxel counts its observations under a mask of the object, and all of them. Its
+foreground probability is the mean of Beta(1 + foreground, 1 + background), and the object's surface is where it exceeds
+1/2. So occasional errors of masks are outvoted, and systematic ones are not.
 
-All that is measured in the volume's blocks is integrated, masked or not, and separated by that probability only: the
-distances at an object's outline are as good as elsewhere.
-
-The blocks are those of a VoxelGrid, aligned with all others, and counts take 4 bytes a voxel beside its 8.
+Every reading in the blocks of the volume is integrated, whether masked or not, so that distances at the outline are as
+accurate as elsewhere. Blocks are aligned with those of other volumes; counts take 4 bytes a voxel in addition to 8.
 """
 
 from __future__ import annotations
@@ -18,29 +15,30 @@ from typing import Any
 import numpy as np
 
 from framework.baselines.object_volume_kernels import MaskCounts, count_masks, foreground_at
-from framework.data import Array, Bool, Float32, Float64, Frame
+from framework.data import Array, Bool, Camera, Float32, Float64, Frame, Int32
+from framework.geometry import inverse
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 from framework.mapping.voxels.voxel_grid import grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, BLOCK_VOXELS
 
-FOREGROUND = 0.5  # probability above which a voxel is the object's
+FOREGROUND = 0.5  # probability above which a voxel belongs to the object
 
 VOLUME_ARRAYS = (*(name for name in BLOCK_ARRAYS if name != "label_row"), *MaskCounts._fields)  # that are saved
 
 
 class ObjectVolume:
-    """One object's TSDF and mask counts."""
+    """The TSDF and the mask counts of one object."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.volume = TsdfVolume(voxel_size, sensor, max_blocks)
         self.voxels = self.volume.voxels
         self.counts = MaskCounts(np.zeros((0, BLOCK_VOXELS), np.uint16), np.zeros((0, BLOCK_VOXELS), np.uint16))
-        self.low = np.full(3, np.inf)  # m: the corners of the box around its blocks
+        self.low = np.full(3, np.inf)  # m: corners of the bounding box of its blocks
         self.high = np.full(3, -np.inf)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickling: without what is only reserved."""
+        """Return the state without unused capacity."""
         return {**vars(self), "counts": MaskCounts(*(counts[: self.block_count] for counts in self.counts))}
 
     @property
@@ -52,48 +50,73 @@ class ObjectVolume:
         return self.voxels.byte_count + sum(counts[: self.block_count].nbytes for counts in self.counts)
 
     def integrate(self, frame: Frame, T_world_camera: Float64, mask: Bool, band: float) -> None:
-        """Adds what `frame` measures in the volume, which grows where `mask` (H, W) shows the object.
+        """Integrate `frame` into the volume, which grows where `mask` (H, W) shows the object.
 
-        Voxels within `band` m of the measured surface count whether they are under the mask. Raises MapFullError when
-        the volume's block budget is reached; nothing is added then.
+        Voxels within `band` m of the measured surface count whether they are under the mask. Raises MapFullError if the
+        block budget is reached; nothing is integrated then.
         """
         seen = self.volume.integrator.integrate_object(frame, T_world_camera, band, mask)
         self._grow()
         count_masks(seen, mask, self.counts)
-        self._measure()
+        self._update_bounds()
         self.volume.changed(seen.blocks)
 
     def _grow(self) -> None:
-        """Makes room for the counts of new blocks, which are 0."""
+        """Allocate the counts of new blocks, which are 0."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.counts.observed) < capacity:
             self.counts = MaskCounts(*(grown(counts, capacity, zeros=True) for counts in self.counts))
 
-    def _measure(self) -> None:
+    def _update_bounds(self) -> None:
         coords = self.voxels.grid.block_coords[: self.block_count]
         if len(coords):
             side = BLOCK_SIDE * float(self.voxels.grid.voxel_size)
             self.low, self.high = coords.min(axis=0) * side, (coords.max(axis=0) + 1) * side
 
     def encloses(self, points_world: Float32) -> Bool:
-        """(P,) whether points (P, 3) m lie in the box around the volume's blocks."""
+        """Return (P,) whether points (P, 3) m lie in the bounding box of the blocks."""
         return np.asarray(((points_world >= self.low) & (points_world <= self.high)).all(axis=1))
 
     def foreground_at(self, points_world: Float32) -> Float32:
-        """(P,) the probability that points (P, 3) m of a surface are the object's."""
+        """Return the probability (P,) that points (P, 3) m of a surface belong to the object."""
         probability = np.empty(len(points_world), np.float32)
         foreground_at(self.voxels.grid, self.counts, points_world, probability)
         return probability
 
     def arrays(self) -> dict[str, Array]:
-        """What is saved of it."""
+        """Return the arrays that are saved."""
         arrays = self.volume.saved()[1] | {n: counts[: self.block_count] for n, counts in self.counts._asdict().items()}
         return {name: arrays[name] for name in VOLUME_ARRAYS}
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Takes over what `arrays` of another volume gave, into one that is empty."""
+        """Copy the saved arrays of another volume into an empty one."""
         self.volume.fill(arrays)
         self._grow()
         for name, counts in self.counts._asdict().items():
             counts[: self.block_count] = arrays[name]
-        self._measure()
+        self._update_bounds()
+
+
+def boxes_in_view(camera: Camera, T_world_camera: Float64, low: Float64, high: Float64, near: float) -> Int32:
+    """Return u0, v0, u1, v1 (N, 4): the pixels, u1 and v1 exclusive, that can see boxes of the world.
+
+    The windows are never too small. A box out of view has u1 <= u0 or v1 <= v0.
+
+    Args:
+        low: (N, 3) m, with `high` the corners of the boxes.
+        near: The least visible depth, m.
+    """
+    T_camera_world = inverse(T_world_camera)
+    center = (low + high) / 2 @ T_camera_world[:3, :3].T + T_camera_world[:3, 3]
+    half = (high - low) / 2 @ np.abs(T_camera_world[:3, :3]).T
+    left, top, z0 = (center - half).T
+    right, bottom, z1 = (center + half).T
+    z0, z1 = np.maximum(z0, near), np.maximum(z1, near)
+    # rays diverge: a side is farthest out at its nearest depth, or at its farthest on the other side of the axis
+    first = np.stack([camera.fx * np.minimum(left / z0, left / z1), camera.fy * np.minimum(top / z0, top / z1)])
+    last = np.stack([camera.fx * np.maximum(right / z0, right / z1), camera.fy * np.maximum(bottom / z0, bottom / z1)])
+    middle, size = np.array([[camera.cx], [camera.cy]]), np.array([[camera.width], [camera.height]])
+    first = np.clip(np.floor(first + middle), 0, size)
+    last = np.clip(np.ceil(last + middle) + 1, 0, size)
+    last[:, z1 <= near] = 0
+    return np.concatenate([first, last]).T.astype(np.int32)

@@ -1,8 +1,7 @@
-"""A map of object instances in Open3D's voxel blocks: each voxel votes for the instance that it belongs to."""
+"""A map of object instances in Open3D's voxel blocks, with one majority vote per voxel."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
 from functools import cached_property
 from pathlib import Path
@@ -10,12 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from framework.baselines.open3d_grid import ATTRIBUTES, BlockGrid, BlockGridSettings, points_of
-from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
+from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
 from framework.geometry import back_project, transform
-from framework.interfaces import SceneMap
-from framework.mapping.gravity import Gravity
-from framework.mapping.instances.association import agreed_classes
-from framework.mapping.instances.instance_list import Confirmation, list_instances
+from framework.interfaces import Gravity, MapStatistics
+from framework.mapping.gravity import GravityEstimator
+from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.storage.map_file import (
     check_known,
@@ -27,65 +25,38 @@ from framework.mapping.storage.map_file import (
     write_map,
 )
 
-FORMAT = "open3d_vbg 5"  # of the saved file; a change of meaning counts it up
+FORMAT = "open3d_vbg 5"  # of the map file; increment it when the meaning of the contents changes
 
 
-class Open3DMap(SceneMap):
-    """Open3D's voxel blocks and the table of instances as one map.
-
-    An instance's class is that of the table, the same for all its voxels. `mesh` and `instances` have the instances
-    that count; `render` and `instances_seen` the tentative ones too.
-    """
+class Open3DMap(InstanceTableMap):
+    """The voxel blocks of Open3D and an instance table. All voxels of an instance have the class of its record."""
 
     def __init__(self, settings: BlockGridSettings, confirmation: Confirmation) -> None:
         self.classes: tuple[str, ...] = ()
         self.table = InstanceTable()
         self.confirmation = confirmation
         self.grid = BlockGrid(settings)
-        self.gravity = Gravity()
+        self.gravity_estimator = GravityEstimator()
 
     @property
-    def voxel_count(self) -> int:
-        return self.grid.voxel_count
-
-    @property
-    def byte_count(self) -> int:
-        return self.grid.byte_count
+    def statistics(self) -> MapStatistics:
+        return MapStatistics(self.grid.voxel_count, self.grid.byte_count)
 
     @property
     def depth_range(self) -> tuple[float, float]:
         return self.grid.settings.min_depth, self.grid.settings.max_depth
 
-    @property
-    def embedding_space(self) -> str:
-        return self.table.embedding_space
-
-    @property
-    def instance_count(self) -> int:
-        """Without the condition on their area, which takes a mesh."""
-        return self.confirmation.count(self.table)
-
-    def instance_ids(self) -> frozenset[int]:
-        return self.confirmation.ids(self.table)
-
-    def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
-        return self.confirmation.most_likely_classes(self.table)
-
-    def begin(self, classes: tuple[str, ...]) -> None:
-        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
-        self.classes = agreed_classes(self.classes, classes)
-
     def integrate(self, frame: Frame, T_world_camera: Float64) -> None:
-        """Adds the depth and the colour of `frame`. Raises MapFullError, and adds nothing, at the end of the budget."""
+        """Integrate `frame`. Raises MapFullError if the block budget is reached; nothing is integrated then."""
         self.grid.integrate(frame, T_world_camera)
-        self.gravity.held(T_world_camera, frame.up)
+        self.gravity_estimator.add_frame(T_world_camera, frame.up)
         self.changed()
 
     def vote(self, frame: Frame, T_world_camera: Float64, instance_ids: Int32, band: float) -> None:
-        """Each voxel within `band` voxels of the depth measured along its ray votes for the id of its pixel.
+        """Vote for instance_ids (H, W), 0 = no vote, in the voxels within `band` voxels of the measured depth.
 
-        `instance_ids` (H, W), 0 = nothing to say. A voxel holds one candidate and one counter, and ends with the
-        majority where there is one: Boyer and Moore, "MJRTY - a fast majority vote algorithm", 1981.
+        A voxel stores one candidate and one counter, which find the majority, if there is one: Boyer and Moore, "MJRTY
+        - a fast majority vote algorithm", 1981.
         """
         voxels, pixels = self.grid.voxels_seen(frame, T_world_camera, instance_ids > 0, band)
         ids = instance_ids.ravel()[pixels]
@@ -105,11 +76,11 @@ class Open3DMap(SceneMap):
         self.changed()
 
     def changed(self) -> None:
-        """To be called after the map was written: what was derived from it is out of date."""
+        """Invalidate derived data after writing the map."""
         self.__dict__.pop("_mesh", None)
 
     def instances_at(self, points_world: Float32) -> Int32:
-        """(P,) the instance of the voxel nearest to each of the points (P, 3) m; 0 where nothing is mapped."""
+        """Return the instance (P,) of the voxel nearest to each of points (P, 3) m; 0 = none."""
         voxels = self.grid.voxels_at(points_world)
         return np.where(voxels >= 0, self.grid.flat("instance")[voxels], 0).astype(np.int32)
 
@@ -130,7 +101,7 @@ class Open3DMap(SceneMap):
         return View(**vars(surface), instance_ids=instance_ids, class_ids=self.table.class_ids()[instance_ids])
 
     def render_near(self, camera: Camera, T_world_camera: Float64, depth: Float32) -> SurfaceView:
-        """The surface without its labels; Open3D has no use for `depth`."""
+        """Return the surface without labels; Open3D cannot use `depth`."""
         return self.grid.ray_cast(camera, T_world_camera)
 
     def mesh(self) -> InstanceMesh:
@@ -144,16 +115,9 @@ class Open3DMap(SceneMap):
         ids[self.confirmation.too_small(ids, self.grid.settings.voxel_size)] = 0
         return InstanceMesh(vertices, triangles, colors, ids, self.table.class_ids()[ids], self.classes)
 
-    def instances(self) -> Mapping[int, Instance]:
-        return list_instances(self.mesh(), self.table, self.up())
-
-    def up(self) -> Float64 | None:
+    def gravity(self) -> Gravity:
         mesh = self.mesh()
-        return self.gravity.up(mesh.vertices, mesh.triangles)
-
-    @property
-    def up_is_sensed(self) -> bool:
-        return self.gravity.sensed() is not None
+        return self.gravity_estimator.estimate(mesh.vertices, mesh.triangles)
 
     def save(self, path: Path | str) -> None:
         header = {
@@ -162,7 +126,7 @@ class Open3DMap(SceneMap):
             "confirmation": asdict(self.confirmation),
             "classes": self.classes,
             "frames": self.grid.frames,
-            **self.gravity.saved(),
+            **self.gravity_estimator.saved(),
             "table": plain_table(self.table),
         }
         write_map(path, header, self.grid.arrays() | table_arrays(self.table))
@@ -176,7 +140,7 @@ class Open3DMap(SceneMap):
             scene.classes = header.classes()
             scene.table = table_of(header.part("table"), len(scene.classes), arrays)
             scene.grid.frames = header.whole("frames")
-            scene.gravity = Gravity.of(header)
+            scene.gravity_estimator = GravityEstimator.of(header)
             scene.grid.fill(arrays)
             check_known("instance", arrays["instance"], [0, *scene.table.records])
         return scene

@@ -1,17 +1,17 @@
-"""A map that knows classes and no instances: these are found, when asked for, as connected surface of one class."""
+"""A semantic map: voxels store classes only; instances are the connected components of one class in the mesh."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from framework.baselines.class_evidence import ClassEvidence, ClassRows
-from framework.baselines.connected_components import component_statistics, connected_components, vertex_classes
-from framework.baselines.semantic_map_kernels import label_view
-from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, SurfaceView, View
-from framework.interfaces import SceneMap
+from framework.baselines.semantic_map_kernels import connect_vertices, label_classes, label_view, sum_components
+from framework.data import Camera, Float32, Float64, Instance, InstanceMesh, Int32, SurfaceView, View
+from framework.interfaces import Gravity, MapStatistics, SceneMap
 from framework.mapping.instances.association import agreed_classes
 from framework.mapping.instances.instance_list import aligned_box, box_around, vertices_by_id, vertices_of_area
 from framework.mapping.storage.map_file import faults_of, read_map, write_map
@@ -19,15 +19,24 @@ from framework.mapping.voxels.integration_parameters import pinhole
 from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, TsdfVolume
 
-MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of what a map is made with; m^2
-FORMAT = "semantic 3"  # of the saved file; a change of meaning counts it up
+MISSED, AREA = (1e-6, 1.0), (0.0, 1000.0)  # bounds of the parameters; AREA in m^2
+FORMAT = "semantic 3"  # of the map file; increment it when the meaning of the contents changes
+
+
+class ComponentStatistics(NamedTuple):
+    """Sums over the nearest voxels of the vertices of K components, by id; entry 0 is not used."""
+
+    probability_sums: Float64  # (K + 1, C) of each class, over the vertices; the remainder is the background's
+    masked: Int32  # (K + 1,) the most frames in which one of the voxels was under a mask
+    first_frame: Int32  # (K + 1,) the first and the last of these frames of any voxel, -1 = none
+    last_frame: Int32  # (K + 1,)
 
 
 class SemanticMap(SceneMap):
-    """A TSDF with a distribution over the classes and the background in its voxels.
+    """A TSDF whose voxels store a distribution over the classes and the background.
 
-    `missed` is the probability that a surface of any class lies under no mask of a frame that sees it. An instance has
-    an id only in the mesh as it is now: more frames may give the same object another one.
+    `missed` is the probability that a surface of any class is under no mask in a frame that sees it. Instance ids hold
+    for the current mesh only: after more frames, an object may have another id.
     """
 
     def __init__(self, volume: TsdfVolume, missed: float, min_area: float) -> None:
@@ -38,38 +47,29 @@ class SemanticMap(SceneMap):
         self.labels = ClassRows(volume.voxels)
 
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
+        """Adopt the label space of the first frame. Raises DataError if a later frame has another one."""
         if not self.classes:
             self.labels.begin(len(classes))
         self.classes = agreed_classes(self.classes, classes)
 
     @property
-    def voxel_count(self) -> int:
-        return self.volume.voxel_count
-
-    @property
-    def byte_count(self) -> int:
-        return self.volume.voxels.byte_count + self.labels.byte_count
+    def statistics(self) -> MapStatistics:
+        size = self.volume.voxels.byte_count + self.labels.byte_count
+        return MapStatistics(self.volume.voxel_count, size, self.labels.evicted)
 
     @property
     def depth_range(self) -> tuple[float, float]:
         return self.volume.sensor.depth_range
 
-    @property
-    def evictions(self) -> int:
-        return self.labels.evicted
-
-    @property
-    def instance_count(self) -> int:
-        """Without their boxes."""
-        return int(self.mesh().instance_ids.max(initial=0))
+    def instance_ids(self) -> frozenset[int]:
+        return frozenset(range(1, 1 + int(self.mesh().instance_ids.max(initial=0))))
 
     @property
     def _log_missed(self) -> np.float32:
         return np.float32(np.log(self.missed))
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
-        """Surface and classes. Voxels know no instance, so that it shows none."""
+        """Return surface and classes; voxels know no instances."""
         surface = self.volume.render(camera, T_world_camera)
         class_ids = np.empty(camera.shape, np.int32)
         view = pinhole(camera, T_world_camera)
@@ -83,51 +83,48 @@ class SemanticMap(SceneMap):
         return self.volume.mesh(self._labeled)
 
     def _labeled(self, surface: UnlabeledMesh) -> InstanceMesh:
-        colors, class_ids = vertex_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface)
-        least = vertices_of_area(self.min_area, self.volume.voxel_size)
-        instance_ids = connected_components(surface.triangles, class_ids, least)
+        """Return the surface with instances and classes, elected as those of `vertex_labels`."""
+        colors, class_ids = np.empty((len(surface.voxels), 3), np.uint8), np.empty(len(surface.voxels), np.int32)
+        label_classes(self.volume.voxels.grid, self.labels.evidence, self._log_missed, surface, colors, class_ids)
+        min_vertices = vertices_of_area(self.min_area, self.volume.voxel_size)
+        instance_ids = connected_components(surface.triangles, class_ids, min_vertices)
         class_ids[instance_ids == 0] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
     def instances(self) -> Mapping[int, Instance]:
-        """The components of the mesh.
+        """Return the components of the mesh.
 
-        A component's distribution is the mean of those of its vertices' nearest voxels, without the background; its
-        confidence is the mean probability of its class, background included: what share of its surface the map
-        believes to be of that class. Observations are the most frames in which one of these voxels was under a mask.
+        The class distribution is the mean over the nearest voxels of the vertices, without the background; confidence
+        is the mean probability of the class, with the background. Observations are the most frames in which one of
+        these voxels was under a mask.
         """
-        mesh = self.mesh()
-        surface = self.volume.surface()
-        statistics = component_statistics(
-            self.volume.voxels.grid,
-            self.labels.evidence,
-            self._log_missed,
-            surface,
-            mesh.instance_ids,
-            len(self.classes),
-        )
-        instances, up = {}, self.up()
+        mesh, up, instances = self.mesh(), self.gravity().up, {}
+        found = self._sum_components(self.volume.surface().voxels, mesh.instance_ids)
         for k, vertices in vertices_by_id(mesh.instance_ids).items():
-            sums, points = statistics.probability_sums[k], mesh.vertices[vertices]
+            sums, points = found.probability_sums[k], mesh.vertices[vertices]
             instances[k] = Instance(
                 id=k,
                 class_probabilities=(sums / sums.sum()).astype(np.float32),
-                confidence=float(sums[mesh.class_ids[vertices[0]]] / statistics.vertices[k]),
-                observations=int(statistics.masked[k]),
-                first_frame=int(statistics.first_frame[k]),
-                last_frame=int(statistics.last_frame[k]),
+                confidence=float(sums[mesh.class_ids[vertices[0]]] / len(vertices)),
+                observations=int(found.masked[k]),
+                first_frame=int(found.first_frame[k]),
+                last_frame=int(found.last_frame[k]),
                 vertices=vertices,
                 aabb=aligned_box(points),
                 obb=box_around(points, up),
             )
         return instances
 
-    def up(self) -> Float64 | None:
-        return self.volume.up()
+    def _sum_components(self, voxels: Int32, instance_ids: Int32) -> ComponentStatistics:
+        entries = 1 + int(instance_ids.max(initial=0))
+        masked, first_frame, last_frame = np.zeros(entries, np.int32), *np.full((2, entries), -1, np.int32)
+        found = ComponentStatistics(np.zeros((entries, len(self.classes))), masked, first_frame, last_frame)
+        grid = self.volume.voxels.grid
+        sum_components(grid, self.labels.evidence, self._log_missed, voxels, instance_ids, found)
+        return found
 
-    @property
-    def up_is_sensed(self) -> bool:
-        return self.volume.gravity.sensed() is not None
+    def gravity(self) -> Gravity:
+        return self.volume.gravity()
 
     def save(self, path: Path | str) -> None:
         header, arrays = self.volume.saved()
@@ -151,3 +148,15 @@ class SemanticMap(SceneMap):
             scene.labels.fill(arrays, len(classes))
             scene.labels.evicted = header.whole("evicted")
         return scene
+
+
+def connected_components(triangles: Int32, class_ids: Int32, min_vertices: int) -> Int32:
+    """Return the component (V,) of each vertex, numbered from 1 in the order of their first vertices.
+
+    A component is connected by edges of the triangles (F, 3) within one class. 0 = no class, or fewer vertices than
+    `min_vertices`.
+    """
+    components = np.empty(len(class_ids), np.int32)
+    connect_vertices(triangles, class_ids, components)
+    counts = np.bincount(components[class_ids >= 0], minlength=len(components)) >= min_vertices
+    return np.where((class_ids >= 0) & counts[components], np.cumsum(counts)[components], 0).astype(np.int32)

@@ -6,12 +6,16 @@ import numpy as np
 from numba import njit, prange
 
 from framework.baselines.class_evidence_kernels import best_class
+from framework.mapping.labels.class_slots import NO_CLASS
+from framework.mapping.labels.vertex_labels_kernels import CHUNK, CORNERS, color_of, corner_voxels, keep_near, majority
 from framework.mapping.voxels.raycasting_kernels import voxel_seen
+from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device
+from framework.refinement.segmentation.union_find import root, unite
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_view(grid, evidence, log_missed, view, depth, class_ids):
-    """Fills class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m."""
+    """Fill class_ids (H, W) with the classes of the voxels nearest to the surface at `depth` (H, W) m."""
     for v in prange(depth.shape[0]):
         key = np.int64(-2)
         region = np.int32(-1)
@@ -21,3 +25,79 @@ def label_view(grid, evidence, log_missed, view, depth, class_ids):
                 block, n, key, region = voxel_seen(grid, view, u, v, depth[v, u], key, region)
                 if block >= 0:
                     class_ids[v, u] = best_class(grid, evidence, log_missed, block, n)
+
+
+@device
+def _elect(grid, evidence, log_missed, blocks, voxels, weights, labels):
+    """Return the class with the majority of the voxels around a vertex, -1 if there is none."""
+    keep_near(grid, blocks, voxels, weights)
+    for c in range(CORNERS):
+        labels[c] = 1 + best_class(grid, evidence, log_missed, blocks[c], voxels[c]) if weights[c] > 0 else 0
+    elected = majority(labels, weights)
+    return labels[elected] - 1 if elected >= 0 else np.int32(-1)
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def label_classes(grid, evidence, log_missed, surface, colors, class_ids):
+    """Fill colors (V, 3) and class_ids (V,), -1 = background, of the vertices of an UnlabeledMesh."""
+    vertices = surface.vertices
+    for chunk in prange(-(-len(vertices) // CHUNK)):
+        blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
+        labels, weights = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
+        for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(vertices))):
+            color_of(grid.color, surface.voxels[v], colors[v])
+            class_ids[v] = -1
+            if corner_voxels(grid, vertices[v], blocks, voxels, weights):
+                class_ids[v] = _elect(grid, evidence, log_missed, blocks, voxels, weights, labels)
+
+
+@njit(cache=True, nogil=True)
+def connect_vertices(triangles, class_ids, components):
+    """Fill components (V,) with the first vertex of the connected component of each vertex."""
+    for v in range(len(components)):
+        components[v] = v
+    for t in range(len(triangles)):
+        for side in range(3):
+            a, b = triangles[t, side], triangles[t, (side + 1) % 3]
+            if class_ids[a] == class_ids[b]:
+                unite(components, a, b)
+    for v in range(len(components)):
+        components[v] = root(components, v)
+
+
+@njit(cache=True, nogil=True)
+def sum_components(grid, evidence, log_missed, voxels, instance_ids, found):
+    """Add up the evidence of the voxel nearest to each vertex, by component, in a ComponentStatistics of zeros."""
+    sums, masked, first_frame, last_frame = found.probability_sums, found.masked, found.first_frame, found.last_frame
+    classes = sums.shape[1]
+    unnamed_sums = np.zeros(len(sums))
+    for v in range(len(voxels)):
+        k = instance_ids[v]
+        block, n = voxels[v] // BLOCK_VOXELS, voxels[v] % BLOCK_VOXELS
+        row = grid.label_row[block]
+        if k == 0 or row < 0:
+            continue
+        labels, ratios = evidence.class_ids[row, n], evidence.log_ratio[row, n]
+        absent = log_missed * np.float64(evidence.unmasked[block, n])
+        named = 0
+        while named < len(labels) and labels[named] != NO_CLASS:
+            named += 1
+        unnamed = evidence.rest[row, n] + absent
+        largest = max(0.0, unnamed)  # of the log ratios; that of the background is 0
+        if named > 0:
+            largest = max(largest, ratios[0] + absent)
+        p_unnamed = np.exp(unnamed - largest)
+        total = np.exp(-largest) + (classes - named) * p_unnamed
+        for s in range(named):
+            total += np.exp(ratios[s] + absent - largest)
+        unnamed_sums[k] += p_unnamed / total
+        for s in range(named):
+            sums[k, labels[s]] += (np.exp(ratios[s] + absent - largest) - p_unnamed) / total
+        masked[k] = max(masked[k], evidence.masked[row, n])
+        if evidence.masked[row, n] > 0:
+            first = evidence.first_frame[row, n]
+            first_frame[k] = first if first_frame[k] < 0 else min(first_frame[k], first)
+            last_frame[k] = max(last_frame[k], evidence.last_frame[row, n])
+    for k in range(len(sums)):
+        for c in range(classes):
+            sums[k, c] = max(sums[k, c] + unnamed_sums[k], 0.0)  # rounding may leave a difference slightly below 0

@@ -87,14 +87,14 @@ class Background:
 
     def _take_snapshot(self) -> None:
         """Where anything is mapped."""
-        if self._failed or self._last is None or not self._scene.voxel_count:
+        if self._failed or self._last is None or not self._scene.statistics.voxels:
             return
         try:
             with self._snapshots.kept():
                 mesh, objects = self._scene.mesh(), self._scene.most_likely_classes()
             self._taken += 1
             if self._taken == self._next_up:
-                self._up = self._scene.up()
+                self._up = self._scene.gravity().up
                 self._next_up *= UP_GROWTH
         except Exception as error:
             self._give_up(error)

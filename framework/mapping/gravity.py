@@ -1,16 +1,8 @@
-"""Which way is up, by sensors or else by the surface of a room and how the camera was held; how high the floor is.
+"""The direction of gravity and the height of the floor.
 
-What sensors told is up, whatever the surface is: the mean over all frames, in which an accelerometer's changes of
-velocity are none. Simulated from the true poses, with noise of 0.5 to 3 degrees in each frame, it is 0.05 to 0.8
-degrees off in the videos below, of 40 to 123 frames; with noise and a constant bias of 1 degree each 0.1 to 0.9; with
-one of 2 degrees up to 1.6. Surfaces do not refine it: in made-up rooms they would make good a bias of half a degree
-and more, in real ones nobody can tell, where floor and ceiling themselves are 1 degree off the world's axis (flat),
-and over a slanted table they would do harm.
-
-Rooms have floors, tables and walls: up is the direction that most of the surface is perpendicular to or along, near to
-where the images' upper edges pointed on average, for these tell walls from floors, as does what faces up. Angles to the
-truth: 0 to 1.0 degrees in a flat, a ScanNet room, five windows of TUM's desk and three made-up rooms; kitchen and study
-room look right, unmeasured. Heights of the floor: 0.03 m off at most, where the truth has it at 0 and it is told.
+The direction is the mean of the sensor's directions over all frames, if frames have one. Otherwise it is estimated from
+the surface: up is the direction that most of the surface is perpendicular to or along, near the mean upper edge of the
+images, which distinguishes floors from walls, as does surface that faces up.
 """
 
 from __future__ import annotations
@@ -22,46 +14,47 @@ import numpy as np
 
 from framework.data import UNIT_TOLERANCE, Float32, Float64, Int32
 from framework.errors import DataError
+from framework.interfaces import Gravity
 from framework.mapping.storage.map_header import MapHeader
 
 MOST_FRAMES = 1e9  # of a map
-AGREED = 0.95  # length of the mean of sensors' unit vectors, at least: so they are 18 degrees off it, or less
-DIGITS = 6  # of what a frame adds: the last ones of float64 depend on how arrays lie in memory
+AGREED = 0.95  # least length of the mean of the sensor's unit vectors: they are within 18 degrees of it
+DIGITS = 6  # of what a frame adds: the last digits of float64 depend on the memory layout of arrays
 SAMPLED = 20_000  # triangles that refine a direction; each VOTING-th of them votes for it
 VOTING = 5
-DIRECTIONS = 3000  # on half a sphere, that are tried: 2.6 degrees apart
-SPREAD = np.radians(4.0)  # standard deviation of a surface's normal from what it is meant to be
-NEAR = np.radians(10.0)  # surfaces that refine the direction found
-HELD_WITHIN = np.radians(50.0)  # of up, that images' upper edges point on average
-FACING_UP = 2.0  # votes of what faces up; in a boxy room all three axes have the same share; 1.5 to 4 do as well
-LEAST_SHARE = 0.15  # of the surface must be level or upright; of a heap of things nothing is
-LEVEL = np.cos(np.radians(18.0))  # a normal's dot product with up, of what may be floor
+DIRECTIONS = 3000  # candidates on half a sphere, 2.6 degrees apart
+SPREAD = np.radians(4.0)  # standard deviation of the normals of level and upright surfaces
+NEAR = np.radians(10.0)  # from the direction found, of surfaces that refine it
+HELD_WITHIN = np.radians(50.0)  # largest angle between up and the mean upper edge of the images
+FACING_UP = 2.0  # weight of surface that faces up; in a boxy room all three axes have the same surface otherwise
+LEAST_SHARE = 0.15  # of the surface, that must be level or upright; a heap of objects has less
+LEVEL = np.cos(np.radians(18.0))  # least dot product of up and the normal of a floor
 STEP = 0.05  # m, of heights
-FLOOR_SHARE = 0.05  # of all level surface, that lies within a step of the floor's height, at least
-BELOW_FLOOR = 0.02  # of all surface, that may lie lower: noise, and what windows and mirrors show
+FLOOR_SHARE = 0.05  # of all level surface, that lies within a step of the height of the floor, at least
+BELOW_FLOOR = 0.02  # of all surface, that may lie below the floor: noise, windows and mirrors
 
 
 log = logging.getLogger(__name__)
 
 
-class Gravity:
-    """How the camera has been held so far, and what sensors told."""
+class GravityEstimator:
+    """Accumulates the camera's orientation and the sensor's directions over frames."""
 
     def __init__(self) -> None:
-        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors up in the images
-        self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors against gravity, in the world
-        self.sensed_frames = 0  # of which a sensor told
+        self.camera_up: Float64 = np.zeros(3)  # (3,) sum of the unit vectors to the upper edge of the images, world
+        self.sensed_up: Float64 = np.zeros(3)  # (3,) sum of the sensor's unit vectors against gravity, world
+        self.sensed_frames = 0  # frames with a direction of a sensor
         self._warned = False
 
-    def held(self, T_world_camera: Float64, up_camera: Float64 | None = None) -> None:
-        """Counts one frame, in whose camera a sensor told that up is the unit vector `up_camera` (3,); None = none."""
+    def add_frame(self, T_world_camera: Float64, up_camera: Float64 | None = None) -> None:
+        """Add one frame; `up_camera` is the sensor's unit vector (3,) against gravity, None = no sensor."""
         self.camera_up -= np.round(T_world_camera[:3, 1], DIGITS)
         if up_camera is not None:
             self.sensed_up += np.round(T_world_camera[:3, :3] @ up_camera, DIGITS)
             self.sensed_frames += 1
 
     def saved(self) -> dict[str, Any]:
-        """What a map's header has of it."""
+        """Return the entries for the header of a map."""
         return {
             "camera_up": self.camera_up.tolist(),
             "sensed_up": self.sensed_up.tolist(),
@@ -69,39 +62,38 @@ class Gravity:
         }
 
     @classmethod
-    def of(cls, header: MapHeader) -> Gravity:
-        """The one that was saved in a map's header. Raises DataError where it is none."""
-        gravity = cls()
-        gravity.camera_up = _vector(header, "camera_up")
-        gravity.sensed_up = _vector(header, "sensed_up")
-        gravity.sensed_frames = header.whole("sensed_frames")
-        length = float(np.linalg.norm(gravity.sensed_up))
-        if not length <= gravity.sensed_frames * (1 + UNIT_TOLERANCE):
-            raise DataError(f"sensed_up has the length {length:.4g}, of {gravity.sensed_frames} unit vectors")
-        return gravity
+    def of(cls, header: MapHeader) -> GravityEstimator:
+        """Return the estimator saved in a map's header. Raises DataError if the entries are invalid."""
+        found = cls()
+        found.camera_up = _vector(header, "camera_up")
+        found.sensed_up = _vector(header, "sensed_up")
+        found.sensed_frames = header.whole("sensed_frames")
+        length = float(np.linalg.norm(found.sensed_up))
+        if not length <= found.sensed_frames * (1 + UNIT_TOLERANCE):
+            raise DataError(f"sensed_up has the length {length:.4g}, of {found.sensed_frames} unit vectors")
+        return found
 
     def sensed(self) -> Float64 | None:
-        """The unit vector (3,) up in the world by sensors; None where none told, or frames contradict each other."""
+        """Return the sensor's unit vector (3,) up in the world; None if there is none, or frames disagree."""
         length = float(np.linalg.norm(self.sensed_up))
         if not self.sensed_frames:
             return None
         if length < AGREED * self.sensed_frames:
             if not self._warned:
-                log.warning("up, as a sensor told it, is not one direction in the world: floors and walls are asked")
+                log.warning("gravity of the sensor is not one direction in the world; estimating it from surfaces")
             self._warned = True
             return None
         return self.sensed_up / length
 
-    def up(self, vertices: Float32, triangles: Int32) -> Float64 | None:
-        """The unit vector (3,) up in the world: what sensors told, else by a surface.
-
-        None where there is no surface, or nothing in it is level.
-        """
+    def estimate(self, vertices: Float32, triangles: Int32) -> Gravity:
+        """Return the sensor's direction, otherwise that of the surface; unknown if no surface is level or upright."""
         sensed = self.sensed()
-        return sensed if sensed is not None else self._up_of(vertices, triangles)
+        if sensed is not None:
+            return Gravity(sensed, "sensor")
+        up = self._up_of(vertices, triangles)
+        return Gravity() if up is None else Gravity(up, "surfaces")
 
     def _up_of(self, vertices: Float32, triangles: Int32) -> Float64 | None:
-        """By a surface."""
         length = float(np.linalg.norm(self.camera_up))
         if length < 10.0**-DIGITS or not len(triangles):
             return None
@@ -112,9 +104,9 @@ class Gravity:
         directions *= np.where(directions @ camera_up < 0, -1.0, 1.0)[:, None]
         directions = directions[directions @ camera_up > np.cos(HELD_WITHIN)]
         votes = level_or_upright(normals[::VOTING], areas[::VOTING], directions, FACING_UP)
-        up = _refined(directions[int(votes.argmax())], normals, areas)
-        share = level_or_upright(normals[::VOTING], areas[::VOTING], directions[[int(votes.argmax())]])
-        return up if share[0] >= LEAST_SHARE else None
+        best = directions[int(votes.argmax())]
+        share = level_or_upright(normals[::VOTING], areas[::VOTING], best[None])
+        return _refined(best, normals, areas) if share[0] >= LEAST_SHARE else None
 
 
 def _vector(header: MapHeader, key: str) -> Float64:
@@ -126,7 +118,7 @@ def _vector(header: MapHeader, key: str) -> Float64:
 
 
 def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float64]:
-    """The unit normals (T, 3), areas (T,) m^2 and centres (T, 3) m of triangles, without those that have no area."""
+    """Return the unit normals (T, 3), areas (T,) m^2 and centers (T, 3) m of the triangles whose area is not 0."""
     a, b, c = (vertices[triangles[:, k]].astype(np.float64) for k in range(3))
     normals = np.cross(b - a, c - a)
     lengths = np.linalg.norm(normals, axis=1)
@@ -135,7 +127,7 @@ def faces(vertices: Float32, triangles: Int32) -> tuple[Float64, Float64, Float6
 
 
 def half_sphere(count: int) -> Float64:
-    """(count, 3) unit vectors, evenly spread over half a sphere: a spiral by the golden angle."""
+    """Return (count, 3) unit vectors, evenly spread over half a sphere: a spiral by the golden angle."""
     k = np.arange(count) + 0.5
     z = 1 - k / count
     turn, radius = np.pi * (1 + np.sqrt(5)) * k, np.sqrt(1 - z * z)
@@ -143,17 +135,20 @@ def half_sphere(count: int) -> Float64:
 
 
 def level_or_upright(normals: Float64, areas: Float64, directions: Float64, facing_up: float = 1.0) -> Float64:
-    """(D,) the share of the surface that is level or upright if a direction is up, times `facing_up` what faces it."""
+    """Return the share (D,) of the surface that is level or upright if a direction is up.
+
+    Surface that faces the direction counts `facing_up` times.
+    """
     signed = normals.astype(np.float32) @ directions.T.astype(np.float32)
     cosines = np.abs(signed)
-    # of small angles: 1 - cos(a) = a^2 / 2, and for what is upright cos(90 deg - a) = a
+    # for small angles: 1 - cos(a) = a^2 / 2, and for upright surfaces cos(90 deg - a) = a
     level = np.exp((cosines - 1) / np.float32(SPREAD**2)) * np.where(signed > 0, np.float32(facing_up), np.float32(1))
     votes = level + np.exp(-0.5 * (cosines / np.float32(SPREAD)) ** 2)
     return np.asarray(areas @ votes.astype(np.float64) / areas.sum())
 
 
 def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
-    """The direction that is most along the normals of what is nearly level, and most across those of walls."""
+    """Return the direction that is most along the normals of level surfaces, and most across those of walls."""
     for _ in range(5):
         cosines = normals @ up
         level, upright = np.abs(cosines) > np.cos(NEAR), np.abs(cosines) < np.sin(NEAR)
@@ -164,7 +159,10 @@ def _refined(up: Float64, normals: Float64, areas: Float64) -> Float64:
 
 
 def floor_height(vertices: Float32, triangles: Int32, up: Float64) -> float | None:
-    """m along `up` of the floor: the lowest level surface of some size, with next to nothing below. None = not seen."""
+    """Return the height of the floor, m along `up`; None if it was not seen.
+
+    The floor is the lowest large level surface, with almost no surface below it.
+    """
     normals, areas, centers = faces(vertices, triangles)
     heights = centers @ up
     level = normals @ up > LEVEL

@@ -1,19 +1,17 @@
-"""The map of object instances: voxels, label evidence and the table of instances, as one SceneMap."""
+"""The map of object instances: voxels, label evidence and the instance table, as one SceneMap."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
 
-from framework.data import Camera, Float32, Float64, Frame, Instance, InstanceMesh, Int32, SurfaceView, View
+from framework.data import Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView, View
 from framework.errors import DataError
-from framework.interfaces import SceneMap
-from framework.mapping.instances.association import agreed_classes
+from framework.interfaces import Gravity, MapStatistics
 from framework.mapping.instances.association_kernels import look_up_instances
-from framework.mapping.instances.instance_list import Confirmation, list_instances
+from framework.mapping.instances.instance_list import Confirmation, InstanceTableMap
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.class_slots import NO_CLASS
 from framework.mapping.labels.evidence_rows import EvidenceRows, Storage
@@ -36,14 +34,11 @@ from framework.mapping.voxels.meshing import UnlabeledMesh
 from framework.mapping.voxels.raycasting import render
 from framework.mapping.voxels.tsdf_volume import BLOCK_ARRAYS, NO_BLOCKS, TsdfVolume
 
-FORMAT = 7  # of the saved file; a change of meaning counts it up
+FORMAT = 7  # of the map file; increment it when the meaning of the contents changes
 
 
-class InstanceMap(SceneMap):
-    """A TSDF with instance and class evidence in its voxels. Fusers write its parts; everybody else reads.
-
-    `mesh` and `instances` have the instances that count; `render` and `instances_seen` the tentative ones too.
-    """
+class InstanceMap(InstanceTableMap):
+    """A TSDF with instance and class evidence in its voxels. Only fusers write its parts."""
 
     def __init__(
         self,
@@ -60,41 +55,18 @@ class InstanceMap(SceneMap):
         self.confirmation = confirmation
 
     @property
-    def voxel_count(self) -> int:
-        return self.volume.voxel_count
-
-    @property
-    def byte_count(self) -> int:
-        return self.volume.voxels.byte_count + self.labels.byte_count
+    def statistics(self) -> MapStatistics:
+        size = self.volume.voxels.byte_count + self.labels.byte_count
+        return MapStatistics(self.volume.voxel_count, size, self.labels.evicted)
 
     @property
     def depth_range(self) -> tuple[float, float]:
         return self.volume.sensor.depth_range
 
-    @property
-    def evictions(self) -> int:
-        return self.labels.evicted
-
-    @property
-    def embedding_space(self) -> str:
-        return self.table.embedding_space
-
-    @property
-    def instance_count(self) -> int:
-        """Without the condition on their area, which takes a mesh."""
-        return self.confirmation.count(self.table)
-
-    def instance_ids(self) -> frozenset[int]:
-        return self.confirmation.ids(self.table)
-
-    def most_likely_classes(self) -> Mapping[int, tuple[int, float]]:
-        return self.confirmation.most_likely_classes(self.table)
-
     def begin(self, classes: tuple[str, ...]) -> None:
-        """Takes the first frame's label space for the map's. Raises DataError for another one later."""
         if not self.classes:
             self.labels.begin(len(classes))
-        self.classes = agreed_classes(self.classes, classes)
+        super().begin(classes)
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
         """See LabeledMap."""
@@ -127,15 +99,8 @@ class InstanceMap(SceneMap):
         class_ids[too_small] = -1
         return InstanceMesh(surface.vertices, surface.triangles, colors, instance_ids, class_ids, self.classes)
 
-    def instances(self) -> Mapping[int, Instance]:
-        return list_instances(self.mesh(), self.table, self.up())
-
-    def up(self) -> Float64 | None:
-        return self.volume.up()
-
-    @property
-    def up_is_sensed(self) -> bool:
-        return self.volume.gravity.sensed() is not None
+    def gravity(self) -> Gravity:
+        return self.volume.gravity()
 
     def save(self, path: Path | str) -> None:
         voxels, arrays = self.volume.saved()
@@ -162,7 +127,7 @@ class InstanceMap(SceneMap):
             expected = scene.labels.evidence._asdict()
             check_like(arrays, {"labeled": expected.pop("labeled")}, len(arrays["labeled"]))
             if storage is Storage.EXACT and arrays["instance_ids"].ndim:
-                slots = max(arrays["instance_ids"].shape[-1], 1)  # as many as were needed
+                slots = max(arrays["instance_ids"].shape[-1], 1)  # as many as the map needed
                 for name in ("instance_ids", "instance_value"):
                     expected[name] = np.empty((0, slots), expected[name].dtype)
             check_like(arrays, expected, len(arrays["instance_ids"]))

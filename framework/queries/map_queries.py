@@ -101,17 +101,17 @@ class Map:
         and how the camera was held; boxes (`obb`) stand along it. None where the map does not tell.
         """
         with self.lock:
-            return self.scene.up()
+            return self.scene.gravity().up
 
     def up_source(self) -> str:
         """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
         with self.lock:
-            return self.scene.up_source()
+            return self.scene.gravity().source
 
     def floor(self) -> float | None:
         """m along `up`, how high the floor is: a point is `point @ up - floor` above it. None where it was not seen."""
         with self.lock:
-            up, mesh = self.scene.up(), self.scene.mesh()
+            up, mesh = self.scene.gravity().up, self.scene.mesh()
             return None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
 
     def mesh(self, instance: Instance | int | None = None) -> InstanceMesh:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import asdict
 
 import numpy as np
 
@@ -31,9 +32,7 @@ def run_metrics(result: RunResult) -> Metrics:
         "fps": result.fps,
         "fps_median": result.fps_median,
         "pose_source": result.pose_source,
-        "map.voxels": result.scene.voxel_count,
-        "map.bytes": result.scene.byte_count,
-        "map.evictions": result.scene.evictions,
+        **{f"map.{name}": value for name, value in asdict(result.scene.statistics).items()},
     }
     for stage in STAGES_TIMED:
         milliseconds = [time.milliseconds for time in result.timings if time.stage == stage]
@@ -58,11 +57,12 @@ def trajectory_metrics(result: RunResult) -> Metrics:
 
 def room_metrics(scene: SceneMap, mesh: InstanceMesh) -> Metrics:
     """Which way is up in the world, what tells it, and how high the floor is; nothing where the map does not tell."""
-    up = scene.up()
+    gravity = scene.gravity()
+    up = gravity.up
     if up is None:
         return {}
     figures: Metrics = {f"map.up.{axis}": float(value) for axis, value in zip("xyz", up, strict=True)}
-    figures["up_from"] = scene.up_source()
+    figures["up_from"] = gravity.source
     return figures | {"map.floor_m": floor_height(mesh.vertices, mesh.triangles, up)}
 
 

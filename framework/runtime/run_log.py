@@ -144,14 +144,14 @@ class Journal:
         now = time.perf_counter()
         self.frames_began.append(now)
         if not self._bar.disable and now - self._counted_at > COUNT_INTERVAL_S:
-            counts = {"instances": self.scene.instance_count}
+            counts = {"instances": len(self.scene.instance_ids())}
             if self.frames_expected is None:
                 counts["dropped"] = self.frames_dropped
             self._bar.set_postfix(counts, refresh=False)
             self._counted_at = time.perf_counter()
         if self._bar.line_is_due():
             of_all = "" if self.frames_expected is None else f" of {self.frames_expected}"
-            log.info("frame %d%s, %d instances", self.frames, of_all, self.scene.instance_count)
+            log.info("frame %d%s, %d instances", self.frames, of_all, len(self.scene.instance_ids()))
 
     def frame_skipped(self, error: FrameError) -> None:
         """Counts a frame that cannot be used."""

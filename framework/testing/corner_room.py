@@ -29,7 +29,7 @@ from framework.data import (
 )
 from framework.errors import DataError
 from framework.geometry import exp_se3
-from framework.interfaces import SceneMap
+from framework.interfaces import MapStatistics, SceneMap
 from framework.refinement.lifting import lift
 
 CLASSES = ("chair", "couch")
@@ -111,12 +111,8 @@ class RoomMap(SceneMap):
     classes: tuple[str, ...] = CLASSES
 
     @property
-    def voxel_count(self) -> int:
-        return 1
-
-    @property
-    def byte_count(self) -> int:
-        return 1
+    def statistics(self) -> MapStatistics:
+        return MapStatistics(voxels=1, bytes=1)
 
     def render(self, camera: Camera, T_world_camera: Float64) -> View:
         depth, normals, color, ids = look(camera, T_world_camera)

@@ -141,7 +141,7 @@ class VoxelHashingIcp(PoseTracker):
         seen = FrameFeatures(frame, self._keyframes.extractor)
         if self._before is not None:
             return self._entered(seen, self._before)
-        if self._T_world_last is None or scene.voxel_count == 0:
+        if self._T_world_last is None or scene.statistics.voxels == 0:
             return self._first(seen, scene)
         levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS)
         self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)

@@ -102,8 +102,8 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
             ["MiB", "ours", "Open3D"],
             [
                 ["used, without labels", mib(scene.volume.voxels.byte_count), mib(theirs.bytes_used)],
-                ["used, with labels", mib(scene.byte_count), NOTHING],
-                ["allocated", mib(scene.byte_count), mib(theirs.bytes_allocated)],
+                ["used, with labels", mib(scene.statistics.bytes), NOTHING],
+                ["allocated", mib(scene.statistics.bytes), mib(theirs.bytes_allocated)],
             ],
             [
                 "Ours: byte_count, the arrays as they are. Open3D: the blocks in its hash map (used) and its capacity "
@@ -113,7 +113,7 @@ def test_slam_beside_open3d(benchmark, recordings, tables, name: str, voxel_size
     )
     benchmark.extra_info.update(
         {f"{row}, ms (ours, Open3D)": [round(1e3 * float(x), 3) for x in pair] for row, pair in medians.items()},
-        bytes_ours=scene.byte_count,
+        bytes_ours=scene.statistics.bytes,
         bytes_open3d_used=theirs.bytes_used,
         bytes_open3d_allocated=theirs.bytes_allocated,
         lost=duel.ours.lost,
@@ -135,7 +135,9 @@ def test_slam_long_walk(benchmark, tables) -> None:
     def keep_books() -> None:
         if long.poses:
             spent["long"].append(long.seconds["track"] + long.seconds["fuse"])
-            size.append((scene.byte_count, scene.voxel_count, scene.labels.byte_count, scene.labels.voxel_count))
+            size.append(
+                (scene.statistics.bytes, scene.statistics.voxels, scene.labels.byte_count, scene.labels.voxel_count)
+            )
 
     def begin_frame() -> tuple[tuple[Frame, Detections], dict[str, Any]]:
         keep_books()
@@ -158,7 +160,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
         float(np.median(spent[who][slice(*window)]))
         for who, window in (("long", EARLY), ("long", LATE), ("short", EARLY))
     )
-    at_700, at_2000, after = size[EARLY[1] - 1], size[-1], (scene.byte_count, scene.voxel_count)
+    at_700, at_2000, after = size[EARLY[1] - 1], size[-1], (scene.statistics.bytes, scene.statistics.voxels)
     grown = [(size[end - 1][1] - size[begin - 1][1]) / (end - begin) for begin, end in (EARLY, LATE)]
     usual = float(np.median(spent["long"][WARM:]))
     worst = [max(spent["long"][slice(*window)]) for window in (EARLY, LATE, (WARM, WALK))]
@@ -184,7 +186,7 @@ def test_slam_long_walk(benchmark, tables) -> None:
             f"Back through the last room the map grew by {100 * (after[1] / at_2000[1] - 1):.1f} % in voxels and "
             f"{100 * (after[0] / at_2000[0] - 1):.1f} % in bytes.",
             f"Lost: {lost} of {WALK}, and {long.lost - lost} on the way back. Drift after "
-            f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {scene.instance_count} instances.",
+            f"{LENGTH * WALK / FRAMES_A_ROOM:.0f} m: {1e3 * drift:.0f} mm. {len(scene.instance_ids())} instances.",
         ],
     )  # fmt: skip
     tables.append(table)

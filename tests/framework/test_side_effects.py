@@ -208,7 +208,7 @@ from instancemap import Mapper, Pipeline
 from tests.support.scenes.corner_room import CornerRoom
 stages = Mapper("detector=none", "tracker=ground_truth", "fuser.voxel_size=0.05").pipeline
 Pipeline(stages.detector, stages.tracker, stages.refiner, stages.fuser, prefetch=2).run(CornerRoom())
-print(numba.threading_layer(), stages.fuser.scene.voxel_count)
+print(numba.threading_layer(), stages.fuser.scene.statistics.voxels)
 """
 
 

@@ -227,7 +227,7 @@ def test_the_default_pipeline_runs_end_to_end(ran: Path) -> None:
     assert metrics["trajectory.ate_rmse_m"] < 0.02
     mesh = read_mesh(ran / "defaults" / "mesh.ply")
     assert len(mesh.vertices) > 1000
-    assert load_map(ran / "defaults" / "map.npz").scene.voxel_count == metrics["map.voxels"] > 0
+    assert load_map(ran / "defaults" / "map.npz").scene.statistics.voxels == metrics["map.voxels"] > 0
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in (CONF / "experiment").glob("*.yaml")))

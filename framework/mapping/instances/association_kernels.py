@@ -9,11 +9,11 @@ from framework.data import Float32, Int32
 from framework.mapping.labels.label_evidence import Evidence
 from framework.mapping.labels.label_evidence_kernels import best_instance, label_row, next_instance
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
-from framework.mapping.prefetching import prefetch_element
 from framework.mapping.voxels.integration_parameters import Pinhole
 from framework.mapping.voxels.raycasting_kernels import voxel_seen
 from framework.mapping.voxels.voxel_grid import Grid
 from framework.mapping.voxels.voxel_grid_kernels import device
+from framework.mapping.voxels.voxel_walk import prefetch_element
 
 
 @njit(cache=True, nogil=True, parallel=True)

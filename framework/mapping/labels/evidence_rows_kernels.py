@@ -6,10 +6,10 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.labels.label_evidence_kernels import UNBOUNDED, add_evidence, best_first, update_voxel
-from framework.mapping.prefetching import prefetch_line, prefetch_row
 from framework.mapping.voxels.bit_slices import ONE
 from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, device, one_more
+from framework.mapping.voxels.voxel_walk import prefetch_line, prefetch_row
 
 BITS = 64  # of a word that tells which instances a row may know: instance k is bit k % BITS
 

@@ -7,8 +7,8 @@ from numba import njit, prange
 
 from framework.mapping.voxels.bit_slices import ONE, lowest_bit
 from framework.mapping.voxels.frustum_kernels import solid_blocks_in_view
-from framework.mapping.voxels.integration_parameters_kernels import ray_direction
 from framework.mapping.voxels.voxel_grid_kernels import NO_KEY, device, pack_key, unpack_key
+from framework.mapping.voxels.voxel_walk import ray_direction
 
 CHUNKS = 32  # of image rows; fixed, so that the order of blocks does not depend on the number of threads
 WORD = 64  # bits

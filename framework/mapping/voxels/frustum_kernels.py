@@ -1,4 +1,4 @@
-"""Kernels of frustum.py."""
+"""Kernels that find the blocks in a camera's view frustum."""
 
 from __future__ import annotations
 

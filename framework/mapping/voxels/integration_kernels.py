@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.mapping.prefetching import prefetch_row
 from framework.mapping.voxels.bit_slices import ONE, lowest_bit
 from framework.mapping.voxels.voxel_grid import TSDF_MAX, WEIGHT_ONE
 from framework.mapping.voxels.voxel_grid_kernels import (
@@ -18,6 +17,7 @@ from framework.mapping.voxels.voxel_grid_kernels import (
     pack_color,
     unpack_color,
 )
+from framework.mapping.voxels.voxel_walk import prefetch_row
 
 LAYER_VOXELS = BLOCK_SIDE**2
 GROUP = 16  # blocks that one thread does in a row, and whose near voxels are listed one behind the other

@@ -6,11 +6,10 @@ import numpy as np
 from numba import njit, prange
 
 from framework.mapping.labels.label_evidence_kernels import best_class, best_instance, labeled_voxel
-from framework.mapping.voxels.integration_parameters_kernels import ray_direction, seen_point
 from framework.mapping.voxels.row_interpolation import blend_colors, gather_corners, points_of_row, step_to_surface
 from framework.mapping.voxels.voxel_grid import REGION_SIDE
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_SIDE, UNSEEN, device, find_block
-from framework.mapping.voxels.voxel_walk import inverses, leave_cell, trilinear, voxel_number
+from framework.mapping.voxels.voxel_walk import inverses, leave_cell, ray_direction, seen_point, trilinear, voxel_number
 from framework.sensors.noise_models import axial_sigma_single
 
 TILE = 8  # px; one tile's rays share blocks in the cache

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from framework.mapping.voxels.integration_parameters_kernels import ray_direction
 from framework.mapping.voxels.voxel_grid_kernels import device, find_block
-from framework.mapping.voxels.voxel_walk import all_seen, blend, corners, interpolate
+from framework.mapping.voxels.voxel_walk import all_seen, blend, corners, interpolate, ray_direction
 
 
 @device

@@ -1,4 +1,4 @@
-"""A TSDF in our own voxel blocks as maps have it: integration, its surface, views of it, and how it is saved."""
+"""A TSDF volume: voxel blocks with integration, surface extraction, ray-casting and serialization."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from framework.data import Array, Camera, Float32, Float64, Frame, InstanceMesh, Int32, SurfaceView
-from framework.mapping.gravity import Gravity
+from framework.interfaces import Gravity
+from framework.mapping.gravity import GravityEstimator
 from framework.mapping.storage.map_file import check_blocks, check_like, check_numbers
 from framework.mapping.storage.map_header import MapHeader
 from framework.mapping.voxels.integration import Integrator, SeenBlocks
@@ -23,19 +24,19 @@ NO_BLOCKS = np.zeros(0, np.int32)
 
 
 class TsdfVolume:
-    """Voxels, what integrates frames into them, and their surface, which is brought up to date as blocks change."""
+    """Voxels, the integrator that writes them, and their surface, updated as blocks change."""
 
     def __init__(self, voxel_size: float, sensor: Sensor, max_blocks: int) -> None:
         self.sensor = sensor
         self.voxels = VoxelGrid(voxel_size, sensor.max_truncation, max_blocks)
         self.integrator = Integrator(self.voxels, sensor)
-        self._nets: SurfaceNets | None = None  # made when a mesh is first asked for: who never asks pays nothing
+        self.gravity_estimator = GravityEstimator()
+        self._nets: SurfaceNets | None = None  # created by the first mesh: runs without one pay nothing
         self._mesh: InstanceMesh | None = None
-        self._up: Float64 | None = None
-        self.gravity = Gravity()
+        self._gravity: Gravity | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickling: without what is derived from the voxels."""
+        """Return the state without what is derived from the voxels."""
         return {**vars(self), "_nets": None, "_mesh": None}
 
     @property
@@ -48,40 +49,37 @@ class TsdfVolume:
         return self.voxels.block_count * BLOCK_VOXELS
 
     def integrate(self, frame: Frame, T_world_camera: Float64, near: float) -> SeenBlocks:
-        """Integrates one frame and tells what it saw within `near` m of the measured surface.
+        """Integrate one frame and return what it saw within `near` m of the measured surface.
 
-        Raises MapFullError when the block budget is reached; the frame is then not integrated.
+        Raises MapFullError if the block budget is reached; the frame is then not integrated.
         """
         seen = self.integrator.integrate(frame, T_world_camera, near)
-        self.gravity.held(T_world_camera, frame.up)
+        self.gravity_estimator.add_frame(T_world_camera, frame.up)
         self.changed(seen.blocks)
         return seen
 
     def changed(self, blocks: Int32 | None = None) -> None:
-        """To be called after the map was written: what was derived from it is out of date.
-
-        `blocks` (A,) are the numbers of those whose voxels were written; None = perhaps all.
-        """
-        self._mesh = self._up = None
+        """Invalidate derived data after writing the voxels of `blocks` (A,); None = of any block."""
+        self._mesh = self._gravity = None
         if blocks is None:
             self._nets = None
         elif self._nets is not None:
             self._nets.changed(blocks)
 
     def surface(self) -> UnlabeledMesh:
-        """As it is now, without labels."""
+        """Return the current surface, without labels."""
         self._nets = self._nets or SurfaceNets(self.voxels)
         return self._nets.extract()
 
-    def up(self) -> Float64 | None:
-        """See SceneMap; kept until the map changes."""
-        if self._up is None:
+    def gravity(self) -> Gravity:
+        """Return the direction of gravity; cached until the volume changes."""
+        if self._gravity is None:
             surface = self.surface()
-            self._up = self.gravity.up(surface.vertices, surface.triangles)
-        return self._up
+            self._gravity = self.gravity_estimator.estimate(surface.vertices, surface.triangles)
+        return self._gravity
 
     def mesh(self, label: Callable[[UnlabeledMesh], InstanceMesh]) -> InstanceMesh:
-        """The surface as it is now, with the labels that `label` gives it; kept until the map changes."""
+        """Return the current surface, labeled by `label`; cached until the volume changes."""
         if self._mesh is None:
             self._mesh = label(self.surface())
         return self._mesh
@@ -93,34 +91,33 @@ class TsdfVolume:
         return render_near(self.voxels, self.sensor, camera, T_world_camera, depth)
 
     def saved(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """What a map's file has of it: a part of the header, and arrays."""
+        """Return the entries for the header of a map file, and the arrays."""
         b = self.voxels.block_count
         header = {
             "voxel_size": self.voxel_size,
             "sensor": {name: float(value) for name, value in self.sensor._asdict().items()},
             "max_blocks": self.voxels.max_blocks,
             "frames": self.integrator.frames,
-            **self.gravity.saved(),
+            **self.gravity_estimator.saved(),
         }
         return header, {name: getattr(self.voxels.grid, name)[:b] for name in BLOCK_ARRAYS}
 
     @classmethod
     def load(cls, header: MapHeader, arrays: dict[str, Any], rows: int) -> TsdfVolume:
-        """The one that `saved` gave, of a map whose labels have so many rows. Raises DataError where it cannot be."""
+        """Return the volume of a map file with `rows` label rows. Raises DataError if it is invalid."""
         saved = header.part("sensor")
         sensor = Sensor(**{name: np.float32(saved.number(name, BOUNDS[name])) for name in Sensor._fields})
-        volume = cls(
-            header.number("voxel_size", BOUNDS["voxel_size"]), sensor, header.whole("max_blocks", 1, MOST_BLOCKS)
-        )
-        volume.integrator.frames = header.whole("frames")  # rounding goes on from there
-        volume.gravity = Gravity.of(header)
+        max_blocks = header.whole("max_blocks", 1, MOST_BLOCKS)
+        volume = cls(header.number("voxel_size", BOUNDS["voxel_size"]), sensor, max_blocks)
+        volume.integrator.frames = header.whole("frames")  # determines the rounding of the next frame
+        volume.gravity_estimator = GravityEstimator.of(header)
         check_like(arrays, volume.saved()[1], len(arrays["block_coords"]))
         check_numbers("label_row", arrays["label_row"], rows)
         volume.fill(arrays)
         return volume
 
     def fill(self, arrays: dict[str, Any]) -> None:
-        """Gives an empty one the voxels of a saved one, whose types and shapes were checked."""
+        """Copy the voxels of a map file, whose types and shapes were checked, into an empty volume."""
         coords = arrays["block_coords"]
         check_blocks(coords)
         self.voxels.allocate(coords)

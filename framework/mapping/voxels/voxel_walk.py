@@ -1,10 +1,38 @@
-"""Reading the voxel grid along a ray: cell borders and the trilinear fields between voxels."""
+"""Device functions that read the voxel grid: rays, cell borders, trilinear fields, and memory prefetch."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
 
 from framework.mapping.voxels.voxel_grid_kernels import COLORED, UNSEEN, device, unpack_color
+
+CACHE_LINE = 64  # bytes
+_READ, _L2, _DATA = 0, 2, 1  # arguments of llvm.prefetch: for reading, into the L2 cache, not instructions
+
+
+@device
+def ray_direction(view, u, v):
+    """Return (dx, dy, dz), world, m per m of depth: the ray through pixel (u, v). `view` holds T_world_camera."""
+    ray_x = (np.float32(u) - view.cx) / view.fx
+    ray_y = (np.float32(v) - view.cy) / view.fy
+    return (
+        view.R[0, 0] * ray_x + view.R[0, 1] * ray_y + view.R[0, 2],
+        view.R[1, 0] * ray_x + view.R[1, 1] * ray_y + view.R[1, 2],
+        view.R[2, 0] * ray_x + view.R[2, 1] * ray_y + view.R[2, 2],
+    )
+
+
+@device
+def seen_point(view, u, v, z):
+    """Return (x, y, z), world, m: the point at depth z (m) of pixel (u, v). `view` holds T_world_camera."""
+    dx, dy, dz = ray_direction(view, u, v)
+    return view.t[0] + z * dx, view.t[1] + z * dy, view.t[2] + z * dz
 
 
 @device
@@ -18,7 +46,7 @@ def _leave_slab(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def leave_cell(z, start, d, inverse_d, size, inverse_size):
-    """The parameter at which the ray start + z * d leaves the grid cell of side `size` that it is in at z.
+    """Return the parameter at which the ray start + z * d leaves the grid cell of side `size` that it is in at z.
 
     `start`, `d` and `inverse_d` are triples; `inverse_d` is 1 / d, a huge number where d is 0.
     """
@@ -30,30 +58,30 @@ def leave_cell(z, start, d, inverse_d, size, inverse_size):
 
 @device
 def inverses(d):
-    """1 / d of a triple, with zeros taken for a hair, so that no ray divides by zero."""
-    hair = np.float32(1e-12)
-    x = d[0] if abs(d[0]) > hair else hair
-    y = d[1] if abs(d[1]) > hair else hair
-    z = d[2] if abs(d[2]) > hair else hair
+    """Return 1 / d of a triple, with tiny values in place of zeros."""
+    tiny = np.float32(1e-12)
+    x = d[0] if abs(d[0]) > tiny else tiny
+    y = d[1] if abs(d[1]) > tiny else tiny
+    z = d[2] if abs(d[2]) > tiny else tiny
     return np.float32(1.0) / x, np.float32(1.0) / y, np.float32(1.0) / z
 
 
 @device
 def voxel_number(i, j, k):
-    """The place of voxel (i, j, k) within its block."""
+    """Return the index of voxel (i, j, k) in its block."""
     return ((k & 7) * 8 + (j & 7)) * 8 + (i & 7)
 
 
 @device
 def _of_neighbor(grid, values, block, neighbor, n, missing):
-    """What `values` (B, 512) holds for voxel n of a block's neighbor, `missing` where there is none."""
+    """Return values[neighbor, n] of values (B, 512), `missing` if the block has no such neighbor."""
     there = grid.neighbors[np.uint32(block), np.uint32(neighbor)]
     return values[np.uint32(there), np.uint32(n)] if there >= 0 else missing
 
 
 @device
 def corners(grid, values, block, i, j, k, missing):
-    """What `values` (B, 512) holds for the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` holds (i, j, k)."""
+    """Return `values` (B, 512) of the eight voxels (i, j, k) + {0, 1}^3, x fastest; `block` contains (i, j, k)."""
     x, y, z = i & 7, j & 7, k & 7
     n = (z * 8 + y) * 8 + x
     here = np.uint32(block)
@@ -68,7 +96,7 @@ def corners(grid, values, block, i, j, k, missing):
             values[here, np.uint32(n + 72)],
             values[here, np.uint32(n + 73)],
         )
-    # the carry of each coordinate into the next block is that coordinate's bit of the neighbor's number
+    # the carry of each coordinate into the next block is the bit of the coordinate in the neighbor's index
     next_x, next_y, next_z = (x + 1) & 7, ((y + 1) & 7) * 8, ((z + 1) & 7) * 64
     over_x, over_y, over_z = (x + 1) >> 3, ((y + 1) >> 3) << 1, ((z + 1) >> 3) << 2
     y *= 8
@@ -87,7 +115,7 @@ def corners(grid, values, block, i, j, k, missing):
 
 @device
 def interpolate(s, fx, fy, fz):
-    """(value, d/dx, d/dy, d/dz) between eight corners, x fastest, at the fractions (fx, fy, fz) of a voxel."""
+    """Return (value, d/dx, d/dy, d/dz) between eight corners, x fastest, at the fractions (fx, fy, fz) of a voxel."""
     x00, x10, x01, x11 = np.float32(s[0]), np.float32(s[2]), np.float32(s[4]), np.float32(s[6])
     dx00, dx10 = np.float32(s[1]) - x00, np.float32(s[3]) - x10
     dx01, dx11 = np.float32(s[5]) - x01, np.float32(s[7]) - x11
@@ -103,15 +131,15 @@ def interpolate(s, fx, fy, fz):
 
 @device
 def all_seen(s):
-    """Whether eight corners' distances were all seen."""
+    """Return whether all of eight corners were observed."""
     return min(min(min(s[0], s[1]), min(s[2], s[3])), min(min(s[4], s[5]), min(s[6], s[7]))) != UNSEEN
 
 
 @device
 def trilinear(grid, block, x, y, z):
-    """(value, d/dx, d/dy, d/dz, valid): the field of stored distances at (x, y, z), in voxels, and its gradient.
+    """Return (value, d/dx, d/dy, d/dz, valid): the stored distance and its gradient at (x, y, z), in voxels.
 
-    `block` holds the voxel at the floor of the point. Valid when all eight voxels around it were seen.
+    `block` contains the voxel at the floor of the point. Valid if all eight voxels around it were observed.
     """
     i, j, k = np.int32(np.floor(x)), np.int32(np.floor(y)), np.int32(np.floor(z))
     s = corners(grid, grid.tsdf, block, i, j, k, np.int16(UNSEEN))
@@ -120,16 +148,16 @@ def trilinear(grid, block, x, y, z):
 
 
 @device
-def _add_color(red, green, blue, total, packed, share):
-    """Adds a packed colour with its share; a voxel without a colour has no say."""
-    share = share if packed & COLORED else np.float32(0.0)
+def _add_color(red, green, blue, total, packed, weight):
+    """Add a packed color with its weight; a voxel without color has none."""
+    weight = weight if packed & COLORED else np.float32(0.0)
     r, g, b = unpack_color(packed)
-    return red + share * r, green + share * g, blue + share * b, total + share
+    return red + weight * r, green + weight * g, blue + weight * b, total + weight
 
 
 @device
 def blend(p, x1, y1, z1):
-    """(red, green, blue) at the fractions (x1, y1, z1) between eight packed colours, of those that are colours."""
+    """Return (red, green, blue) at the fractions (x1, y1, z1) between eight packed colors, of the voxels with color."""
     one, zero = np.float32(1.0), np.float32(0.0)
     x0, y0, z0 = one - x1, one - y1, one - z1
     r, g, b, total = _add_color(zero, zero, zero, zero, p[0], x0 * y0 * z0)
@@ -142,3 +170,34 @@ def blend(p, x1, y1, z1):
     r, g, b, total = _add_color(r, g, b, total, p[7], x1 * y1 * z1)
     scale = np.float32(0.25) / max(total, np.float32(1e-6))
     return r * scale, g * scale, b * scale
+
+
+@intrinsic
+def prefetch_line(_typing_context: Any, array: Any, offset: Any) -> Any:
+    """Prefetch the cache line that is `offset` bytes after the first element of an array."""
+
+    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        byte, int32 = ir.IntType(8), ir.IntType(32)
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        address = builder.gep(builder.bitcast(data, byte.as_pointer()), [arguments[1]])
+        function_type = ir.FunctionType(ir.VoidType(), [byte.as_pointer(), int32, int32, int32])
+        function = cgutils.get_or_insert_function(builder.module, function_type, "llvm.prefetch.p0i8")
+        builder.call(function, [address, int32(_READ), int32(_L2), int32(_DATA)])
+        return context.get_dummy_value()
+
+    return types.void(array, types.int64), generate
+
+
+@device
+def prefetch_element(array, row, column):
+    """Prefetch array[row, column]."""
+    prefetch_line(array, np.int64(row) * array.strides[0] + np.int64(column) * array.strides[1])
+
+
+@device
+def prefetch_row(array, row):
+    """Prefetch array[row], if there is such a row."""
+    if 0 <= row < array.shape[0]:
+        bytes_a_row = array.itemsize * (array.size // array.shape[0])
+        for line in range(0, bytes_a_row, CACHE_LINE):
+            prefetch_line(array, row * bytes_a_row + line)

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float32, Float64, Int32
 from framework.errors import DataError
-from framework.mapping.gravity import Gravity, faces, floor_height, half_sphere
+from framework.mapping.gravity import GravityEstimator, faces, floor_height, half_sphere
 from framework.mapping.instances.instance_list import box_around, upright_box
 from framework.mapping.storage.map_header import MapHeader
 
@@ -44,16 +44,16 @@ def room() -> tuple[Float32, Int32]:
     )
 
 
-def held(turned: Float64, downwards: float = 0.5) -> Gravity:
+def held(turned: Float64, downwards: float = 0.5) -> GravityEstimator:
     """By who walks through the room, turned as the world is, and looks downwards, rad."""
-    gravity = Gravity()
+    gravity = GravityEstimator()
     for k in range(8):
         heading = Rotation.from_euler("z", k / 8 * 3)
         # camera axes: x right, y down, z forward; without a turn forward is the world's y
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -downwards)
         T = np.eye(4)
         T[:3, :3] = turned @ (heading * looking).as_matrix()
-        gravity.held(T)
+        gravity.add_frame(T)
     return gravity
 
 
@@ -61,7 +61,7 @@ def held(turned: Float64, downwards: float = 0.5) -> Gravity:
 def test_up_is_found_however_the_world_lies(seed: int) -> None:
     turned = Rotation.random(random_state=seed).as_matrix()
     vertices, triangles = room()
-    up = held(turned).up((vertices @ turned.T).astype(np.float32), triangles)
+    up = held(turned).estimate((vertices @ turned.T).astype(np.float32), triangles).up
     assert up is not None
     assert np.degrees(np.arccos(min(up @ turned @ Z, 1.0))) < 0.05
     floor = floor_height((vertices @ turned.T).astype(np.float32), triangles, up)
@@ -76,9 +76,9 @@ def test_what_faces_up_decides_between_the_axes_of_a_box() -> None:
         rectangle(2 * Y, 1.5 * X, 1.5 * Z),
         rectangle(3 * Y, X, Y + Z),  # a lid that leans, along x
     )
-    askew = Gravity()
+    askew = GravityEstimator()
     askew.camera_up = np.array([0.68, 0.2, 0.7])  # nearer to x than to z but for 1 degree
-    up = askew.up(vertices, triangles)
+    up = askew.estimate(vertices, triangles).up
     assert up is not None
     assert np.degrees(np.arccos(min(up @ Z, 1.0))) < 0.1
 
@@ -89,18 +89,18 @@ def test_noise_and_clutter_leave_it_where_it_is() -> None:
     heap = [rectangle(chosen.normal(size=3), chosen.normal(size=3), chosen.normal(size=3), 3) for _ in range(20)]
     vertices, triangles = joined((vertices, triangles), *heap)
     noisy = vertices + chosen.normal(scale=0.005, size=vertices.shape).astype(np.float32)
-    up = held(np.eye(3)).up(noisy, triangles)
+    up = held(np.eye(3)).estimate(noisy, triangles).up
     assert up is not None
     assert np.degrees(np.arccos(up @ Z)) < 2
 
 
 def test_where_nothing_tells_nobody_knows() -> None:
     vertices, triangles = room()
-    assert Gravity().up(vertices, triangles) is None
-    assert held(np.eye(3)).up(vertices, triangles[:0]) is None
+    assert GravityEstimator().estimate(vertices, triangles).up is None
+    assert held(np.eye(3)).estimate(vertices, triangles[:0]).up is None
     directions = half_sphere(500) * np.where(np.arange(500) % 2, 1, -1)[:, None]
     pebbles = [rectangle(8 * n, *np.linalg.svd(n[None])[2][1:], 1) for n in directions]  # each has another slope
-    assert held(np.eye(3)).up(*joined(*pebbles)) is None
+    assert held(np.eye(3)).estimate(*joined(*pebbles)).up is None
 
 
 def test_a_floor_that_was_not_seen_is_not_made_up() -> None:
@@ -120,16 +120,18 @@ def test_faces_are_those_of_the_triangles() -> None:
     np.testing.assert_allclose(centers, [[2 / 3, 1, 0]])
 
 
-def sensing(turned: Float64, noise: float = 0.0, bias: float = 0.0, frames: int = 40, seed: int = 0) -> Gravity:
+def sensing(
+    turned: Float64, noise: float = 0.0, bias: float = 0.0, frames: int = 40, seed: int = 0
+) -> GravityEstimator:
     """As `held`, by a camera with an accelerometer, noise and bias in rad, whose heading changes."""
-    gravity, chosen = Gravity(), np.random.default_rng(seed)
+    gravity, chosen = GravityEstimator(), np.random.default_rng(seed)
     for k in range(frames):
         looking = Rotation.from_matrix(np.stack([X, -Z, Y], axis=1)) * Rotation.from_euler("x", -0.5)
         T = np.eye(4)
         T[:3, :3] = turned @ (Rotation.from_euler("z", 2 * np.pi * k / frames) * looking).as_matrix()
         up_camera = T[:3, :3].T @ turned @ Z
         up_camera = Rotation.from_euler("x", bias).apply(up_camera) + chosen.normal(scale=noise, size=3)
-        gravity.held(T, up_camera / np.linalg.norm(up_camera))
+        gravity.add_frame(T, up_camera / np.linalg.norm(up_camera))
     return gravity
 
 
@@ -144,9 +146,11 @@ def test_sensors_tell_up_where_surfaces_cannot(seed: int) -> None:
     turned = Rotation.random(random_state=seed).as_matrix()
     vertices, triangles = rectangle(np.zeros(3), 2 * X, 2 * (np.cos(0.35) * Y + np.sin(0.35) * Z))
     vertices = (vertices @ turned.T).astype(np.float32)
-    assert degrees(held(turned).up(vertices, triangles), turned @ Z) == pytest.approx(np.degrees(0.35), abs=0.1)
-    assert degrees(sensing(turned).up(vertices, triangles), turned @ Z) < 1e-3
-    assert degrees(sensing(turned).up(vertices[:0], triangles[:0]), turned @ Z) < 1e-3
+    assert degrees(held(turned).estimate(vertices, triangles).up, turned @ Z) == pytest.approx(
+        np.degrees(0.35), abs=0.1
+    )
+    assert degrees(sensing(turned).estimate(vertices, triangles).up, turned @ Z) < 1e-3
+    assert degrees(sensing(turned).estimate(vertices[:0], triangles[:0]).up, turned @ Z) < 1e-3
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -164,24 +168,24 @@ def test_a_sensor_whose_directions_contradict_each_other_is_not_believed(caplog:
     for k in range(8):
         T = np.eye(4)
         T[:3, :3] = Rotation.from_euler("z", k).as_matrix()
-        gravity.held(T, np.array([np.sin(0.4), 0, np.cos(0.4)]))
+        gravity.add_frame(T, np.array([np.sin(0.4), 0, np.cos(0.4)]))
     assert gravity.sensed() is None
-    assert degrees(gravity.up(vertices, triangles), Z) < 0.1
-    assert caplog.text.count("is not one direction in the world: floors and walls are asked") == 1
+    assert degrees(gravity.estimate(vertices, triangles).up, Z) < 0.1
+    assert caplog.text.count("is not one direction in the world") == 1
 
 
 def test_what_was_saved_is_read_back_and_nonsense_refused() -> None:
     saved = sensing(np.eye(3)).saved()
-    read = Gravity.of(MapHeader(json.loads(json.dumps(saved))))
+    read = GravityEstimator.of(MapHeader(json.loads(json.dumps(saved))))
     assert read.saved() == saved
     for wrong in ([], [1, 2], ["a", 0, 0], [float("nan"), 0, 0], [True, None, 0], [1e200, 0, 0]):
         for key in ("camera_up", "sensed_up"):
             with pytest.raises(DataError, match=key):
-                Gravity.of(MapHeader(saved | {key: wrong}))
+                GravityEstimator.of(MapHeader(saved | {key: wrong}))
     with pytest.raises(DataError, match="sensed_up has the length 40, of 3 unit vectors"):
-        Gravity.of(MapHeader(saved | {"sensed_frames": 3}))
+        GravityEstimator.of(MapHeader(saved | {"sensed_frames": 3}))
     with pytest.raises(DataError, match="sensed_frames must be a whole number"):
-        Gravity.of(MapHeader(saved | {"sensed_frames": -1}))
+        GravityEstimator.of(MapHeader(saved | {"sensed_frames": -1}))
 
 
 @pytest.mark.parametrize("seed", range(5))

@@ -192,4 +192,4 @@ def test_an_empty_map_has_an_empty_mesh(tmp_path: Path) -> None:
     assert len(scene.mesh().vertices) == 0
     assert len(scene.instances()) == 0
     scene.save(tmp_path / "map.npz")
-    assert InstanceMap.load(tmp_path / "map.npz").voxel_count == 0
+    assert InstanceMap.load(tmp_path / "map.npz").statistics.voxels == 0

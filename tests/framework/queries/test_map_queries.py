@@ -163,7 +163,7 @@ def test_stages_and_parameters_go_by_name(value: str) -> None:
         detector="none", tracker="ground_truth", threads=1, detection_cache_dir=value, debug=False, resume_from=None
     )
     assert type(named.pipeline.detector).__name__ == "NoDetections"
-    assert Mapper("detector=none", **{"fuser.voxel_size": 0.05}).scene.voxel_count == 0  # type: ignore[arg-type]
+    assert Mapper("detector=none", **{"fuser.voxel_size": 0.05}).scene.statistics.voxels == 0  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="detector must be a name, a number"):
         Mapper(detector=["none"])
 

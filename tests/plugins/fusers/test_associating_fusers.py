@@ -197,7 +197,7 @@ def test_nothing_changes_where_the_scene_is_empty(new_fuser: NewFuser) -> None:
     fuser = new_fuser()
     frame = Scene().frame(np.eye(4))
     fuse_masks(fuser, frame, [np.ones(CAMERA.shape, np.bool_)], [0.9])
-    assert fuser.scene.voxel_count == 0
+    assert fuser.scene.statistics.voxels == 0
     assert len(fuser.scene.table.records) == 0
 
 
@@ -228,7 +228,7 @@ def test_the_least_area_of_an_instance_does_not_depend_on_the_voxels(new_fuser: 
         for k in range(3):
             fuse_masks(fuser, wall.frame(np.eye(4), k), [poster], [0.9])
         assert len(fuser.scene.instances()) == count
-        assert fuser.scene.instance_count == 1, "which does not look at the mesh"
+        assert len(fuser.scene.instance_ids()) == 1, "which does not look at the mesh"
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame]) -> None:
     fuser = new_fuser(max_blocks=300)
     with pytest.raises(MapFullError, match="300 blocks"):
         fuse_masks(fuser, frames[0], [], [])
-    assert fuser.scene.voxel_count == 300 * 512
+    assert fuser.scene.statistics.voxels == 300 * 512
     fuser.scene.mesh()
 
 

@@ -98,9 +98,9 @@ def test_rendered_ids_are_those_of_the_boxes(mapped: ObjectVolumes, frames: list
 def test_bytes_and_voxels_are_those_of_all_volumes(mapped: ObjectVolumes) -> None:
     scene = mapped.scene
     objects = sum(volume.block_count for volume in scene.volumes.values())
-    assert scene.voxel_count == 512 * (scene.background.voxels.block_count + objects)
+    assert scene.statistics.voxels == 512 * (scene.background.voxels.block_count + objects)
     per_object_voxel = 8 + 4  # a grid's, and the two counts
-    assert scene.byte_count > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
+    assert scene.statistics.bytes > 8 * 512 * scene.background.voxels.block_count + per_object_voxel * 512 * objects
     assert 0 < objects < scene.background.voxels.block_count
 
 
@@ -265,7 +265,7 @@ def test_the_mesh_kept_up_to_date_is_that_of_a_map_read_from_a_file(frames: list
     loaded = type(fuser.scene).load(tmp_path / "map.npz")
     for name in ("vertices", "triangles", "colors", "instance_ids", "class_ids"):
         assert np.array_equal(getattr(loaded.mesh(), name), getattr(fuser.scene.mesh(), name)), name
-    assert loaded.byte_count == fuser.scene.byte_count
+    assert loaded.statistics.bytes == fuser.scene.statistics.bytes
     assert loaded.instances()[2].confidence == fuser.scene.instances()[2].confidence
     loaded.save(tmp_path / "again.npz")
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()

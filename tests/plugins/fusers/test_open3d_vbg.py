@@ -295,15 +295,15 @@ def test_a_full_map_says_so_and_keeps_what_it_has(frames: list[Frame], monkeypat
     before = fuser.scene.mesh()
     with pytest.raises(MapFullError, match=f"{budget} blocks of 8"):
         fuse_masks(fuser, dataclasses.replace(frames[0], T_world_camera=pose(0.3)), [], [])
-    assert fuser.scene.voxel_count == budget * 512
+    assert fuser.scene.statistics.voxels == budget * 512
     assert fuser.scene.grid.blocks.hashmap().capacity() <= budget
     assert np.array_equal(fuser.scene.mesh().vertices, before.vertices)
     fuse_masks(fuser, frames[0], [], [])  # what is there can still be seen again
 
 
 def test_bytes_are_those_of_the_blocks_in_use(mapped: Open3DMap) -> None:
-    assert mapped.byte_count == mapped.voxel_count * 4 * (1 + 1 + 3 + 1 + 1)
-    assert mapped.voxel_count == mapped.grid.block_count * 512
+    assert mapped.statistics.bytes == mapped.statistics.voxels * 4 * (1 + 1 + 3 + 1 + 1)
+    assert mapped.statistics.voxels == mapped.grid.block_count * 512
 
 
 def test_save_and_load_round_trip_and_the_same_map_is_the_same_file(mapped: Open3DMap, tmp_path: Path) -> None:
@@ -347,9 +347,9 @@ def test_a_damaged_or_foreign_file_is_refused(mapped: Open3DMap, tmp_path: Path)
 def test_an_empty_map_is_saved_and_an_empty_scene_changes_nothing(tmp_path: Path) -> None:
     fuser = new_fuser()
     fuse_masks(fuser, Scene().frame(np.eye(4)), [np.ones(CAMERA.shape, np.bool_)], [0.9])
-    assert (fuser.scene.voxel_count, len(fuser.scene.table.records)) == (0, 0)
+    assert (fuser.scene.statistics.voxels, len(fuser.scene.table.records)) == (0, 0)
     fuser.scene.save(tmp_path / "map.npz")
-    assert Open3DMap.load(tmp_path / "map.npz").voxel_count == 0
+    assert Open3DMap.load(tmp_path / "map.npz").statistics.voxels == 0
 
 
 def test_a_single_reading_is_mapped(frames: list[Frame]) -> None:
@@ -358,7 +358,7 @@ def test_a_single_reading_is_mapped(frames: list[Frame]) -> None:
     depth[61, 83] = 1.5
     fuser = new_fuser()
     fuse_masks(fuser, dataclasses.replace(frames[0], depth=depth), [np.ones(CAMERA.shape, np.bool_)], [0.9])
-    assert fuser.scene.voxel_count > 0
+    assert fuser.scene.statistics.voxels > 0
 
 
 def test_parameters_are_checked() -> None:

@@ -207,7 +207,7 @@ def test_a_first_frame_that_nothing_can_be_tracked_by_is_not_the_last(name: str)
 def test_poses_are_not_copied_from_the_truth_while_nothing_can_be_mapped() -> None:
     far = [dataclasses.replace(f, depth=100 * f.depth) for f in (room().frame(T, k) for k, T in enumerate(walk(4)))]
     poses, scene = run(VoxelHashingIcp(finest_scale=1.0), far)
-    assert scene.voxel_count == 0
+    assert scene.statistics.voxels == 0
     assert all(pose.lost for pose in poses)
     assert poses[-1].reason == "0.0% of the pixels have a depth that is mapped, 0.2 to 4 m"
 

@@ -31,6 +31,7 @@ from framework.interfaces import (
     FrameReader,
     LiveVideo,
     MapFuser,
+    MapStatistics,
     PoseTracker,
     RGBDSequence,
     SceneMap,
@@ -165,12 +166,9 @@ class GridMap(SceneMap):
     slow_save_s: float = 0.0
 
     @property
-    def voxel_count(self) -> int:
-        return sum(map(len, self.vertices))
-
-    @property
-    def byte_count(self) -> int:
-        return 28 * self.voxel_count
+    def statistics(self) -> MapStatistics:
+        voxels = sum(map(len, self.vertices))
+        return MapStatistics(voxels, bytes=28 * voxels)
 
     def render(self, camera: Camera, T_world_camera: np.ndarray) -> View:
         depth, normals, color, ids = look(camera, T_world_camera)  # as a perfect map would
@@ -244,7 +242,7 @@ class GridFuser(MapFuser):
         triangles = np.concatenate(
             [np.stack([corner, below, corner + 1], 1), np.stack([corner + 1, below, below + 1], 1)]
         )
-        scene.triangles.append((triangles + scene.voxel_count).astype(np.int32))
+        scene.triangles.append((triangles + scene.statistics.voxels).astype(np.int32))
         scene.vertices.append(np.asarray(transform(pose.T_world_camera, points), np.float32))
         scene.colors.append(frame.color.reshape(-1, 3))
         scene.ids.append(ids.ravel())

@@ -78,7 +78,7 @@ def check_halves(tmp_path: Path, recording: Recording) -> None:
     )
     assert not any(pose.lost for pose in [*poses, *in_first, *in_second])
     assert ate_mm(recording, [*in_first, *in_second]) < ate_mm(recording, poses) + 5
-    assert continued.scene.voxel_count == pytest.approx(whole.scene.voxel_count, rel=0.02)
+    assert continued.scene.statistics.voxels == pytest.approx(whole.scene.statistics.voxels, rel=0.02)
 
 
 def test_the_desk_is_gone_on_with(tmp_path: Path) -> None:
@@ -185,7 +185,7 @@ def test_a_map_of_its_own_lies_in_the_world_of_another(tmp_path: Path) -> None:
         assert np.linalg.norm(apart[:3, 3]) < 0.01
         assert rotation_angle(apart[:3, :3]) < 0.01
     alone, _ = mapped(unposed[20:], *TRACKED)
-    assert own.scene.voxel_count == pytest.approx(alone.scene.voxel_count, rel=0.05)
+    assert own.scene.statistics.voxels == pytest.approx(alone.scene.statistics.voxels, rel=0.05)
     with pytest.raises(ConfigError, match="resume_from and localize_in"):
         Mapper(*TRACKED, f"localize_in={tmp_path / 'first'}", f"resume_from={tmp_path / 'first'}")
     with pytest.raises(DataError, match="localize_in: there is no"):

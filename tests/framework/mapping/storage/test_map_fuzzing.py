@@ -63,9 +63,9 @@ def use(scene: SceneMap) -> None:
     for T in walk(4)[:2]:
         scene.render(CAMERA, T)
         scene.render_near(CAMERA, T, np.ones(CAMERA.shape, np.float32))
-    assert scene.voxel_count >= 0
-    assert scene.byte_count >= 0
-    assert scene.instance_count >= 0
+    assert scene.statistics.voxels >= 0
+    assert scene.statistics.bytes >= 0
+    assert scene.instance_ids() >= set()
     for instance in instances.values():
         assert instance.class_probabilities.shape == (len(scene.classes),)
         assert instance.class_probabilities.sum() == pytest.approx(1, abs=1e-3)

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components as scipy_components
 
-from framework.baselines.connected_components import connected_components
+from framework.baselines.semantic_map import connected_components
 
 STRIP = np.int32([[0, 1, 2], [1, 3, 2], [2, 3, 4], [3, 5, 4], [4, 5, 6]])
 """Seven vertices in a row of triangles."""

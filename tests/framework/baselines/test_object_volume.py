@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from framework.baselines.object_volume import boxes_in_view
 from framework.data import Camera
 from framework.geometry import inverse, project, transform
-from framework.mapping.voxels.frustum import boxes_in_view
 from tests.support.scenes.analytic_scene import pose
 
 CAMERA = Camera(40, 30, 35.0, 33.0, 18.0, 15.5)
