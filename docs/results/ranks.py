@@ -23,10 +23,9 @@ from framework.data import Float64
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, RunRow
-from framework.tables.comparison import ComparisonTable
+from framework.tables.comparison import ComparisonTable, mean_by_sequence
 from framework.tables.grid import TextTable, decimals, figure, markdown_grid
 from framework.tables.layouts import NOTHING, head
-from framework.tables.sequences import mean_by_sequence
 from framework.tables.table_notes import counted, digest
 
 FEWEST = 3  # rows: two are in the same order or in the other one, by chance as likely as not

@@ -1,21 +1,17 @@
-"""3D instance segmentation: average precision and overlap of a map's instances against the true ones.
+"""Metrics of 3D instance segmentation: average precision and overlap of a map's instances with the true ones.
 
-The paper's figure is AP at IoU 0.5, averaged over classes. Labels are carried between map vertices and true surface
-points by nearest neighbor, predictions are matched to truth greedily in order of confidence, and a class's AP is the
-area under its precision-recall curve with all-point interpolation (the precision at a recall is the largest precision
-at that or any higher recall, as in Pascal VOC from 2010 on), averaged over the classes that have a true instance.
+Labels are transferred between map vertices and true surface points by nearest neighbor. Predictions are matched to true
+instances greedily in order of confidence. AP is the area under a class's precision-recall curve with all-point
+interpolation (Pascal VOC from 2010 on), averaged over the classes with a true instance. The paper has it at IoU 0.5.
 
-**What is evaluated.** A true instance counts when its class is known and it has at least `min_points` points. The other
-true instances (class None, or too few points) are *ignored* ones: something is there, but nobody can say whether a
-detection of it is right. A prediction that finds no evaluated true instance is therefore left out, neither right nor
-wrong, when
+A true instance is evaluated if its class is known and it has at least `min_points` points. The others are *ignored*
+instances. A prediction without a match is ignored, neither right nor wrong, if
 
-1. its best overlap among the ignored instances reaches the IoU threshold, or
-2. more than half of its points lie on ignored instances: most of its evidence is where the truth is not known, or
-3. its class is none of those that were looked for (`SceneTruth.classes`): a keyboard may well be there.
+1. its best overlap with an ignored instance reaches the IoU threshold, or
+2. more than half of its points lie on ignored instances, or
+3. its class was not annotated (`SceneTruth.classes`).
 
-Every other prediction without a match is wrong; among them those on points of instance 0 (known to be no instance) and
-those that no true point is near.
+Every other prediction without a match is wrong, also on points of instance 0 (no instance) and far from the truth.
 """
 
 from __future__ import annotations
@@ -32,51 +28,47 @@ from framework.data import Array, Bool, Float32, Float64, Instance, InstanceMesh
 from framework.errors import DataError
 
 MAX_DISTANCE = 0.05  # m, to the nearest neighbor that a label is taken from
-MIN_POINTS = 100  # true instances with fewer points do not count
-IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # those that `ap` averages over, COCO's
+MIN_POINTS = 100  # of a true instance that is evaluated
+IOU_THRESHOLDS = tuple(percent / 100 for percent in range(50, 100, 5))  # averaged by `ap`, as in COCO
 
 
 class Transfer(Enum):
-    """Which way labels are carried; tables name it."""
+    """The direction of the label transfer."""
 
-    TO_TRUTH = "to_truth"  # each true point takes the instance of the nearest map vertex: the default
-    TO_MAP = "to_map"  # each map vertex takes the instance of the nearest true point
+    TO_TRUTH = "to_truth"  # each true point gets the instance of the nearest map vertex
+    TO_MAP = "to_map"  # each map vertex gets the instance of the nearest true point
 
 
 @dataclass(frozen=True)
 class PredictedInstances:
-    """The K instances of a map, as labelled points and what is claimed about each."""
+    """The K instances of a map, as labeled points."""
 
-    points_world: Float32  # (V, 3) m, all of the map's surface: points of no instance take part in the transfer
+    points_world: Float32  # (V, 3) m, the whole surface: points of no instance take part in the transfer
     instance_ids: Int32  # (V,), 0 = no instance
-    ids: Int64  # (K,) every instance of the map, also one without points
-    confidences: Float64  # (K,) in [0, 1], ranks the instances
-    class_names: tuple[str, ...]  # K, the most probable class of each
+    ids: Int64  # (K,) every instance of the map, also without points
+    confidences: Float64  # (K,) in [0, 1]
+    class_names: tuple[str, ...]  # K, the most probable ones
 
     def __post_init__(self) -> None:
-        if not (len(self.ids) == len(self.confidences) == len(self.class_names)):
-            raise DataError(
-                f"PredictedInstances: {len(self.ids)} ids, {len(self.confidences)} confidences and "
-                f"{len(self.class_names)} class names; there must be equally many"
-            )
-        if self.points_world.shape != (len(self.instance_ids), 3):
-            raise DataError(
-                f"PredictedInstances.points_world must be ({len(self.instance_ids)}, 3) like instance_ids, "
-                f"found {self.points_world.shape}"
-            )
+        counts = {name: len(getattr(self, name)) for name in ("ids", "confidences", "class_names")}
+        if len(set(counts.values())) > 1:
+            raise DataError(f"PredictedInstances: expected equally many values, got {counts}")
+        shape = len(self.instance_ids), 3
+        if self.points_world.shape != shape:
+            raise DataError(f"PredictedInstances.points_world must be {shape}, found {self.points_world.shape}")
         if len(np.unique(self.ids)) != len(self.ids) or (self.ids < 1).any():
             raise DataError("PredictedInstances.ids must be positive and each there once")
         if not np.isfinite(self.confidences).all():
             raise DataError("PredictedInstances.confidences holds values that are not finite")
         unlisted = np.setdiff1d(self.instance_ids, np.append(self.ids, 0))
         if len(unlisted):
-            raise DataError(f"PredictedInstances: points are labelled {unlisted[0]}, which is not among the ids")
+            raise DataError(f"PredictedInstances: points are labeled {unlisted[0]}, which is not among the ids")
 
     @classmethod
     def of_map(
         cls, mesh: InstanceMesh, instances: Mapping[int, Instance], classes: Sequence[str]
     ) -> PredictedInstances:
-        """All `instances` of a map with its `mesh`; `classes` name the columns of their class probabilities."""
+        """Return all instances of a map; `classes` name the columns of their class probabilities."""
         ids = sorted(instances)
         names = [classes[int(instances[key].class_probabilities.argmax())] for key in ids]
         return cls.on_mesh(mesh, ids, [instances[key].confidence for key in ids], names)
@@ -85,7 +77,7 @@ class PredictedInstances:
     def on_mesh(
         cls, mesh: InstanceMesh, ids: Sequence[int], confidences: Sequence[float], class_names: Sequence[str]
     ) -> PredictedInstances:
-        """What is claimed about each of the `ids`; vertices of other ids, tentative ones, are of no instance."""
+        """Return the instances `ids`; vertices of other, tentative instances have none."""
         listed = np.array(ids, np.int64)
         return cls(
             points_world=mesh.vertices,
@@ -98,13 +90,13 @@ class PredictedInstances:
 
 @dataclass(frozen=True)
 class Score:
-    """How one class, or all of them together, fares at one IoU threshold."""
+    """The result of one class, or of all together, at one IoU threshold."""
 
     ap: float  # area under the precision-recall curve
     true_positives: int
     false_positives: int
     ignored: int  # predictions that are neither
-    truths: int  # true instances that count, at least 1
+    truths: int  # evaluated true instances, at least 1
     matched_iou: float  # sum over the true positives
 
     @property
@@ -115,52 +107,50 @@ class Score:
 
 
 class Outcome(Enum):
-    """What became of a prediction."""
+    """The result of one prediction."""
 
     RIGHT = "right"  # matched with a true instance of its class
-    WRONG_CLASS = "wrong class"  # it overlaps a true instance of another class enough
-    FALSE = "false"  # it overlaps none enough, or one that a more confident prediction has found already
-    IGNORED = "not judged"  # it lies where the truth is not known, or nobody looked for its class
+    WRONG_CLASS = "wrong class"  # overlaps a true instance of another class enough
+    FALSE = "false"  # overlaps none enough, or only one that is matched with a more confident prediction
+    IGNORED = "not judged"  # unknown truth
 
 
 @dataclass(frozen=True)
 class Judgement:
-    """One prediction against the truth."""
+    """One prediction compared with the truth."""
 
     id: int
     outcome: Outcome
-    truth_id: int  # the true instance that it overlaps most, 0 = none; of a match the one that it is matched with
-    truth_class: str | None  # None = not known
-    iou: float  # with that one
+    truth_id: int  # the matched true instance, or else the one with the largest overlap; 0 = none
+    truth_class: str | None  # None = unknown
+    iou: float  # with this true instance
 
 
 @dataclass(frozen=True)
 class InstanceEvaluation:
-    """What `evaluate` found. Empty where the truth holds no instance that counts."""
+    """The result of `evaluate`; empty without evaluated true instances."""
 
     by_class: Mapping[float, Mapping[str, Score]]  # IoU threshold -> class with a true instance -> score
-    agnostic: Mapping[float, Score]  # IoU threshold -> score with classes ignored
-    overall: Score | None  # at IoU 0.5 over all predictions and all classes; a match must agree in class
-    best_ious: Mapping[int, float]  # true instance that counts -> its best overlap with any prediction
-    best_ids: Mapping[int, int]  # true instance that counts -> the prediction with that overlap, 0 = none
+    agnostic: Mapping[float, Score]  # IoU threshold -> score with all classes as one
+    overall: Score | None  # at IoU 0.5 over all classes; matches agree in class
+    best_ious: Mapping[int, float]  # evaluated true instance -> its best overlap with any prediction
+    best_ids: Mapping[int, int]  # evaluated true instance -> the prediction with this overlap, 0 = none
 
     def ap(self, threshold: float) -> float:
-        """The class-averaged AP at one IoU threshold, `nan` without truth."""
+        """Return the class-averaged AP at one IoU threshold, `nan` without truth."""
         scores = self.by_class.get(threshold, {})
         return float(np.mean([score.ap for score in scores.values()])) if scores else float("nan")
 
     def metrics(self) -> dict[str, float]:
-        """The figures by their names in metrics.json, in [0, 1] or counts; empty where nothing could be evaluated.
+        """Return the metrics by their names in metrics.json; empty without evaluated true instances.
 
-        `instances.`... over the classes with a true instance, or for one of them with `.<class>` behind it:
-
-        - `ap50`, `ap25`: AP at IoU 0.5 and 0.25; `ap`: the mean over IOU_THRESHOLDS. Each also by class.
-        - `ap50_agnostic`, `ap25_agnostic`: AP with all classes taken for one.
-        - `mean_iou`: the best overlap of each true instance with a prediction of whatever class, averaged.
-        - `precision50`, `recall50`, `f1_50`: at IoU 0.5, of all predictions and all true instances together.
-        - `pq50`: the panoptic quality of each class at IoU 0.5, averaged.
-        - `true_count`: true instances that count, also by class; `ignored_count`: predictions that are neither right
-          nor wrong at IoU 0.5.
+        - `instances.ap50`, `ap25`: AP at IoU 0.5 and 0.25; `ap`: the mean over IOU_THRESHOLDS. Also for each class with
+          a true instance, as `instances.ap50.<class>`.
+        - `ap50_agnostic`, `ap25_agnostic`: AP with all classes as one.
+        - `mean_iou`: mean over the true instances of the best overlap with a prediction of any class.
+        - `precision50`, `recall50`, `f1_50`: at IoU 0.5, over all predictions and true instances.
+        - `pq50`: panoptic quality at IoU 0.5, averaged over classes.
+        - `true_count`: evaluated true instances, also by class; `ignored_count`: ignored predictions at IoU 0.5.
         """
         if self.overall is None:
             return {}
@@ -195,24 +185,19 @@ def evaluate(
     max_distance: float = MAX_DISTANCE,
     min_points: int = MIN_POINTS,
 ) -> InstanceEvaluation:
-    """Compares a map's instances with the true ones: see the module's text for the rules.
+    """Compare a map's instances with the true ones by the rules in the module's docstring.
 
-    The result does not depend on the order of points or of predictions; equal confidences are ranked by id.
+    The result does not depend on the order of points or predictions; equal confidences are ranked by id.
     """
     overlaps = _Overlaps.between(predictions, truth, transfer, max_distance, min_points)
     names = sorted(set(overlaps.truth_classes[overlaps.evaluated]))
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
     allowed = np.broadcast_to(overlaps.evaluated, overlaps.iou.shape)
     same_class = allowed & (overlaps.predicted_classes[:, None] == overlaps.truth_classes[None, :])
-    by_class: dict[float, dict[str, Score]] = {}
-    agnostic: dict[float, Score] = {}
+    of_class = {name: (overlaps.predicted_classes == name, overlaps.truth_classes == name) for name in names}
+    by_class, agnostic = {}, {}
     for threshold in (0.25, *IOU_THRESHOLDS):
-        by_class[threshold] = {
-            name: overlaps.score(
-                threshold, overlaps.predicted_classes == name, overlaps.truth_classes == name, same_class
-            )
-            for name in names
-        }
+        by_class[threshold] = {name: overlaps.score(threshold, *of_class[name], same_class) for name in names}
         if names:
             agnostic[threshold] = overlaps.score(threshold, everything, overlaps.evaluated, allowed)
     overall = overlaps.score(0.5, everything, overlaps.evaluated, same_class) if names else None
@@ -223,9 +208,9 @@ def evaluate(
 def judge(
     predictions: PredictedInstances, truth: SceneTruth, threshold: float = 0.5
 ) -> tuple[list[Judgement], dict[int, str]]:
-    """What became of each prediction, best first, and the class of each true instance that counts and was missed.
+    """Return the outcome of each prediction, best first, and the class of each missed true instance.
 
-    By the matching of `InstanceEvaluation.overall`: the counts are those of its score at that IoU.
+    The matching is that of `InstanceEvaluation.overall`.
     """
     overlaps = _Overlaps.between(predictions, truth, Transfer.TO_TRUTH, MAX_DISTANCE, MIN_POINTS)
     everything = np.ones(len(overlaps.predicted_ids), np.bool_)
@@ -242,10 +227,10 @@ IGNORED, NO_MATCH = -2, -1  # in place of a true instance's column
 
 @dataclass(frozen=True)
 class _Overlaps:
-    """K predictions, best first, against T true instances."""
+    """The overlaps of K predictions, best first, with T true instances."""
 
     iou: Float64  # (K, T)
-    ignorable: Bool  # (K,) more than half of the points on ignored instances, or of a class that nobody looked for
+    ignorable: Bool  # (K,) more than half of the points on ignored instances, or of a class that was not annotated
     predicted_ids: Int64  # (K,)
     predicted_classes: npt.NDArray[np.object_]  # (K,)
     truth_ids: Int64  # (T,)
@@ -254,17 +239,17 @@ class _Overlaps:
 
     @classmethod
     def between(
-        cls,
-        predictions: PredictedInstances,
-        truth: SceneTruth,
-        transfer: Transfer,
-        max_distance: float,
-        min_points: int,
+        cls, predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, reach: float, min_points: int
     ) -> _Overlaps:
+        """Count the points with each pair of labels, transferred by up to `reach` m."""
         truth_ids, truth_sizes = np.unique(truth.instance_ids[truth.instance_ids > 0], return_counts=True)
         ranks = np.lexsort((predictions.ids, -predictions.confidences))
         ids = predictions.ids[ranks]
-        predicted, true = _transferred(predictions, truth, transfer, max_distance)
+        predicted, true, map_points = predictions.instance_ids, truth.instance_ids, predictions.points_world
+        if transfer is Transfer.TO_TRUTH:
+            predicted = transfer_labels(map_points, predicted, truth.points_world, reach)
+        else:
+            true = transfer_labels(truth.points_world, true, map_points, reach)
         points = _contingency(predicted, true, ids, truth_ids)
         intersection = points[1:, 1:]
         union = points[1:].sum(axis=1)[:, None] + points[:, 1:].sum(axis=0)[None, :] - intersection
@@ -272,10 +257,10 @@ class _Overlaps:
         predicted_classes = np.array([predictions.class_names[k] for k in ranks], object)
         evaluated = (truth_sizes >= min_points) & np.array([name is not None for name in classes], np.bool_)
         mostly_ignored = 2 * intersection[:, ~evaluated].sum(axis=1) > points[1:].sum(axis=1)
-        looked_for = truth.classes is None or np.isin(predicted_classes, truth.classes)
+        annotated = truth.classes is None or np.isin(predicted_classes, truth.classes)
         return cls(
             iou=intersection / np.maximum(union, 1),
-            ignorable=mostly_ignored | np.logical_not(looked_for),
+            ignorable=mostly_ignored | np.logical_not(annotated),
             predicted_ids=ids,
             predicted_classes=predicted_classes,
             truth_ids=truth_ids.astype(np.int64),
@@ -284,9 +269,9 @@ class _Overlaps:
         )
 
     def score(self, threshold: float, predicted: Bool, truths: Bool, allowed: Bool) -> Score:
-        """Matches the chosen predictions (K,) in order of confidence with true instances that are `allowed` (K, T)."""
+        """Match the chosen predictions (K,) in order of confidence with `allowed` (K, T) true instances."""
         matches = self.matches(threshold, predicted, allowed)
-        hits = [match >= 0 for _, match in matches if match != IGNORED]  # of the predictions that count, best first
+        hits = [match >= 0 for _, match in matches if match != IGNORED]  # of the judged predictions, best first
         count = int((truths & self.evaluated).sum())
         return Score(
             ap=average_precision(np.array(hits, np.bool_), count),
@@ -298,7 +283,7 @@ class _Overlaps:
         )
 
     def matches(self, threshold: float, predicted: Bool, allowed: Bool) -> list[tuple[int, int]]:
-        """Each of the chosen predictions (K,), best first, with the column of its match, NO_MATCH or IGNORED."""
+        """Return the chosen predictions (K,), best first, each with the column of its match, NO_MATCH or IGNORED."""
         ignored_iou = self.iou[:, ~self.evaluated].max(axis=1, initial=0.0)
         unknown = self.ignorable | (ignored_iou >= threshold)
         free = np.ones(len(self.truth_ids), np.bool_)
@@ -314,40 +299,27 @@ class _Overlaps:
         return found
 
     def judgement(self, k: int, match: int, threshold: float) -> Judgement:
-        """Of prediction k with what `matches` says of it."""
+        """Return the judgement of prediction k with this result of `matches`."""
         t = match if match >= 0 else int(self.iou[k].argmax()) if len(self.truth_ids) else -1
         iou = float(self.iou[k, t]) if t >= 0 else 0.0
-        if match >= 0:
-            outcome = Outcome.RIGHT
-        elif match == IGNORED:
-            outcome = Outcome.IGNORED
-        else:
-            other = iou >= threshold and self.truth_classes[t] != self.predicted_classes[k]
-            outcome = Outcome.WRONG_CLASS if other else Outcome.FALSE
-        near = iou > 0
-        return Judgement(
-            id=int(self.predicted_ids[k]),
-            outcome=outcome,
-            truth_id=int(self.truth_ids[t]) if near else 0,
-            truth_class=self.truth_classes[t] if near else None,
-            iou=iou,
-        )
+        truth_id, truth_class = (int(self.truth_ids[t]), self.truth_classes[t]) if iou > 0 else (0, None)
+        outcome = Outcome.RIGHT if match >= 0 else Outcome.IGNORED if match == IGNORED else Outcome.FALSE
+        if match == NO_MATCH and iou >= threshold and truth_class != self.predicted_classes[k]:
+            outcome = Outcome.WRONG_CLASS
+        return Judgement(int(self.predicted_ids[k]), outcome, truth_id, truth_class, iou)
 
     def best(self) -> tuple[dict[int, float], dict[int, int]]:
-        """For each evaluated true instance its best overlap and the prediction that has it, whatever its class."""
-        ious, ids = {}, {}
-        for t in np.flatnonzero(self.evaluated):
-            column = self.iou[:, t]
-            truth_id = int(self.truth_ids[t])
-            ious[truth_id] = float(column.max(initial=0.0))
-            ids[truth_id] = int(self.predicted_ids[column.argmax()]) if ious[truth_id] > 0 else 0
+        """Return the best overlap of each evaluated true instance, and the prediction with it, of any class."""
+        columns = {int(self.truth_ids[t]): self.iou[:, t] for t in np.flatnonzero(self.evaluated)}
+        ious = {key: float(column.max(initial=0.0)) for key, column in columns.items()}
+        ids = {key: int(self.predicted_ids[columns[key].argmax()]) if iou > 0 else 0 for key, iou in ious.items()}
         return ious, ids
 
 
 def average_precision(hits: Bool, truths: int) -> float:
-    """The area under the precision-recall curve of ranked predictions (K,), True where right, of `truths` to be found.
+    """Return the area under the precision-recall curve of ranked predictions `hits` (K,), True = right.
 
-    All-point interpolation: sum over the hits of max(precision at that or a lower rank) / truths.
+    All-point interpolation: the sum over the hits of the largest precision at this or a lower rank, by `truths`.
     """
     if truths == 0:
         raise ValueError("average precision is not defined without a true instance")
@@ -356,42 +328,31 @@ def average_precision(hits: Bool, truths: int) -> float:
     return float(envelope[hits].sum() / truths)
 
 
-def _transferred(
-    predictions: PredictedInstances, truth: SceneTruth, transfer: Transfer, max_distance: float
-) -> tuple[Int32, Int32]:
-    """Predicted and true instance ids at the same points, after the transfer."""
-    if transfer is Transfer.TO_TRUTH:
-        carried = transfer_labels(predictions.points_world, predictions.instance_ids, truth.points_world, max_distance)
-        return carried, truth.instance_ids
-    carried = transfer_labels(truth.points_world, truth.instance_ids, predictions.points_world, max_distance)
-    return predictions.instance_ids, carried
-
-
 def transfer_labels(points: Float32, labels: Int32, targets: Float32, max_distance: float) -> Int32:
-    """The label of the nearest of `points` for each target, 0 where none is within `max_distance`."""
+    """Return the label of the nearest of `points` for each target, 0 = none within `max_distance` m."""
     if not len(points) or not len(targets):
         return np.zeros(len(targets), np.int32)
-    import numba  # here: commands that only read figures are answered before it loads
+    import numba  # here: commands that only read figures do not load it
 
-    # Meshes come in an order that differs between runs: sorted, equally near points give the same label each time.
+    # The order of vertices differs between runs: sorted, equally near points give the same label each time.
     order = np.lexsort((labels, points[:, 2], points[:, 1], points[:, 0]))
     points, labels = points[order], labels[order]
     tree = cKDTree(points, balanced_tree=False)
     bound = np.nextafter(max_distance, np.inf)  # exclusive in SciPy
     _, nearest = tree.query(targets, distance_upper_bound=bound, workers=numba.get_num_threads())
-    carried: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy answers "none" with the index after the last
-    return carried
+    transferred: Int32 = np.append(labels, np.int32(0))[nearest]  # SciPy's "none" is the index after the last
+    return transferred
 
 
 def _contingency(predicted: Int32, true: Int32, predicted_ids: Int64, truth_ids: Array) -> Int64:
-    """(1 + K, 1 + T) points with each pair of labels; row and column 0 hold the points of no instance."""
+    """Return the points (1 + K, 1 + T) with each pair of labels; row and column 0 are for no instance."""
     rows, columns = _positions(predicted, predicted_ids), _positions(true, truth_ids)
     shape = 1 + len(predicted_ids), 1 + len(truth_ids)
     return np.bincount(rows * shape[1] + columns, minlength=shape[0] * shape[1]).reshape(shape)
 
 
 def _positions(labels: Int32, ids: Array) -> Int64:
-    """For each label 1 + its place in `ids`, 0 for label 0."""
+    """Return 1 + the index in `ids` of each label, 0 for label 0."""
     values, inverse = np.unique(labels, return_inverse=True)
-    place = {int(value): 1 + k for k, value in enumerate(ids)}
-    return np.array([place.get(int(value), 0) for value in values], np.int64)[inverse]
+    index = {value: k for k, value in enumerate(ids.tolist(), start=1)}
+    return np.array([index.get(value, 0) for value in values.tolist()], np.int64)[inverse]

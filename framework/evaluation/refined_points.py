@@ -1,4 +1,4 @@
-"""What a refiner did to the clusters of one frame: their points, and how well they fit the true masks."""
+"""The effect of a refiner on the point clusters of one frame: their points and their fit to the true masks."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
 from framework.refinement.refine import refine
 
-TIMED = 5  # calls, of which the median counts; the one before them may have to compile
+TIMED = 5  # calls, of which the median counts; the call before them may compile
 
 
 @dataclass(frozen=True)
 class Refinement:
-    """The N clusters of one frame before, and the M clusters after its refiner; N and M differ where one was split."""
+    """The N clusters of one frame before and the M clusters after its refiner, which may split clusters."""
 
     frame: Frame
     before: PointClusters
     after: PointClusters
-    milliseconds: float  # that the refiner took
+    milliseconds: float  # run time of the refiner
 
     @classmethod
     def of(cls, refiner: ClusterRefiner, detections: Detections, frame: Frame) -> Refinement:
-        """Lifts the detections at the frame's true pose, or else in the camera's own frame, and refines them."""
+        """Lift the detections at the frame's true pose, or in the camera's frame without one, and refine them."""
         pose = Pose(np.eye(4) if frame.T_world_camera is None else frame.T_world_camera)
         before = lift(detections, frame, pose)
         after = refine(refiner, before, frame)
@@ -42,20 +42,20 @@ class Refinement:
 
     @cached_property
     def origin(self) -> Int32:
-        """(M,) the cluster before that each cluster after comes from, -1 = none.
+        """(M,) the original cluster of each refined cluster, -1 = none.
 
-        Refiners that keep the number of clusters keep their index. Where it has changed, a cluster comes from the one
-        that it shares most pixels with, the first of equals.
+        Refiners that keep the number of clusters keep their order. Otherwise a refined cluster comes from the one with
+        which it shares most pixels, the first of equals.
         """
         n, m = len(self.before), len(self.after)
         if n == m or n == 0:
             return np.arange(m, dtype=np.int32) if n == m else np.full(m, -1, np.int32)
-        shared = (membership(self.before, self.frame) @ membership(self.after, self.frame).T).toarray()
+        shared = (_membership(self.before, self.frame) @ _membership(self.after, self.frame).T).toarray()
         return np.where(shared.any(axis=0), shared.argmax(axis=0), -1).astype(np.int32)
 
     @cached_property
     def main_part(self) -> Int32:
-        """(N,) the largest of the clusters after that come from each cluster before, -1 = there is none."""
+        """(N,) the largest refined cluster of each original cluster, -1 = none."""
         sizes = point_counts(self.after)
         largest_last = np.argsort(sizes, kind="stable")
         main = np.full(len(self.before), -1, np.int32)
@@ -65,35 +65,35 @@ class Refinement:
 
     @cached_property
     def points_before(self) -> Int32:
-        """(N,) points of each cluster."""
+        """(N,) points of each original cluster."""
         return point_counts(self.before)
 
     @cached_property
     def points_after(self) -> Int32:
-        """(N,) points of all that is left of each cluster."""
+        """(N,) remaining points of each original cluster."""
         known = self.origin >= 0
         sums = np.bincount(self.origin[known], point_counts(self.after)[known], minlength=len(self.before))
         return sums.astype(np.int32)
 
     @cached_property
     def fit_before(self) -> TrueFit | None:
-        """Of the N clusters; None where the true instances are not known."""
+        """The fit of the N clusters; None without true instances."""
         return None if self.frame.truth is None else true_fit(self.before, self.frame, self.frame.truth)
 
     @cached_property
     def fit_after(self) -> TrueFit | None:
-        """Of the M clusters; None where the true instances are not known."""
+        """The fit of the M clusters; None without true instances."""
         return None if self.frame.truth is None else true_fit(self.after, self.frame, self.frame.truth)
 
     @cached_property
     def judged_before(self) -> Bool:
-        """(N,) clusters that count: not those on an object of unknown class, nor any where no truth is known."""
+        """(N,) True for the clusters that count: not on an object of unknown class; none without truth."""
         fit = self.fit_before
         return np.zeros(len(self.before), np.bool_) if fit is None else ~fit.unknown
 
     @cached_property
     def judged_after(self) -> Bool:
-        """(M,) clusters that come from one that counts, so that the same are compared."""
+        """(M,) True for the clusters whose original cluster counts."""
         fit = self.fit_after
         if fit is None:
             return np.zeros(len(self.after), np.bool_)
@@ -102,32 +102,32 @@ class Refinement:
 
 @dataclass(frozen=True)
 class TrueFit:
-    """How well each of N clusters fits the true object of known class that it fits best, as seen in the frame."""
+    """The fit of N clusters to their best-fitting true objects of known class, as seen in the frame."""
 
     iou: Float64  # (N,) intersection over union with that object; 0 for an empty cluster
-    points_inside: Int32  # (N,) of the cluster's points, those on that object
-    unknown: Bool  # (N,) an object of unknown class fits better: not to be evaluated
+    points_inside: Int32  # (N,) points of the cluster on that object
+    unknown: Bool  # (N,) an object of unknown class fits better: not evaluated
 
 
 def point_counts(clusters: PointClusters) -> Int32:
-    """(N,) points of each cluster."""
+    """Return the number of points (N,) of each cluster."""
     return np.bincount(clusters.cluster[clusters.cluster >= 0], minlength=len(clusters)).astype(np.int32)
 
 
 def pixel_index(clusters: PointClusters, frame: Frame) -> Int32:
-    """(P,) where each point was seen, as an index into the image's pixels in rows."""
+    """Return the row-major pixel index (P,) of each point."""
     return clusters.pixels[:, 1] * frame.camera.width + clusters.pixels[:, 0]
 
 
-def membership(clusters: PointClusters, frame: Frame) -> csr_array:
-    """(N, H * W) 1 where a cluster has a point at the pixel."""
+def _membership(clusters: PointClusters, frame: Frame) -> csr_array:
+    """Return (N, H * W), 1 where a cluster has a point at the pixel."""
     held = clusters.cluster >= 0
     entries = clusters.cluster[held], pixel_index(clusters, frame)[held]
     return csr_array((np.ones(held.sum(), np.int32), entries), (len(clusters), frame.depth.size))
 
 
 def true_fit(clusters: PointClusters, frame: Frame, truth: FrameTruth) -> TrueFit:
-    """Compares clusters with the true objects, over the pixels with a depth reading, as clusters hold no others."""
+    """Compare clusters with the true objects, over the pixels with a depth reading: clusters have no others."""
     ids = np.where(frame.depth > 0, truth.instance_ids, 0).ravel()
     objects, of_pixel, areas = np.unique(ids, return_inverse=True, return_counts=True)
     n, held = len(clusters), clusters.cluster >= 0

@@ -1,14 +1,13 @@
-"""How far an estimated trajectory is from the true one: ATE and RPE, in evo's symbols and with evo's numbers.
+"""Trajectory errors ATE and RPE, in evo's symbols and equal to evo's values.
 
-Q_i = T_world_camera of frame i, reference; P_i = the same, estimated.
+Q_i and P_i are the reference and the estimated T_world_camera of frame i.
 
-- ATE (absolute trajectory error, Sturm et al. 2012): with the rigid S that aligns the positions best in the least
-  squares sense (Umeyama 1991, without scale), E_i = Q_i^-1 S P_i; the RMSE of |trans E_i|.
-- RPE (relative pose error) with delta = 1 frame: E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}); the RMSE of |trans E_i|
-  and that of the angle of rot E_i. No alignment is needed.
+- ATE (absolute trajectory error, Sturm et al. 2012): the RMSE of |trans E_i| with E_i = Q_i^-1 S P_i, where the rigid S
+  aligns the positions in the least squares sense (Umeyama 1991, without scale).
+- RPE (relative pose error) with delta = 1 frame: the RMSE of |trans E_i| and of the angle of rot E_i with
+  E_i = (Q_i^-1 Q_{i+1})^-1 (P_i^-1 P_{i+1}).
 
-Frames whose pose is lost or whose true pose is not known are left out; RPE then also leaves out the pairs that they are
-in, so that a step always is one frame long.
+Frames with a lost or an unknown true pose are left out, and for RPE the pairs with them.
 """
 
 from __future__ import annotations
@@ -24,16 +23,16 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrajectoryError:
-    """Errors of one trajectory; `nan` where no frame (ATE) or no pair of frames (RPE) could be compared."""
+    """Errors of one trajectory; `nan` without a frame (ATE) or a pair of frames (RPE)."""
 
     ate_rmse_m: float
     rpe_rmse_m: float
     rpe_rotation_rmse_rad: float
-    frames: int  # that ATE compares
-    pairs: int  # that RPE compares
+    frames: int  # compared by ATE
+    pairs: int  # compared by RPE
 
     def metrics(self) -> dict[str, float]:
-        """By their names in metrics.json; an error that is not defined is left out."""
+        """Return the defined errors by their names in metrics.json."""
         flat: dict[str, float] = {}
         if self.frames:
             flat["trajectory.ate_rmse_m"] = self.ate_rmse_m
@@ -44,9 +43,9 @@ class TrajectoryError:
 
 
 def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> TrajectoryError:
-    """Compares pose i with true pose i (T_world_camera, (4, 4); None = not known) of consecutive frames.
+    """Compare the poses of consecutive frames with the true T_world_camera (4, 4); None = unknown.
 
-    Raises DataError when there are not equally many.
+    Raises DataError if the numbers of poses differ.
     """
     if len(reference) != len(estimated):
         raise DataError(
@@ -55,7 +54,12 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
     usable = np.array([q is not None and not p.lost for q, p in zip(reference, estimated, strict=True)], np.bool_)
     Q = np.array([np.eye(4) if q is None else q for q in reference]).reshape(-1, 4, 4)
     P = np.array([p.T_world_camera for p in estimated]).reshape(-1, 4, 4)
-    ate = np.linalg.norm(_aligned(Q[usable, :3, 3], P[usable, :3, 3]) - Q[usable, :3, 3], axis=1)
+    positions = Q[usable, :3, 3]
+    aligned = P[usable, :3, 3]
+    if len(aligned):
+        R, t = umeyama(aligned, positions)
+        aligned = aligned @ R.T + t
+    ate = np.linalg.norm(aligned - positions, axis=1)
     i = np.flatnonzero(usable[:-1] & usable[1:])
     E = _inverse(_inverse(Q[i]) @ Q[i + 1]) @ (_inverse(P[i]) @ P[i + 1])
     return TrajectoryError(
@@ -68,9 +72,9 @@ def evaluate(reference: Sequence[Float64 | None], estimated: Sequence[Pose]) -> 
 
 
 def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
-    """R (3, 3) and t (3,) that minimize sum |y_i - (R x_i + t)|^2 over points (n, 3): Umeyama 1991, eqs. (40) to (43).
+    """Return R (3, 3) and t (3,) that minimize sum |y_i - (R x_i + t)|^2: Umeyama 1991, eqs. (40) to (43).
 
-    Where the points do not determine the rotation (fewer than three, or all on a line), it is one of the best.
+    The points are (n, 3). If they are fewer than three or on a line, R is one of several solutions.
     """
     mu_x, mu_y = x.mean(axis=0), y.mean(axis=0)
     U, _, Vt = np.linalg.svd((y - mu_y).T @ (x - mu_x) / len(x))
@@ -79,16 +83,8 @@ def umeyama(x: Float64, y: Float64) -> tuple[Float64, Float64]:
     return R, mu_y - R @ mu_x
 
 
-def _aligned(reference: Float64, estimated: Float64) -> Float64:
-    """The estimated positions (n, 3) moved rigidly onto the reference."""
-    if not len(estimated):
-        return estimated
-    R, t = umeyama(estimated, reference)
-    return np.asarray(estimated @ R.T + t)
-
-
 def _inverse(T: Float64) -> Float64:
-    """Of rigid transforms (n, 4, 4)."""
+    """Invert rigid transforms (n, 4, 4)."""
     inverse = np.zeros_like(T)
     inverse[:, :3, :3] = T[:, :3, :3].transpose(0, 2, 1)
     inverse[:, :3, 3] = -np.einsum("nji,nj->ni", T[:, :3, :3], T[:, :3, 3])
@@ -97,7 +93,7 @@ def _inverse(T: Float64) -> Float64:
 
 
 def _angles(R: Float64) -> Float64:
-    """The angles (n,) of rotations (n, 3, 3), rad, accurate for small ones too: see geometry.rotation_angle."""
+    """Return the angles (n,) of rotations (n, 3, 3) in rad, accurate for small ones: see geometry.rotation_angle."""
     axis = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
     return np.asarray(np.arctan2(np.linalg.norm(axis, axis=1) / 2, (np.trace(R, axis1=1, axis2=2) - 1) / 2))
 

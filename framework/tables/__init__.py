@@ -1,1 +1,1 @@
-"""Run records become tables: Markdown, LaTeX, CSV."""
+"""Tables of runs: Markdown, LaTeX and CSV."""

@@ -1,6 +1,4 @@
-"""What a table compares: the records below a directory as rows, the row that the others are compared with, and what a
-table shows of them.
-"""
+"""The contents of a table: the run directories below a folder as rows, their base, and what is shown of them."""
 
 from __future__ import annotations
 
@@ -13,7 +11,7 @@ from typing import Any
 from framework.config.validation import checked_block
 from framework.errors import ConfigError, DataError
 from framework.runs.metrics import is_evaluation
-from framework.runs.run_rows import CHOICE, Run, RunRow, natural, rows_of
+from framework.runs.run_rows import CHOICE, Mean, Run, RunRow, natural, rows_of
 from framework.runs.stored_runs import Incomplete, Record, find_records, read_yaml
 from framework.runs.sweep_file import SWEEP, asked_runs, sweep_rows
 from framework.tables.published import (
@@ -31,27 +29,26 @@ PLAIN = (
     *("instances.count", "trajectory.ate_rmse_m", "frames_lost", "fps"),
     *("stage_ms.refine.median", "stage_ms.fuse.median"),
 )
-"""The columns of a table that no experiment describes, as far as its runs have such figures: keys of metrics.json."""
+"""The columns without an experiment, if the runs have these figures: keys of metrics.json."""
 
 
 @dataclass(frozen=True)
 class TableChoice:
-    """What a table shows: the block `table` of an experiment.
+    """The block `table` of an experiment.
 
     A line is a row and a column is a metric, averaged over the runs that differ in `average_over` alone. With
-    `columns_by`, a column is a value of that key, such as a sequence, and a line ends with their mean. With `group_by`,
-    each of its values has a group of lines.
+    `columns_by`, a column is a value of that key, such as a sequence, followed by the mean. With `group_by`, each value
+    has a group of lines.
     """
 
-    # keys of the config, averaged over and paired by; runs that agree in the last of them are no independent evidence
+    # config keys, averaged over and paired by; runs that agree in the last one are not independent
     average_over: list[str] = field(default_factory=lambda: ["seed"])
-    columns_by: str | None = None  # key of the config with a column for each value; None = columns are figures
-    group_by: str | None = None  # key of the config with a group of lines for each value; None = a line is all of a row
+    columns_by: str | None = None  # config key with a column per value; None = columns are figures
+    group_by: str | None = None  # config key with a group of lines per value; None = a row is one line
     baseline: str | None = None  # name of the row that the others are compared with; None = the first
     columns: list[str] = field(default_factory=list)  # keys of metrics.json, at least one; with `columns_by`, just one
-    names: dict[str, str] = field(default_factory=dict)  # what rows are called in the table; others go by their name
-    # section of published.yaml, whose numbers stand below where all runs are of the real SceneNN; None = none
-    published: str | None = None
+    names: dict[str, str] = field(default_factory=dict)  # row -> its name in the table
+    published: str | None = None  # section of published.yaml, shown if all runs are of the real SceneNN; None = none
 
     def __post_init__(self) -> None:
         for name in ("average_over", "columns"):
@@ -81,35 +78,34 @@ class TableChoice:
 
     @property
     def split_key(self) -> str | None:
-        """The key whose values are shown one by one, as columns or as groups of lines."""
+        """The key whose values are columns or groups of lines."""
         return self.columns_by or self.group_by
 
     @classmethod
     def of(cls, node: Any) -> TableChoice:
-        """The choice that a config's `table` describes. Raises ConfigError for keys and types that it does not have."""
+        """Return the choice of a config's `table`; raise ConfigError for unknown keys and wrong types."""
         return cls(**checked_block(cls, "table", node))
 
 
 @dataclass(frozen=True)
 class ComparisonTable:
-    """All that a table says, before it is written in one format or another."""
+    """The contents of a table, independent of its format."""
 
     title: str
     choice: TableChoice
-    rows: list[RunRow]  # in their order, each with a run or more
+    rows: list[RunRow]  # each with at least one run
     overrides: Mapping[str, Sequence[str]]  # of the experiment's rows, by name; some may have no run yet
-    asked: list[Run]  # what the sweep was last asked for, of every row; some may not have begun
+    asked: list[Run]  # the runs of the last sweep, for every row; some may not have begun
     incomplete: list[Incomplete]
-    superseded: int  # records of runs that have a later one
-    root: Path  # what the names of runs are relative to
-    left_out: Sequence[str] = ()  # of PLAIN, what no run has a figure of; without an experiment only
+    superseded: int  # older records of the same runs
+    root: Path  # runs are named relative to it
+    left_out: Sequence[str] = ()  # of PLAIN, without a figure in any run
 
     @classmethod
     def below(cls, directory: Path) -> ComparisonTable:
-        """From the records at and below `directory`, as the experiment that ran there says, else with the figures of
-        PLAIN that there are.
+        """Return the table of the runs at and below `directory`: its experiment's, or else with the columns PLAIN.
 
-        Raises DataError when there is no complete record, or when the experiment's config cannot be read.
+        Raises DataError if no run is complete or the experiment's config cannot be read.
         """
         if not directory.is_dir():
             raise DataError(f"{directory} is not a folder with records of runs")
@@ -124,16 +120,18 @@ class ComparisonTable:
         rows = rows_of(records, keys, overrides)
         asked = asked_runs(sweep, keys)
         superseded = len(records) - sum(len(row.records) for row in rows)
-        left_out = () if sweep.get("table") else _without_figure(choice.columns, rows)
-        if left_out:
+        left_out = () if sweep.get("table") else [c for c in choice.columns if not any(row.values(c) for row in rows)]
+        if 0 < len(left_out) < len(choice.columns):
             choice = replace(choice, columns=[key for key in choice.columns if key not in left_out])
+        else:
+            left_out = ()
         return cls(
             directory.resolve().name, choice, rows, overrides, asked, incomplete, superseded, directory, left_out
         )
 
     @property
     def judged(self) -> bool:
-        """Whether a figure depends on the true instances, of whose annotation there may be several releases."""
+        """Return True if a figure depends on the true instances, whose annotation may have several releases."""
         annotated = self.choice.split_key or any(record.annotation for record in self.records)
         return bool(annotated) and any(map(is_evaluation, self.choice.columns))
 
@@ -147,11 +145,11 @@ class ComparisonTable:
 
     @property
     def noun(self) -> str:
-        """What is shown one by one, in a word: `scene` for dataset.scene."""
+        """The last word of the split key: `scene` for dataset.scene."""
         return (self.choice.split_key or "").rpartition(".")[2]
 
     def base_of(self, row: RunRow) -> RunRow | None:
-        """The row that `row` is compared with, of the same poses and the like; None for that one, and without it."""
+        """Return the row that `row` is compared with; None for the base itself, and without one of this variant."""
         named = [other for other in self.rows if other.name == self.base_name]
         bases = named or [r for r in self.rows if r.system == self.base_name and r.variant == row.variant]
         return bases[0] if bases and bases[0] is not row else None
@@ -162,7 +160,7 @@ class ComparisonTable:
 
     @property
     def compared(self) -> list[tuple[RunRow, RunRow]]:
-        """The rows that have one to be compared with, and that one."""
+        """The rows that have a base, each with it."""
         pairs = ((row, self.base_of(row)) for row in self.rows)
         return [(row, base) for row, base in pairs if base is not None]
 
@@ -172,7 +170,7 @@ class ComparisonTable:
 
     @property
     def is_of_scenenn(self) -> bool:
-        """Whether all runs are of the real SceneNN, as published numbers are, and not of rooms in its format."""
+        """Return True if all runs are of the real SceneNN, as published numbers are, not of rooms in its format."""
         datasets = {record.metrics.get(f"{CHOICE}dataset") for record in self.records}
         return datasets == {DATASET} and not any(record.annotation.startswith(MADE_UP) for record in self.records)
 
@@ -184,17 +182,17 @@ class ComparisonTable:
 
     @property
     def published_rows(self) -> list[PublishedRow]:
-        """Those of which a number that the table shows is known."""
+        """The published rows with a number that the table shows."""
         return [row for row in self.published.rows if row.knows(self._keys)]
 
     @property
     def published_unknown(self) -> list[PublishedRow]:
-        """Those of which no number that the table shows is known, as nobody has looked them up."""
+        """The published rows whose numbers for this table were not looked up."""
         return [row for row in self.published.rows if not row.knows(self._keys) and row.leaves_open(self._keys)]
 
     @property
     def _keys(self) -> list[Key]:
-        """What the table shows, as published numbers are listed."""
+        """The keys of the table's figures in published.yaml."""
         if self.choice.columns_by:
             return [(sequence,) for sequence in self.sequences]
         if self.choice.group_by:
@@ -203,19 +201,19 @@ class ComparisonTable:
 
     @cached_property
     def sequences(self) -> list[str]:
-        """The values that are shown one by one: those of published tables first, and those of the runs."""
+        """The values of the split key: those of published tables first, then those of the runs."""
         found = {run[-1] for run in self._runs} if self.choice.split_key else set()
         order = sorted(found, key=lambda value: natural((value,)))
         return list(dict.fromkeys([*self.published.sequences, *order]))
 
     def called(self, row: RunRow, without: str = "") -> str:
-        """What a row is called, without the part of its name that says which `without` it has."""
+        """Return a row's name in the table, without the value of the key `without`."""
         named = self.choice.names.get(row.system, row.system)
         variant = [part for part in row.variant if not without or not part.startswith(f"{without}=")]
         return ", ".join([named, *variant] if named else variant) or row.name
 
     def missing(self) -> Iterator[tuple[RunRow, list[Run]]]:
-        """The runs that a row should have: they were asked for, or other rows have their seeds and sequences."""
+        """Yield the rows that lack runs: requested ones, or of the seeds and sequences of other rows."""
         runs = self._runs
         if self.choice.split_key:
             seeds, sequences = (dict.fromkeys(run[:-1] for run in runs), dict.fromkeys(run[-1] for run in runs))
@@ -226,11 +224,39 @@ class ComparisonTable:
 
     @property
     def _runs(self) -> list[Run]:
-        """All that a row has or that were asked for."""
+        """The runs of all rows, and the requested ones."""
         return [*(run for row in self.rows for run in row.records), *self.asked]
 
 
-def _without_figure(columns: Sequence[str], rows: Sequence[RunRow]) -> list[str]:
-    """The columns that would be empty; none of them where all would, as a table without a column says nothing."""
-    empty = [key for key in columns if not any(row.values(key) for row in rows)]
-    return empty if len(empty) < len(columns) else []
+@dataclass(frozen=True)
+class SequenceMean:
+    """The mean over sequences of their means over seeds."""
+
+    value: float  # NaN = of no sequence
+    deviation: float  # sample standard deviation of the means of the seeds that have all sequences; NaN = below two
+    count: int  # sequences
+    runs: int  # of all sequences
+
+
+def mean_by_sequence(values: Mapping[Run, float]) -> dict[str, Mean]:
+    """Return the mean of each sequence, the last part of a run."""
+    grouped: dict[str, list[float]] = {}
+    for run, value in values.items():
+        grouped.setdefault(run[-1], []).append(value)
+    return {sequence: Mean.of(found) for sequence, found in grouped.items()}
+
+
+def mean_over_sequences(values: Mapping[Run, float]) -> SequenceMean:
+    """Return the mean of the sequences, with equal weights."""
+    means = mean_by_sequence(values)
+    seeds: dict[Run, list[float]] = {}
+    for run, value in values.items():
+        seeds.setdefault(run[:-1], []).append(value)
+    complete = Mean.of(Mean.of(found).value for found in seeds.values() if len(found) == len(means))
+    mean = Mean.of(mean.value for mean in means.values())
+    return SequenceMean(mean.value, complete.deviation, len(means), len(values))
+
+
+def mean_difference(differences: Mapping[Run, float]) -> Mean:
+    """Return the mean of paired differences with its standard error over sequences: seeds are no further evidence."""
+    return Mean.of(mean.value for mean in mean_by_sequence(differences).values())

@@ -1,4 +1,4 @@
-"""Tables of runs: from the records below a directory to Markdown, LaTeX and CSV."""
+"""Tables of the runs below a directory, as Markdown, LaTeX and CSV."""
 
 from __future__ import annotations
 
@@ -9,40 +9,28 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from framework.files.atomic_write import written_whole
-from framework.tables.comparison import ComparisonTable
+from framework.tables.comparison import ComparisonTable, mean_difference
 from framework.tables.grid import TextTable, latex_grid, markdown_grid
-from framework.tables.layouts import difference_grid, row_grid
-from framework.tables.sequence_layouts import across_grid, by_grid, difference_across_grid
-from framework.tables.sequences import mean_difference
+from framework.tables.layouts import across_grid, by_grid, difference_across_grid, difference_grid, row_grid
 from framework.tables.table_notes import counted, digest, notes
 
 
 def write_tables(directory: Path) -> str:
-    """Writes table.md, table.tex and table.csv into `directory`, from the records below it; returns the Markdown.
+    """Write table.md, table.tex and table.csv of the runs below `directory` into it; return the Markdown.
 
-    Raises DataError when there is no complete record.
+    Raises DataError if no run is complete.
     """
     comparison = ComparisonTable.below(directory)
-    text = markdown(comparison)
+    grids = list(_grids(comparison))
+    explained = list(notes(comparison))
+    bullets = "\n".join(f"- {note}" for note in explained)
+    text = "\n\n".join([f"# {comparison.title}", *map(markdown_grid, grids), bullets]) + "\n"
+    latex = "\n".join([*(f"% {note}" for note in explained), *(line for grid in grids for line in latex_grid(grid))])
     separated = comma_separated_runs if comparison.choice.split_key else comma_separated_rows
-    for name, content in (("md", text), ("tex", latex(comparison)), ("csv", separated(comparison))):
+    for name, content in (("md", text), ("tex", latex), ("csv", separated(comparison))):
         with written_whole(directory / f"table.{name}") as temporary:
             temporary.write_text(content, "utf-8")
     return text
-
-
-def markdown(comparison: ComparisonTable) -> str:
-    parts = [f"# {comparison.title}", *map(markdown_grid, grids(comparison))]
-    parts.append("\n".join(f"- {note}" for note in notes(comparison)))
-    return "\n\n".join(parts) + "\n"
-
-
-def latex(comparison: ComparisonTable) -> str:
-    """Tabulars, with the notes as comments."""
-    lines = [f"% {note}" for note in notes(comparison)]
-    for grid in grids(comparison):
-        lines += latex_grid(grid)
-    return "\n".join(lines)
 
 
 LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[ComparisonTable], TextTable]]] = {
@@ -50,10 +38,10 @@ LAYOUTS: dict[str, tuple[Callable[[ComparisonTable], TextTable], Callable[[Compa
     "columns_by": (across_grid, difference_across_grid),
     "group_by": (by_grid, difference_grid),
 }
-"""By TableChoice.layout: the table of the figures, and that of the differences to the base."""
+"""TableChoice.layout -> the table of the figures, and the table of the differences to the base."""
 
 
-def grids(comparison: ComparisonTable) -> Iterator[TextTable]:
+def _grids(comparison: ComparisonTable) -> Iterator[TextTable]:
     figures, differences = LAYOUTS[comparison.choice.layout]
     yield figures(comparison)
     if comparison.compared:
@@ -61,7 +49,7 @@ def grids(comparison: ComparisonTable) -> Iterator[TextTable]:
 
 
 def comma_separated_rows(comparison: ComparisonTable) -> str:
-    """One line a row, all digits; empty where nothing is known."""
+    """Return a line per row, with all digits; unknown values are empty."""
     statistics = ("mean", "sd", "n", "difference", "se", "pairs")
     keys = [f"{column}.{name}" for column in comparison.choice.columns for name in statistics]
     text = io.StringIO()
@@ -82,7 +70,7 @@ def comma_separated_rows(comparison: ComparisonTable) -> str:
 
 
 def comma_separated_runs(comparison: ComparisonTable) -> str:
-    """One line a run and figure, all digits, for pandas; a figure that is not defined has no line."""
+    """Return a line per run and figure, with all digits; undefined figures have no line."""
     split_key = comparison.choice.split_key
     assert split_key
     text = io.StringIO()
@@ -90,15 +78,10 @@ def comma_separated_runs(comparison: ComparisonTable) -> str:
     origins = ["poses", "tracker", "annotation", "code", "config"]
     writer.writerow(["system", "variant", *comparison.choice.average_over, split_key, "figure", "value", *origins])
     for row in comparison.rows:
-        origins_of = {
-            run: [
-                *(record.metrics.get(key) for key in ("pose_source", "choice.tracker", "annotation_release")),
-                *(record.code, record.metrics["config_hash"]),
-            ]
-            for run, record in row.records.items()
-        }
         for column in comparison.choice.columns:
             for run, value in row.values(column).items():
-                variant = ", ".join(row.variant)
-                writer.writerow([row.system or row.name, variant, *run, column, repr(value), *origins_of[run]])
+                record = row.records[run]
+                origin = [record.metrics.get(f) for f in ("pose_source", "choice.tracker", "annotation_release")]
+                origin += [record.code, record.metrics["config_hash"]]
+                writer.writerow([row.system or row.name, ", ".join(row.variant), *run, column, repr(value), *origin])
     return text.getvalue()

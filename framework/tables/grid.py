@@ -1,4 +1,4 @@
-"""Cells of text under heads, as Markdown and as LaTeX; and how a figure becomes the text of a cell."""
+"""Tables of text in Markdown and LaTeX, and the format of figures."""
 
 from __future__ import annotations
 
@@ -9,50 +9,43 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class TextTable:
-    """Cells of text under heads."""
+    """Cells of text below heads."""
 
     heads: list[str]
     body: list[list[str]]
-    label_columns: int = 1  # how many columns, from the left, hold words; the others hold figures
+    label_columns: int = 1  # from the left, aligned to the left; the others hold figures
     bold: frozenset[tuple[int, int]] = frozenset()  # (line, column)
-    groups: frozenset[int] = frozenset()  # lines that begin another group than the line above
+    groups: frozenset[int] = frozenset()  # lines that begin a group
 
 
 def decimals(values: Iterable[float]) -> int:
-    """As many as the largest of the values that are known needs, for three digits or so."""
+    """Return the decimals that show about three digits of the largest value; NaN is ignored."""
     largest = max((abs(value) for value in values if not math.isnan(value)), default=0.0)
     return next((3 - k for k, limit in enumerate((2, 20, 200)) if largest < limit), 0)
 
 
 def figure(value: float, spread: float, digits: int, signed: bool = False) -> str:
-    """Value ± spread, the spread only where it is known."""
+    """Return value ± spread; a NaN spread is omitted."""
     text = f"{round(value, digits) + 0.0:{'+' if signed else ''}.{digits}f}"  # + 0.0: no -0.000
     return text if math.isnan(spread) else f"{text} ± {spread:.{digits}f}"
 
 
 def markdown_grid(grid: TextTable) -> str:
-    """Padded, so that it reads as a table in a terminal, too."""
+    """Return Markdown, padded so that it is readable in a terminal."""
     cells = [[" ".join(cell.replace("|", "\\|").split()) for cell in line] for line in (grid.heads, *grid.body)]
     for line, column in grid.bold:
         cells[line + 1][column] = f"**{cells[line + 1][column]}**"
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    first, *lines = ["| " + " | ".join(_padded(line, widths, grid.label_columns)) + " |" for line in cells]
-    rules = ["-" * width if k < grid.label_columns else "-" * (width - 1) + ":" for k, width in enumerate(widths)]
-    return "\n".join([first, "| " + " | ".join(rules) + " |", *lines])
-
-
-def _padded(line: list[str], widths: list[int], label_columns: int) -> list[str]:
-    pairs = enumerate(zip(line, widths, strict=True))
-    return [cell.ljust(width) if k < label_columns else cell.rjust(width) for k, (cell, width) in pairs]
+    cells.insert(1, ["-" * w if k < grid.label_columns else "-" * (w - 1) + ":" for k, w in enumerate(widths)])
+    adjust = [str.ljust if k < grid.label_columns else str.rjust for k in range(len(widths))]
+    padded = ([pad(cell, w) for pad, cell, w in zip(adjust, line, widths, strict=True)] for line in cells)
+    return "\n".join("| " + " | ".join(line) + " |" for line in padded)
 
 
 def latex_grid(grid: TextTable) -> list[str]:
-    """The lines of a tabular for `\\usepackage{booktabs}`."""
-    lines = [
-        f"\\begin{{tabular}}{{{'l' * grid.label_columns}{'r' * (len(grid.heads) - grid.label_columns)}}}",
-        "\\toprule",
-    ]
-    lines += [_latex_line(map(_escaped, grid.heads)), "\\midrule"]
+    """Return the lines of a tabular for `\\usepackage{booktabs}`."""
+    alignment = "l" * grid.label_columns + "r" * (len(grid.heads) - grid.label_columns)
+    lines = [f"\\begin{{tabular}}{{{alignment}}}", "\\toprule", _latex_line(map(_escaped, grid.heads)), "\\midrule"]
     for k, cells in enumerate(grid.body):
         if k in grid.groups:
             lines.append("\\midrule")
@@ -79,5 +72,5 @@ def _escaped(cell: str) -> str:
 
 def _latex_line(cells: Iterable[str]) -> str:
     line = " & ".join(cells) + " \\\\"
-    # else the line above would take the mark for its argument
+    # Without {}, the line above would take the mark as its argument.
     return f"{{}}{line}" if line.startswith(("*", "[")) else line

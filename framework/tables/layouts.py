@@ -1,18 +1,23 @@
-"""How a comparison is laid out: a line a row, and below that each row's differences to the base."""
+"""Layouts of a comparison: a line per row, a column per sequence, or a group of lines per sequence.
+
+In the layouts with sequences, rows of the same poses stand together, and the highest mean among them is bold. Only
+means over equally many runs compete.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
-from framework.runs.run_rows import Mean
-from framework.tables.comparison import ComparisonTable
+from framework.runs.run_rows import Mean, RunRow
+from framework.tables.comparison import ComparisonTable, mean_by_sequence, mean_difference, mean_over_sequences
 from framework.tables.grid import TextTable, decimals, figure
 from framework.tables.published import NOT_KNOWN, Key, PublishedRow
-from framework.tables.sequences import mean_difference
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-NOTHING = "–"  # a figure that is not defined, such as the AP of a class that is not there
+NOTHING = "–"  # an undefined figure, such as the AP of a class without objects
+MISSING = "missing"  # a figure without a complete run
 
 HEADS = {
     "instances.ap": "AP",
@@ -36,11 +41,11 @@ HEADS = {
     "peak_rss_bytes": "peak memory (bytes)",
     **{f"instances.ap50.{coco}": name for name, coco in SCENENN_TO_COCO.items()},
 }
-"""What columns are called; others get the name of their key."""
+"""The heads of columns; other columns are headed by their key."""
 
 
 def head(key: str) -> str:
-    """What a figure is called, with its unit."""
+    """Return the head of a figure's column, with its unit."""
     parts = key.split(".")
     if parts[0] == "stage_ms" and len(parts) == 3:
         return f"{parts[1]} (ms{'' if parts[2] == 'median' else f', {parts[2]}'})"
@@ -48,64 +53,194 @@ def head(key: str) -> str:
 
 
 def row_grid(comparison: ComparisonTable) -> TextTable:
-    """Each row's mean and deviation."""
-    rows = comparison.rows
-    columns = [_Column([row.mean(key) for row in rows]) for key in comparison.choice.columns]
-    body = [
-        [
-            *(comparison.called(row), str(len(row.records))),
-            *(column.cell(k, column.means[k].deviation, len(row.records)) for column in columns),
-            row.pose_source,
-            *([row.annotation or NOTHING] if comparison.judged else []),
-        ]
-        for k, row in enumerate(rows)
-    ]
-    for published in comparison.published_rows:
-        cells = [
-            published_cell(published, (key,), column.decimals)
-            for key, column in zip(comparison.choice.columns, columns, strict=True)
-        ]
-        annotation = [published.annotation] if comparison.judged else []
-        body.append([published_name(published), NOTHING, *cells, published.poses, *annotation])
-    heads = ["row", "runs", *map(head, comparison.choice.columns), "poses"] + ["annotation"] * comparison.judged
-    return TextTable(heads, body, groups=frozenset({len(rows)}))
+    """Return each row's mean and deviation, and the published rows below."""
+    keys = comparison.choice.columns
+    means = {key: [row.mean(key) for row in comparison.rows] for key in keys}
+    digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
+    lines = [["row", "runs", *map(head, keys), "poses", "annotation"]]
+    for k, row in enumerate(comparison.rows):
+        cells = [_mean_cell(means[key][k], digits[key], len(row.records)) for key in keys]
+        annotation = row.annotation or NOTHING
+        lines.append([comparison.called(row), str(len(row.records)), *cells, row.pose_source, annotation])
+    for one in comparison.published_rows:
+        cells = [published_cell(one, (key,), digits[key]) for key in keys]
+        lines.append([published_name(one), NOTHING, *cells, one.poses, one.annotation])
+    if not comparison.judged:
+        lines = [line[:-1] for line in lines]
+    return TextTable(lines[0], lines[1:], groups=frozenset({len(comparison.rows)}))
 
 
 def difference_grid(comparison: ComparisonTable) -> TextTable:
-    """Each row's mean difference to the base with its standard error."""
-    compared = comparison.compared
-    columns = [
-        _Column([mean_difference(row.differences(base, key)) for row, base in compared])
-        for key in comparison.choice.columns
-    ]
+    """Return each row's mean difference to the base with its standard error."""
+    keys, compared = comparison.choice.columns, comparison.compared
+    means = {key: [mean_difference(row.differences(base, key)) for row, base in compared] for key in keys}
+    digits = {key: decimals(mean.value for mean in of_key) for key, of_key in means.items()}
     body = []
     for k, (row, base) in enumerate(compared):
         pairs = set(row.records) & set(base.records)
         expected = len({run[-1] for run in pairs})
-        cells = [column.cell(k, column.means[k].error, expected, signed=True) for column in columns]
+        cells = [_of(_difference(means[key][k], digits[key]), means[key][k].count, expected) for key in keys]
         body.append([comparison.called(row), str(len(pairs)), *cells])
-    return TextTable([f"less {comparison.base_called}", "pairs", *map(head, comparison.choice.columns)], body)
+    return TextTable([f"less {comparison.base_called}", "pairs", *map(head, keys)], body)
+
+
+_Cell = tuple[str, float]  # the text, and the figure that competes for the highest; NaN = does not compete
 
 
 @dataclass(frozen=True)
-class _Column:
-    """One figure down the rows, with as many decimals as its largest needs."""
+class _Line:
+    labels: list[str]
+    cells: list[_Cell]
+    variant: tuple[str, ...] = ()  # lines with the same variant compete
 
-    means: list[Mean]
+
+class _SequenceFigures:
+    """One figure of all rows as cells, by sequence and averaged over sequences."""
+
+    def __init__(self, comparison: ComparisonTable, key: str) -> None:
+        self._rows = comparison.rows
+        self._seeds = len({run[:-1] for row in self._rows for run in row.records})  # runs expected in a sequence
+        self.means = {row.name: mean_by_sequence(row.values(key)) for row in self._rows}
+        self._overall = {row.name: mean_over_sequences(row.values(key)) for row in self._rows}
 
     @property
-    def decimals(self) -> int:
-        return decimals(mean.value for mean in self.means)
+    def sequences(self) -> set[str]:
+        """The sequences in which a row has the figure."""
+        return {sequence for of_row in self.means.values() for sequence in of_row}
 
-    def cell(self, k: int, spread: float, expected: int, signed: bool = False) -> str:
-        """Mean ± spread; with their number where it is not that of the row's runs."""
-        mean = self.means[k]
-        if not mean.count:
-            return NOTHING
-        text = figure(mean.value, spread, self.decimals, signed)
-        if signed and mean.is_not_zero:
-            text += " *"
-        return text if mean.count == expected else f"{text} ({mean.count} of {expected})"
+    def cell(self, row: RunRow, sequence: str, digits: int) -> _Cell:
+        """Return mean ± deviation over seeds; with their number if a run is missing or does not have the figure."""
+        if not any(run[-1] == sequence for run in row.records):
+            return MISSING, math.nan
+        mean = self.means[row.name].get(sequence, Mean.of(()))
+        found = [self.means[other.name] for other in self._rows if other.variant == row.variant]
+        most = max((of_row[sequence].count for of_row in found if sequence in of_row), default=0)
+        return _mean_cell(mean, digits, self._seeds), mean.value if mean.count == most else math.nan
+
+    def mean_cell(self, row: RunRow, expected: int, digits: int) -> _Cell:
+        """Return mean ± deviation over seeds; with the number of sequences or of runs if some are missing."""
+        mean = self._overall[row.name]
+        others = [self._overall[other.name] for other in self._rows if other.variant == row.variant]
+        competes = (mean.count, mean.runs) == max((other.count, other.runs) for other in others)
+        text = _of(figure(mean.value, mean.deviation, digits), mean.count, expected)
+        if 0 < mean.count == expected and mean.runs < expected * self._seeds:
+            text += f" ({mean.runs} of {expected * self._seeds} runs)"
+        return text, mean.value if competes else math.nan
+
+
+def across_grid(comparison: ComparisonTable) -> TextTable:
+    """Return a column per sequence with each row's mean over seeds, and the mean over sequences."""
+    [key] = comparison.choice.columns
+    figures, sequences = _SequenceFigures(comparison, key), comparison.sequences
+    digits = _decimals([figures])
+    sections = []
+    for rows in _by_variant(comparison.rows):
+        section = []
+        for row in rows:
+            cells = [figures.cell(row, sequence, digits) for sequence in sequences]
+            cells.append(figures.mean_cell(row, len(sequences), digits))
+            section.append(_row_line(comparison, row, cells))
+        sections.append(section)
+    keys = [(sequence,) for sequence in (*sequences, "mean")]
+    sections.append([_published_line(comparison, one, keys, digits) for one in comparison.published_rows])
+    return _grid([*_labels(comparison, "system"), *sequences, "mean"], sections, digits)
+
+
+def by_grid(comparison: ComparisonTable) -> TextTable:
+    """Return a group of lines per sequence, each line a row with all its figures; the last group holds the means."""
+    keys = comparison.choice.columns
+    rows = [row for rows in _by_variant(comparison.rows) for row in rows]
+    figures = [_SequenceFigures(comparison, key) for key in keys]
+    digits = _decimals(figures)
+    begun = {run[-1] for row in rows for run in row.records}
+
+    sections: dict[str, list[_Line]] = {}
+    for sequence in comparison.sequences:
+        known = [one for one in comparison.published_rows if one.knows((sequence, key) for key in keys)]
+        sections[sequence] = [
+            _row_line(comparison, row, [of_key.cell(row, sequence, digits) for of_key in figures])
+            for row in rows
+            if sequence in begun
+        ] + [_published_line(comparison, one, [(sequence, key) for key in keys], digits) for one in known]
+    sections["mean"] = [
+        _row_line(comparison, row, [of_key.mean_cell(row, len(of_key.sequences), digits) for of_key in figures])
+        for row in rows
+    ]
+    titled = [
+        [replace(line, labels=[title if k == 0 else "", *line.labels]) for k, line in enumerate(section)]
+        for title, section in sections.items()
+    ]
+    return _grid([comparison.noun, *_labels(comparison, "system"), *map(head, keys)], titled, digits)
+
+
+def difference_across_grid(comparison: ComparisonTable) -> TextTable:
+    """Return the base less each other row, by sequence, and the mean with its standard error."""
+    [key] = comparison.choice.columns
+    differences = {row.name: base.differences(row, key) for row, base in comparison.compared}
+    paired = {run[-1] for runs in differences.values() for run in runs}
+    sequences = [sequence for sequence in comparison.sequences if sequence in paired]
+    digits = decimals(value for runs in differences.values() for value in runs.values())
+    sections = []
+    for rows in _by_variant([row for row, _ in comparison.compared]):
+        section = []
+        for row in rows:
+            means, mean = mean_by_sequence(differences[row.name]), mean_difference(differences[row.name])
+            texts = [figure(means[s].value, math.nan, digits, True) if s in means else MISSING for s in sequences]
+            texts += [_difference(mean, digits) if mean.count else MISSING, str(len(differences[row.name]))]
+            section.append(_row_line(comparison, row, [(text, math.nan) for text in texts]))
+        sections.append(section)
+    heads = [*_labels(comparison, f"{comparison.base_called} less"), *sequences, "mean", "pairs"]
+    return _grid(heads, sections, digits)
+
+
+def _grid(heads: list[str], sections: Sequence[Sequence[_Line]], digits: int) -> TextTable:
+    lines: list[_Line] = []
+    bold: set[tuple[int, int]] = set()
+    groups: set[int] = set()
+    for section in sections:
+        if lines:
+            groups.add(len(lines))
+        bold |= {(len(lines) + k, len(section[k].labels) + column) for k, column in _highest(section, digits)}
+        lines += section
+    body = [[*line.labels, *(text for text, _ in line.cells)] for line in lines]
+    return TextTable(heads, body, len(lines[0].labels), frozenset(bold), frozenset(groups))
+
+
+def _highest(section: Sequence[_Line], digits: int) -> Iterator[tuple[int, int]]:
+    """Yield (line, column) of the figures that are highest as printed, where several lines compete."""
+    for k, line in enumerate(section):
+        competing = [other.cells for other in section if other.variant == line.variant]
+        for column, (_, value) in enumerate(line.cells):
+            values = [round(cells[column][1], digits) for cells in competing if not math.isnan(cells[column][1])]
+            if len(values) > 1 and round(value, digits) == max(values):
+                yield k, column
+
+
+def _decimals(figures: Iterable[_SequenceFigures]) -> int:
+    return decimals(mean.value for f in figures for of_row in f.means.values() for mean in of_row.values())
+
+
+def _by_variant(rows: Sequence[RunRow]) -> list[list[RunRow]]:
+    """Group the rows that can be compared, in the order of each group's first."""
+    groups: dict[tuple[str, ...], list[RunRow]] = {}
+    for row in rows:
+        groups.setdefault(row.variant, []).append(row)
+    return list(groups.values())
+
+
+def _labels(comparison: ComparisonTable, name: str, poses: str = "poses", annotation: str = "annotation") -> list[str]:
+    """Return the first cells of a line, or of the heads: a name, and what must not be averaged over."""
+    return [name, poses, annotation] if comparison.judged else [name, poses]
+
+
+def _row_line(comparison: ComparisonTable, row: RunRow, cells: list[_Cell]) -> _Line:
+    name = comparison.called(row, without="tracker")
+    return _Line(_labels(comparison, name, row.poses, row.annotation or NOTHING), cells, row.variant)
+
+
+def _published_line(comparison: ComparisonTable, one: PublishedRow, keys: Iterable[Key], digits: int) -> _Line:
+    labels = _labels(comparison, published_name(one), one.poses, one.annotation)
+    return _Line(labels, [(published_cell(one, key, digits), math.nan) for key in keys])
 
 
 def published_name(published: PublishedRow) -> str:
@@ -113,8 +248,25 @@ def published_name(published: PublishedRow) -> str:
 
 
 def published_cell(published: PublishedRow, key: Key, digits: int) -> str:
-    """The number in a cell; told apart: what nobody has looked up, and what the source does not have."""
+    """Return a published number; a number that was not looked up differs from one that the source lacks."""
     value = (published.values or {}).get(key, math.nan)
     if value is None:
         return NOT_KNOWN
     return NOTHING if math.isnan(value) else figure(value, math.nan, min(digits, published.decimals))
+
+
+def _mean_cell(mean: Mean, digits: int, expected: int) -> str:
+    return _of(figure(mean.value, mean.deviation, digits), mean.count, expected)
+
+
+def _difference(mean: Mean, digits: int) -> str:
+    """Return signed mean ± standard error; * = significantly different from 0."""
+    text = figure(mean.value, mean.error, digits, signed=True)
+    return f"{text} *" if mean.is_not_zero else text
+
+
+def _of(text: str, count: int, expected: int) -> str:
+    """Return the text, with the count if it is not the expected one."""
+    if not count:
+        return NOTHING
+    return text if count == expected else f"{text} ({count} of {expected})"

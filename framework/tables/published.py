@@ -1,4 +1,4 @@
-"""What others have published, as `published.yaml` beside this file has it: numbers with their source."""
+"""Published numbers with their sources, from published.yaml."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ import yaml
 from framework.errors import ConfigError
 
 FILE = Path(__file__).with_suffix(".yaml")
-DATASET = "scenenn"  # what the numbers were measured on
-MADE_UP = "synthetic"  # begins the release of rooms that `python -m framework synthesize` writes in its format
-NOT_KNOWN = "not known"  # what tables print for what nobody has looked up
+DATASET = "scenenn"  # the dataset of the numbers
+MADE_UP = "synthetic"  # first word of the release of scenes that `instancemap synthesize` writes in its format
+NOT_KNOWN = "not known"  # printed for numbers that were not looked up
 
-Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"): what a number stands for in its table
+Key = tuple[str, ...]  # ("fps",), ("011",) or ("011", "instances.ap50.bed"): by the layout of the table
 
 
 @dataclass(frozen=True)
 class PublishedRow:
-    """A system's numbers, as somebody has printed them."""
+    """The published numbers of one system."""
 
     system: str
     source: str
-    remark: str  # how the numbers were come by, and what they are not
+    remark: str  # conditions of the measurement
     poses: str
     annotation: str  # the release
     decimals: int  # of the values, in our unit
-    values: Mapping[Key, float | None] | None  # in our unit; None = nobody has looked it up, or none of all
+    values: Mapping[Key, float | None] | None  # in our unit; None = not looked up
 
     def knows(self, keys: Iterable[Key]) -> bool:
-        """Whether the number of one of `keys`, or more, is known."""
+        """Return True if a number of one of `keys` is known."""
         return any((self.values or {}).get(key) is not None for key in keys)
 
     def leaves_open(self, keys: Iterable[Key]) -> bool:
-        """Whether the source may have a number of one of `keys`, and nobody has looked it up."""
+        """Return True if the source may have a number of one of `keys` that was not looked up."""
         return self.values is None or any(key in self.values and self.values[key] is None for key in keys)
 
 
@@ -45,7 +45,7 @@ class PublishedRow:
 class Published:
     """A section of the file."""
 
-    layout: str  # of the tables that the numbers go below: rows, columns_by or group_by
+    layout: str  # of the tables that show the numbers: rows, columns_by or group_by
     sequences: tuple[str, ...]  # of the published table, in its order
     rows: tuple[PublishedRow, ...]
 
@@ -55,7 +55,7 @@ NOTHING_PUBLISHED = Published("rows", (), ())
 
 @cache
 def read_published(section: str) -> Published:
-    """The numbers of a section. Raises ConfigError when the file does not have it."""
+    """Return the numbers of a section; raise ConfigError if the file does not have it."""
     sections: dict[str, Any] = yaml.safe_load(FILE.read_text("utf-8"))
     if section not in sections:
         raise ConfigError(f"table.published must be null or one of {', '.join(sections)}, found {section}")

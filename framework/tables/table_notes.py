@@ -1,4 +1,4 @@
-"""What the reader of a table must know to trust its figures, sentence by sentence."""
+"""Notes below a table: how its figures were computed, and what is missing."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from framework.registry import STAGES
 from framework.runs.metrics import is_evaluation
 from framework.runs.run_rows import CHOICE, CONFIDENCE, Run, following
 from framework.runs.stored_runs import Record
-from framework.tables.comparison import ComparisonTable
+from framework.tables.comparison import ComparisonTable, mean_by_sequence
 from framework.tables.layouts import head
-from framework.tables.sequences import mean_by_sequence
 
 
 def notes(comparison: ComparisonTable) -> Iterator[str]:
-    """Each of them one line."""
+    """Yield the notes, one line each."""
     for note in _notes(comparison):
         yield " ".join(note.split())
 
@@ -41,7 +40,7 @@ def _notes(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _averaging(comparison: ComparisonTable) -> Iterator[str]:
-    """How figures come about, and how rows are compared."""
+    """Explain the means, and how rows are compared."""
     choice, over = comparison.choice, ", ".join(comparison.choice.average_over)
     if others := following(comparison.records, choice.average_over):
         yield f"Averaged over with {over}, whose value they have in every run: {', '.join(others)}."
@@ -71,7 +70,7 @@ def _averaging(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _with_needs(columns: Sequence[str]) -> str:
-    """The heads of figures, with what a recording must have for them to be known."""
+    """Return the heads of figures, with the ground truth that they require."""
     heads: dict[str, list[str]] = {}
     for key in columns:
         what = "true instances" if is_evaluation(key) else "true poses" if key.startswith("trajectory.") else ""
@@ -80,7 +79,7 @@ def _with_needs(columns: Sequence[str]) -> str:
 
 
 def _winners(comparison: ComparisonTable) -> Iterator[str]:
-    """In which sequences the base is better than each of the others, and in which it loses."""
+    """Yield the sequences in which the base is better and worse than each other row."""
     if not comparison.choice.columns_by:
         return
     [key] = comparison.choice.columns
@@ -95,7 +94,7 @@ def _winners(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _protocol(comparison: ComparisonTable) -> Iterator[str]:
-    """What the instances were compared with, and how."""
+    """Explain how the instances were compared with the truth."""
     kinds = {key.startswith("instances.to_map.") for key in comparison.choice.columns if is_evaluation(key)}
     if not kinds:
         return
@@ -116,7 +115,7 @@ def _published(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _missing(comparison: ComparisonTable) -> Iterator[str]:
-    """The figures, rows, sequences and runs of which there is no record, and the runs that did not end well."""
+    """Yield the figures, rows, sequences and runs without a result, and the incomplete runs."""
     known_keys = {key for record in comparison.records for key in record.metrics}
     if absent := [key for key in comparison.choice.columns if key not in known_keys]:
         yield f"No run has a figure of this name: {', '.join(absent)}."
@@ -136,7 +135,7 @@ def _missing(comparison: ComparisonTable) -> Iterator[str]:
 
 
 def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
-    """As overrides that run them: seed=0 dataset.scene=011,030; seed=1 dataset.scene=011."""
+    """Return the runs as overrides: seed=0 dataset.scene=011,030; seed=1 dataset.scene=011."""
     last: dict[Run, list[str]] = {}
     for run in runs:
         last.setdefault(run[:-1], []).append(run[-1])
@@ -145,21 +144,21 @@ def _as_overrides(keys: Sequence[str], runs: Sequence[Run]) -> str:
 
 
 def _same(records: Sequence[Record]) -> str:
-    """What all runs have chosen, stage by stage."""
+    """Return the options that all runs share, by stage."""
     chosen = {stage: {record.metrics.get(f"{CHOICE}{stage}") for record in records} for stage in STAGES}
     agreed = {stage: names for stage, names in chosen.items() if len(names) == 1 and None not in names}
     return ", ".join(f"{stage}={names.pop()}" for stage, names in agreed.items())
 
 
 def machine(record: Record) -> str:
-    """The cores, and how many threads they were given."""
+    """Return the cores and the number of threads."""
     cores = f"{record.metrics.get('environment.cpus')} cores of {record.metrics.get('environment.processor')}"
     threads = record.config.get("threads")
     return f"{cores}, threads={threads}" if threads else cores
 
 
 def counted(words: Iterable[str]) -> str:
-    """The words that there are, with their number where there are several."""
+    """Return the distinct words, with their counts if there are several."""
     counts = Counter(words).most_common()
     if len(counts) == 1:
         return counts[0][0]
@@ -167,6 +166,6 @@ def counted(words: Iterable[str]) -> str:
 
 
 def digest(records: Sequence[Record]) -> str:
-    """One short hash of the configs of several runs, whatever their order."""
+    """Return one short hash of the configs of several runs, in any order."""
     hashes = sorted(str(record.metrics["config_hash"]) for record in records)
     return hashlib.sha256("".join(hashes).encode()).hexdigest()[:12]

@@ -1,1 +1,1 @@
-"""Training of detectors on rendered rooms."""
+"""Training of detectors on synthetic scenes."""

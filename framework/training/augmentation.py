@@ -1,4 +1,4 @@
-"""Random changes to pictures that leave the objects what they are: what a detector must not be fooled by."""
+"""Random augmentation of pictures and masks."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from framework.data import UInt8
 from framework.training.room_pictures import Example
 
-ZOOM = (0.55, 1.0)  # share of the picture's sides that is cut out and enlarged
+ZOOM = (0.55, 1.0)  # side lengths of a crop, relative
 ZOOMED = 0.5  # share of the pictures
-LEAST_LEFT = 0.25  # share of an object that must be left after a cut for it to stay an object
-SMALLEST = 40  # px, of an object to be learned
+LEAST_LEFT = 0.25  # share of an object that must be inside the crop
+SMALLEST = 40  # px, area of an object
 GAIN, CHANNEL_GAIN, GAMMA = 0.35, 0.12, 0.35  # logarithms of the largest factors
 BLURRED, NOISY, GRAY = 0.3, 0.3, 0.05  # shares of the pictures
 
 
 def augmented(example: Example, rng: np.random.Generator) -> Example:
-    """The picture mirrored, cut out and enlarged, in other light, blurred, noisy: each with some probability."""
+    """Return the picture randomly mirrored, zoomed, relit, blurred and noisy; hidden objects are dropped."""
     color, masks = example.color, example.masks
     if rng.uniform() < 0.5:
         color, masks = color[:, ::-1], masks[:, :, ::-1]
@@ -28,11 +28,11 @@ def augmented(example: Example, rng: np.random.Generator) -> Example:
     left = masks.sum(axis=(1, 2))
     kept = (left >= SMALLEST) & (left >= LEAST_LEFT * areas)
     names = tuple(name for name, keep in zip(example.class_names, kept.tolist(), strict=True) if keep)
-    return Example(_in_other_light(np.ascontiguousarray(color), rng), np.ascontiguousarray(masks[kept]), names)
+    return Example(_relit(color, rng), np.ascontiguousarray(masks[kept]), names)
 
 
 def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[UInt8, np.ndarray, float]:
-    """A part of the picture at the whole one's size, and by how much areas grow."""
+    """Return a crop at the picture's size, and the factor by which areas grow."""
     height, width = color.shape[:2]
     share = rng.uniform(*ZOOM)
     h, w = round(share * height), round(share * width)
@@ -43,7 +43,7 @@ def _zoomed(color: UInt8, masks: np.ndarray, rng: np.random.Generator) -> tuple[
     return np.asarray(cut, np.uint8), masks[:, rows[:, None], columns], (height * width) / (h * w)
 
 
-def _in_other_light(color: UInt8, rng: np.random.Generator) -> UInt8:
+def _relit(color: UInt8, rng: np.random.Generator) -> UInt8:
     levels = np.arange(256, dtype=np.float32) / 255
     gains = np.exp(rng.uniform(-GAIN, GAIN) + rng.uniform(-CHANNEL_GAIN, CHANNEL_GAIN, 3))
     gamma = np.exp(rng.uniform(-GAMMA, GAMMA))

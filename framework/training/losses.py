@@ -1,4 +1,7 @@
-"""The loss of a Mask R-CNN: objectness and boxes of anchors; classes, boxes and masks of proposals."""
+"""The loss of Mask R-CNN (He et al. 2017) on Faster R-CNN's anchors (Ren et al. 2015).
+
+Boxes are x1 y1 x2 y2 px, of extent 0. `own` (N,) is the index of the object of each box, or BACKGROUND or IGNORED.
+"""
 
 from __future__ import annotations
 
@@ -11,17 +14,18 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN
-from framework.training.targets import BACKGROUND, box_iou, encode, mask_targets, match, sample
+from framework.detection.mask_rcnn.roi_align import roi_align
 
 BETA = 1.0 / 9.0  # where the smooth L1 loss becomes linear
-ANCHORS = 256  # an image, that a step learns from
-ANCHORS_POSITIVE = 0.5
-PROPOSALS_POSITIVE = 0.25
+ANCHORS = 256  # sampled per image
+ANCHORS_POSITIVE = 0.5  # largest share
+PROPOSALS_POSITIVE = 0.25  # largest share
+BACKGROUND, IGNORED = -1, -2
 
 
 @dataclass(frozen=True)
 class Objects:
-    """The N objects of one picture, as the network should find them."""
+    """The N objects of one picture."""
 
     boxes: Tensor  # (N, 4) px, extent 0
     labels: Tensor  # (N,) from 1
@@ -33,40 +37,33 @@ class Objects:
 
 @dataclass(frozen=True)
 class Budget:
-    """How much of each image a step looks at."""
+    """Limits for each image in a step."""
 
-    before_nms: int = 500  # anchors a level that become proposals
+    before_nms: int = 500  # anchors per level that become proposals
     after_nms: int = 300  # proposals
-    proposals: int = 96  # of these, that are learned from
+    proposals: int = 96  # sampled from these
 
 
 def losses(
     network: MaskRCNN, images: Tensor, objects: Sequence[Objects], budget: Budget, generator: torch.Generator
 ) -> dict[str, Tensor]:
-    """The five terms, each a mean over the images (N, 3, H, W) RGB 0..255; their sum is what training minimizes."""
+    """Return the five terms, each a mean over the images (N, 3, H, W) RGB 0..255; training minimizes their sum."""
     shape = (images.shape[2], images.shape[3])
     pyramid = network.extract(network.normalize(images))
-    objectness, deltas = (found.float() for found in network.score_anchors(pyramid))
+    objectness, deltas = (output.float() for output in network.score_anchors(pyramid))
     of_levels = network.anchors(pyramid)
     anchors = torch.from_numpy(np.concatenate(of_levels)).to(images.device)
-    terms: dict[str, list[Tensor]] = {name: [] for name in ("objectness", "anchors", "classes", "boxes", "masks")}
+    of_images: list[dict[str, Tensor]] = []
     for i, true in enumerate(objects):
         of_image = [level[i : i + 1] for level in pyramid]
-        for name, value in _anchor_losses(anchors, objectness[i], deltas[i], true, generator).items():
-            terms[name].append(value)
+        terms = _anchor_losses(anchors, objectness[i], deltas[i], true, generator)
+        scores, moves = (output[i].detach().cpu().numpy() for output in (objectness, deltas))
         with torch.no_grad():
-            proposals = network.propose(
-                of_levels,
-                objectness[i].detach().cpu().numpy(),
-                deltas[i].detach().cpu().numpy(),
-                shape,
-                budget.before_nms,
-                budget.after_nms,
-            )
+            proposals = network.propose(of_levels, scores, moves, shape, budget.before_nms, budget.after_nms)
         boxes = torch.cat([torch.from_numpy(proposals).to(images.device), true.boxes])
-        for name, value in _proposal_losses(network, of_image, boxes, true, budget.proposals, generator).items():
-            terms[name].append(value)
-    return {name: torch.stack(values).mean() for name, values in terms.items()}
+        of_images.append(terms | _proposal_losses(network, of_image, boxes, true, budget.proposals, generator))
+    names = ("objectness", "anchors", "classes", "boxes", "masks")
+    return {name: torch.stack([terms[name] for terms in of_images]).mean() for name in names}
 
 
 def _anchor_losses(
@@ -76,36 +73,93 @@ def _anchor_losses(
     positive, negative = sample(own, ANCHORS, ANCHORS_POSITIVE, generator)
     chosen = torch.cat([positive, negative])
     wanted = (own[chosen] >= 0).to(objectness.dtype)
-    aims = encode(anchors[positive], true.boxes[own[positive]])
-    missed = functional.smooth_l1_loss(deltas[positive], aims, beta=BETA, reduction="sum")
+    targets = encode(anchors[positive], true.boxes[own[positive]])
+    distance = functional.smooth_l1_loss(deltas[positive], targets, beta=BETA, reduction="sum")
     return {
         "objectness": functional.binary_cross_entropy_with_logits(objectness[chosen], wanted),
-        "anchors": missed / max(len(chosen), 1),
+        "anchors": distance / max(len(chosen), 1),
     }
 
 
 def _proposal_losses(
-    network: MaskRCNN, pyramid: Sequence[Tensor], boxes: Tensor, true: Objects, number: int, generator: torch.Generator
+    network: MaskRCNN, pyramid: Sequence[Tensor], boxes: Tensor, true: Objects, count: int, generator: torch.Generator
 ) -> dict[str, Tensor]:
     own = match(box_iou(boxes, true.boxes), 0.5, 0.5, each_object=False)
-    positive, negative = sample(own, number, PROPOSALS_POSITIVE, generator)
+    positive, negative = sample(own, count, PROPOSALS_POSITIVE, generator)
     chosen = torch.cat([positive, negative])
     boxes, own = boxes[chosen], own[chosen]
     is_object = own != BACKGROUND
     labels = torch.zeros(len(chosen), dtype=torch.int64, device=boxes.device)
     labels[is_object] = true.labels[own[is_object]]
-    logits, deltas = (found.float() for found in network.classify(pyramid, boxes))
+    logits, deltas = (output.float() for output in network.classify(pyramid, boxes))
     n = len(positive)  # the first ones
-    weights = torch.tensor(DELTA_WEIGHTS, device=boxes.device)
-    aims = encode(boxes[:n], true.boxes[own[:n]]) * weights
-    moved = deltas[torch.arange(n, device=boxes.device), labels[:n]]
-    missed = functional.smooth_l1_loss(moved, aims, beta=BETA, reduction="sum")
-    terms = {"classes": functional.cross_entropy(logits, labels), "boxes": missed / max(len(chosen), 1)}
+    index = torch.arange(n, device=boxes.device)
+    targets = encode(boxes[:n], true.boxes[own[:n]]) * torch.tensor(DELTA_WEIGHTS, device=boxes.device)
+    distance = functional.smooth_l1_loss(deltas[index, labels[:n]], targets, beta=BETA, reduction="sum")
+    terms = {"classes": functional.cross_entropy(logits, labels), "boxes": distance / max(len(chosen), 1)}
     if n:
-        of_labels = network.segment(pyramid, boxes[:n]).float()
-        own_logits = of_labels[torch.arange(n, device=boxes.device), labels[:n]]
-        covered = mask_targets(true.masks, boxes[:n], own[:n], own_logits.shape[-1])
-        terms["masks"] = functional.binary_cross_entropy_with_logits(own_logits, covered)
+        mask_logits = network.segment(pyramid, boxes[:n]).float()[index, labels[:n]]
+        covered = mask_targets(true.masks, boxes[:n], own[:n], mask_logits.shape[-1])
+        terms["masks"] = functional.binary_cross_entropy_with_logits(mask_logits, covered)
     else:
-        terms["masks"] = logits.sum() * 0.0  # no object: nothing to learn, but a gradient for every image
+        terms["masks"] = logits.sum() * 0.0  # every image needs a gradient
     return terms
+
+
+def box_iou(a: Tensor, b: Tensor) -> Tensor:
+    """Return the (N, M) intersections over unions of boxes (N, 4) and (M, 4)."""
+    low = torch.maximum(a[:, None, :2], b[None, :, :2])
+    high = torch.minimum(a[:, None, 2:], b[None, :, 2:])
+    shared = (high - low).clamp(min=0).prod(dim=2)
+    area_a, area_b = (a[:, 2:] - a[:, :2]).prod(dim=1), (b[:, 2:] - b[:, :2]).prod(dim=1)
+    return shared / (area_a[:, None] + area_b[None, :] - shared).clamp(min=1e-9)
+
+
+def match(iou: Tensor, foreground: float, background: float, each_object: bool) -> Tensor:
+    """Return `own` (N,) from iou (N, M): the best object from `foreground` on, BACKGROUND below `background`.
+
+    With `each_object`, every object also gets the boxes with its highest IoU above 0.
+    """
+    if iou.shape[1] == 0:
+        return torch.full((len(iou),), BACKGROUND, device=iou.device)
+    best, matched = iou.max(dim=1)
+    own = matched.clone()
+    own[best < foreground] = IGNORED
+    own[best < background] = BACKGROUND
+    if each_object:
+        highest = iou.max(dim=0).values
+        fits = ((iou == highest[None, :]) & (highest[None, :] > 0)).any(dim=1)
+        own[fits] = matched[fits]
+    return own
+
+
+def sample(own: Tensor, count: int, positive_share: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Draw at most `count` boxes; return the indices of those with an object, at most a share, and of background."""
+    positive = _draw(torch.nonzero(own >= 0)[:, 0], int(count * positive_share), generator)
+    negative = _draw(torch.nonzero(own == BACKGROUND)[:, 0], count - len(positive), generator)
+    return positive, negative
+
+
+def _draw(indices: Tensor, count: int, generator: torch.Generator) -> Tensor:
+    chosen = torch.randperm(len(indices), generator=generator)[:count]
+    return indices[chosen.to(indices.device)]
+
+
+def encode(boxes: Tensor, objects: Tensor) -> Tensor:
+    """Return the deltas dx dy dw dh (N, 4) from `boxes` to `objects` (N, 4): the inverse of boxes.decode."""
+    sizes, wanted = boxes[:, 2:] - boxes[:, :2], objects[:, 2:] - objects[:, :2]
+    centers, targets = boxes[:, :2] + sizes / 2, objects[:, :2] + wanted / 2
+    return torch.cat([(targets - centers) / sizes, torch.log(wanted / sizes)], dim=1)
+
+
+def mask_targets(masks: Tensor, boxes: Tensor, own: Tensor, bins: int) -> Tensor:
+    """Return (N, bins, bins), 1 where the mask of its object covers at least half of a bin of boxes (N, 4), else 0.
+
+    masks (M, H, W) bool, with pixel centers half a pixel inside the borders, as in boxes of extent 0.
+    """
+    targets = torch.empty((len(boxes), bins, bins), device=boxes.device)
+    for k in torch.unique(own).tolist():
+        of_object = own == k
+        mask = masks[k].to(boxes.dtype)[None, None]
+        targets[of_object] = roi_align(mask, boxes[of_object], bins, 1.0, 2, half_pixel=True)[:, 0]
+    return (targets >= 0.5).to(boxes.dtype)

@@ -1,10 +1,9 @@
-"""Pictures of many furnished rooms, with the mask of every object: what a detector is trained on.
+"""Pictures of many synthetic rooms with instance ids, for training.
 
-Each room is a random stream of its own and is looked at from random places, at random heights and angles, towards its
-objects. Domain randomization (Tobin et al. 2017): for each picture the colours of all surfaces are drawn anew around
-those that the room has, so that a network has to learn shapes.
+Each room has its own random stream and is seen from random poses towards its objects. Domain randomization (Tobin et
+al. 2017) changes the colors of all surfaces in most pictures, so that a network learns shapes.
 
-On disk a room is a folder, written whole or not at all: 000000.jpg, 000000.png (16-bit instance ids) and classes.json.
+A room is a folder, written atomically: 000000.jpg, 000000.png (16-bit instance ids), ... and classes.json.
 """
 
 from __future__ import annotations
@@ -34,17 +33,17 @@ from framework.synthetic.renderer import Renderer
 from framework.synthetic.room import Room, RoomKind, furnish
 from framework.synthetic.walk import look
 
-STREAM = 0x7261_696E  # apart from the streams of all datasets, whatever their seed
+STREAM = 0x7261_696E  # differs from the random streams of all datasets
 WIDTH, HEIGHT = 320, 240  # px
 FOCAL = (0.7, 1.0)  # image widths
 EYE_HEIGHT = (0.9, 1.75)  # m
-CLEAR = 0.35  # m, of the camera from furniture and walls
-TINT = 0.5  # how far a surface's colours may be multiplied or divided, as a logarithm
-TINTED = 0.7  # share of the pictures whose colours are drawn anew
-STUDIOS = 0.5  # share of the rooms that hold all classes: some are found nowhere else
+CLEAR = 0.35  # m, between camera and furniture or walls
+TINT = 0.5  # logarithm of the largest factor of a surface's colors
+TINTED = 0.7  # share of the pictures with changed colors
+STUDIOS = 0.5  # share of the rooms with all classes: some classes are in no other kind of room
 QUALITY = 93  # of the JPEG files
-LEAST = 100  # px of objects that make a picture worth keeping
-TRIES = 20  # views from which one worth keeping is sought
+LEAST = 100  # px of objects in a picture
+TRIES = 20  # views tried for each picture
 
 
 @dataclass(frozen=True)
@@ -57,12 +56,12 @@ class Example:
 
 
 def render_rooms(folder: Path, first: int, rooms: int, views: int, processes: int) -> None:
-    """Renders the rooms number `first` and following into `folder`; those that are there already are kept."""
+    """Render the rooms from number `first` on into `folder`; existing ones are kept."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [number for number in range(first, first + rooms) if not room_folder(folder, number).is_dir()]
     if not missing:
         return
-    # not forked: threads of numba and OpenCV do not survive that
+    # Not forked: threads of numba and OpenCV do not survive a fork.
     workers = ProcessPoolExecutor(processes, multiprocessing.get_context("spawn"), numba.set_num_threads, (1,))
     with workers, tqdm(total=len(missing), desc="rendering rooms", unit="room", disable=None) as bar:
         for _ in workers.map(partial(render_room, folder, views), missing):
@@ -74,13 +73,12 @@ def room_folder(folder: Path, number: int) -> Path:
 
 
 def render_room(folder: Path, views: int, number: int) -> None:
-    """Writes `views` pictures of room `number`."""
+    """Write `views` pictures of room `number`."""
     with tempfile.TemporaryDirectory(dir=folder, prefix=".room_") as unfinished:
         target = Path(unfinished) / "room"
         target.mkdir()
         for k, (color, ids, names) in enumerate(pictures(number, views)):
-            if k == 0:
-                (target / "classes.json").write_text(json.dumps({str(i): name for i, name in names.items()}))
+            (target / "classes.json").write_text(json.dumps(names))
             bgr = cv2.cvtColor(color, cv2.COLOR_RGB2BGR)
             cv2.imwrite(str(target / f"{k:06d}.jpg"), bgr, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
             cv2.imwrite(str(target / f"{k:06d}.png"), ids)
@@ -88,7 +86,7 @@ def render_room(folder: Path, views: int, number: int) -> None:
 
 
 def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[int, str]]]:
-    """(color (H, W, 3), instance ids (H, W) uint16, their COCO classes) of random views of room `number`."""
+    """Yield (color (H, W, 3), instance ids (H, W) uint16, their COCO classes) of random views of room `number`."""
     rng = np.random.default_rng([STREAM, number])
     kinds = list(RoomKind)
     room = furnish(RoomKind.STUDIO if rng.uniform() < STUDIOS else kinds[int(rng.integers(len(kinds)))], rng)
@@ -102,8 +100,8 @@ def pictures(number: int, views: int) -> Iterator[tuple[UInt8, np.ndarray, dict[
 def _random_views(
     room: Room, renderer: Renderer, names: Mapping[int, str], views: int, rng: np.random.Generator
 ) -> Iterator[tuple[Camera, Float64]]:
-    """(camera, T_world_camera (4, 4)) of so many views in which objects with a class are to be seen."""
-    centers = {name: _centers(room, [i for i in names if names[i] == name]) for name in sorted(set(names.values()))}
+    """Yield (camera, T_world_camera (4, 4)) of views of objects with a class."""
+    centers = [_centers(room, [i for i in names if names[i] == name]) for name in sorted(set(names.values()))]
     for _ in range(views):
         for _ in range(TRIES):
             focal = rng.uniform(*FOCAL) * WIDTH
@@ -116,20 +114,20 @@ def _random_views(
 
 
 def _centers(room: Room, ids: Sequence[int]) -> Float64:
-    """(N, 3) m: the middle of each object's box."""
+    """Return the center (N, 3) m of each object's box."""
     surfaces = room.surfaces
     corners = [surfaces.vertices[surfaces.triangles[surfaces.instance_ids == i]].reshape(-1, 3) for i in ids]
     return np.array([(c.min(axis=0) + c.max(axis=0)) / 2 for c in corners], np.float64)
 
 
-def _view(room: Room, centers: Mapping[str, Float64], rng: np.random.Generator) -> Float64:
-    """T_world_camera (4, 4) from a free place, more or less towards an object of some class, all classes alike."""
+def _view(room: Room, centers: Sequence[Float64], rng: np.random.Generator) -> Float64:
+    """Return a random T_world_camera (4, 4) on free floor, roughly towards an object, all classes equally often."""
     layout = room.layout
     rows, columns = np.nonzero(layout.free >= CLEAR)
     at = int(rng.integers(len(rows)))
     x, y = (columns[at] + 0.5) * CELL - layout.width / 2, (rows[at] + 0.5) * CELL - layout.depth / 2
     eye = np.array([x, y, rng.uniform(*EYE_HEIGHT)])
-    of_class = list(centers.values())[int(rng.integers(len(centers)))]
+    of_class = centers[int(rng.integers(len(centers)))]
     aim = of_class[int(rng.integers(len(of_class)))] - eye
     yaw = np.arctan2(aim[1], aim[0]) + rng.normal(0, 0.3)
     pitch = np.clip(np.arctan2(aim[2], np.hypot(aim[0], aim[1])) + rng.normal(0, 0.15), -0.9, 0.3)
@@ -137,7 +135,7 @@ def _view(room: Room, centers: Mapping[str, Float64], rng: np.random.Generator) 
 
 
 def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """The material table with the colours of each material multiplied by random factors."""
+    """Return the material table with the colors of each material multiplied by random factors."""
     if rng.uniform() > TINTED:
         return table
     gains = np.exp(rng.uniform(-TINT, TINT, (len(table), 1)) + rng.uniform(-TINT, TINT, (len(table), 3)))
@@ -148,7 +146,7 @@ def _tinted(table: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 class RoomPictures:
-    """The pictures of rendered rooms, read when they are asked for."""
+    """The pictures of rendered rooms, read on demand."""
 
     def __init__(self, folder: Path, first: int, rooms: int) -> None:
         self.files: list[Path] = []

@@ -1,7 +1,7 @@
-"""One training from its config: render rooms, train, evaluate on rooms that were never learned from.
+"""A training from its config: render rooms, train, evaluate on held-out rooms.
 
-Leaves in its folder: network.safetensors, for `detector=mask_rcnn detector.weights=...`; checkpoint.pt, from which a
-second call goes on; losses.csv and losses.png; average_precision.json.
+Writes network.safetensors (for `detector=mask_rcnn detector.weights=...`), checkpoint.pt (to resume from), losses.csv,
+losses.png and average_precision.json.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from framework.vocabulary.label_spaces import COCO, SCENENN_TO_COCO
 log = logging.getLogger(__name__)
 
 DETECTOR = "plugins.detectors.mask_rcnn.MaskRCNNDetector"
-HELD_OUT = 1_000_000  # the number of the first room that is never learned from
+HELD_OUT = 1_000_000  # number of the first held-out room
 NETWORK, PRECISION = "network.safetensors", "average_precision.json"
 
 
 def train(config: DictConfig, folder: Path) -> MaskAp:
-    """Renders the rooms that are missing, trains for the steps that are left, evaluates."""
+    """Render missing rooms, train the remaining steps and evaluate."""
     Settings.of(config).apply()
     torch.manual_seed(config.seed)
     network = _started(config.network)
@@ -70,14 +70,15 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
         "seed": int(config.seed),
         "bfloat16": schedule.bfloat16,
         "domain": RENDERED_ROOMS,
-        "limits": "trained on rendered rooms only, at 320x240; of photographs it knows nothing",
+        "limits": "trained on rendered rooms only, at 320x240; not for photographs",
     }
-    save_network(trainer.trained(), folder / NETWORK, card, half=True)
-    node = {"_target_": DETECTOR, "weights": str((folder / NETWORK).absolute()), "device": device}
+    weights = folder / NETWORK
+    save_network(trainer.trained(), weights, card, half=True)
+    node = {"_target_": DETECTOR, "weights": str(weights.absolute()), "device": device}
     detector = build(Detector, OmegaConf.create(node))
     precision = mask_ap(_detected(detector, RoomPictures(rooms, HELD_OUT, wanted.held_out)), detector.classes, SMALLEST)
     card |= _known({"held_out_rooms": wanted.held_out, "mask_ap50": precision.ap50, "mask_ap": precision.ap})
-    save_network(trainer.trained(), folder / NETWORK, card, half=True)
+    save_network(trainer.trained(), weights, card, half=True)
     with written_whole(folder / PRECISION) as path:
         path.write_text(json.dumps(_known(asdict(precision)), indent=1))
     log.info("mask AP50 %.3f, AP %.3f on %d other rooms", precision.ap50, precision.ap, wanted.held_out)
@@ -85,20 +86,18 @@ def train(config: DictConfig, folder: Path) -> MaskAp:
 
 
 def _started(config: DictConfig) -> MaskRCNN:
-    """The network before the first step. Raises ConfigError when `start_from` is another one."""
+    """Return the initial network; raise ConfigError if `start_from` has another architecture."""
     network = MaskRCNN(architecture(config))
     if config.start_from:
         start = load_network(Path(config.start_from))
         if start.architecture != network.architecture:
-            raise ConfigError(
-                f"network.start_from: {config.start_from} is not of the architecture that network asks for"
-            )
+            raise ConfigError(f"network.start_from: {config.start_from} is not of the architecture of network")
         network.load_state_dict(start.state_dict())
     return network
 
 
 def architecture(network: DictConfig) -> Architecture:
-    """The network that the config describes, for the classes that rooms hold."""
+    """Return the configured architecture, for the classes of synthetic rooms."""
     require(network.backbone in DEPTHS, "network.backbone", network.backbone, ", ".join(DEPTHS))
     return Architecture(
         classes=tuple(name for name in COCO if name in SCENENN_TO_COCO.values()),
@@ -114,13 +113,13 @@ def architecture(network: DictConfig) -> Architecture:
 
 
 def _known(values: Mapping[str, Any]) -> dict[str, Any]:
-    """None for NaN, which JSON does not have."""
+    """Replace NaN by None: JSON has no NaN."""
     inner = {name: _known(value) if isinstance(value, Mapping) else value for name, value in values.items()}
     return {name: None if isinstance(v, float) and not math.isfinite(v) else v for name, v in inner.items()}
 
 
 def _detected(detector: Detector, pictures: RoomPictures) -> Iterator[tuple[Bool, Sequence[str], Detections]]:
-    """True masks, their classes, and what the detector finds, picture by picture."""
+    """Yield the true masks, their classes and the detections of each picture."""
     for k in tqdm(range(len(pictures)), desc="evaluating", unit="picture", disable=None):
         example = pictures[k]
         height, width = example.color.shape[:2]

@@ -1,7 +1,6 @@
 """The training loop: batches, steps, checkpoints, the loss curve.
 
-What a step sees depends on the seed and the step's number only, so that a run that was stopped goes on as if it had not
-been.
+The random draws of a step depend only on the seed and the step, so that a resumed run equals an uninterrupted one.
 """
 
 from __future__ import annotations
@@ -32,30 +31,29 @@ LARGEST_GRADIENT = 10.0  # norm
 
 @dataclass(frozen=True)
 class Schedule:
-    """How long and how fast to learn."""
+    """Length and speed of a training."""
 
     steps: int = 8000  # >= 1
-    batch: int = 4  # pictures a step, >= 1
-    learning_rate: float = 1e-3  # > 0, at its height (AdamW)
+    batch: int = 4  # pictures per step, >= 1
+    learning_rate: float = 1e-3  # > 0, the largest (AdamW)
     weight_decay: float = 1e-2  # >= 0
-    warmup: int = 300  # steps, >= 0, in which the learning rate rises; then it falls as a cosine to a hundredth
-    averaging: float = 0.998  # in [0, 1): of the weights, over steps; what is saved is the average
+    warmup: int = 300  # steps, >= 0, of linear warmup; then the learning rate falls as a cosine to a hundredth
+    averaging: float = 0.998  # in [0, 1), decay of the moving average of the weights, which is saved
     checkpoint_every: int = 250  # steps, >= 1
-    bfloat16: bool = False  # products in 16 bits, sums and weights in 32: faster where the processor has them
+    bfloat16: bool = False  # products in 16 bits, sums and weights in 32
     seed: int = 0
     budget: Budget = field(default_factory=Budget)
 
     def __post_init__(self) -> None:
-        require(self.steps >= 1, "steps", self.steps, "at least 1")
-        require(self.batch >= 1, "batch", self.batch, "at least 1")
+        for name in ("steps", "batch", "checkpoint_every"):
+            require(getattr(self, name) >= 1, name, getattr(self, name), "at least 1")
+        for name in ("weight_decay", "warmup"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "0 or positive")
         require(self.learning_rate > 0, "learning_rate", self.learning_rate, "positive")
-        require(self.weight_decay >= 0, "weight_decay", self.weight_decay, "0 or positive")
-        require(self.warmup >= 0, "warmup", self.warmup, "0 or positive")
         require(0 <= self.averaging < 1, "averaging", self.averaging, "in [0, 1)")
-        require(self.checkpoint_every >= 1, "checkpoint_every", self.checkpoint_every, "at least 1")
 
     def rate(self, step: int) -> float:
-        """The learning rate of a step."""
+        """Return the learning rate of a step."""
         if step < self.warmup:
             return self.learning_rate * (step + 1) / self.warmup
         done = (step - self.warmup) / max(1, self.steps - self.warmup)
@@ -63,7 +61,7 @@ class Schedule:
 
 
 class Trainer:
-    """Trains a network on pictures, from the last checkpoint in `folder` where there is one."""
+    """Trains a network on pictures, from the last checkpoint in `folder` if there is one."""
 
     def __init__(
         self, network: MaskRCNN, pictures: RoomPictures, schedule: Schedule, folder: Path, device: str
@@ -74,10 +72,10 @@ class Trainer:
         self.schedule = schedule
         self.folder = folder
         self.step = 0
-        self.history: list[dict[str, float]] = []  # a step
+        self.history: list[dict[str, float]] = []  # the terms of the loss in each step
         self.averaged = {name: value.detach().clone() for name, value in network.state_dict().items()}
         decayed = [p for p in network.parameters() if p.ndim > 1]
-        rest = [p for p in network.parameters() if p.ndim <= 1]  # biases and norms are not drawn towards 0
+        rest = [p for p in network.parameters() if p.ndim <= 1]  # biases and norms
         self._optimizer = torch.optim.AdamW(
             [{"params": decayed, "weight_decay": schedule.weight_decay}, {"params": rest, "weight_decay": 0.0}],
             lr=schedule.learning_rate,
@@ -87,9 +85,8 @@ class Trainer:
             self._resume()
 
     def run(self) -> None:
-        """All steps that are left. Ctrl-C loses what came after the last checkpoint."""
-        bar = tqdm(total=self.schedule.steps, initial=self.step, desc="training", unit="step", disable=None)
-        with bar:
+        """Run the remaining steps; Ctrl-C loses the steps after the last checkpoint."""
+        with tqdm(total=self.schedule.steps, initial=self.step, desc="training", unit="step", disable=None) as bar:
             while self.step < self.schedule.steps:
                 terms = self._learn()
                 self.history.append(terms)
@@ -100,13 +97,13 @@ class Trainer:
                     self._save()
 
     def trained(self) -> MaskRCNN:
-        """The network with its averaged weights, on the CPU, for evaluation."""
+        """Return the network with averaged weights, on the CPU, for evaluation."""
         network = MaskRCNN(self.network.architecture)
         network.load_state_dict({name: value.cpu() for name, value in self.averaged.items()})
         return network.eval()
 
     def _learn(self) -> dict[str, float]:
-        """One step; returns the terms of the loss."""
+        """Run one step and return the terms of the loss."""
         rng = np.random.default_rng([self.schedule.seed, self.step])
         chosen = rng.integers(len(self.pictures), size=self.schedule.batch)
         examples = [augmented(self.pictures[int(k)], rng) for k in chosen]
@@ -117,9 +114,7 @@ class Trainer:
             terms = losses(self.network, images, objects, self.schedule.budget, generator)
         loss = torch.stack(list(terms.values())).sum()
         if not torch.isfinite(loss):
-            raise DataError(
-                f"training has diverged at step {self.step}: the loss is {loss.item()}; lower learning_rate"
-            )
+            raise DataError(f"training diverged at step {self.step}: the loss is {loss.item()}; lower learning_rate")
         for group in self._optimizer.param_groups:
             group["lr"] = self.schedule.rate(self.step)
         self._optimizer.zero_grad(set_to_none=True)
@@ -134,7 +129,7 @@ class Trainer:
         unknown = sorted(set(example.class_names) - set(index))
         if unknown:
             raise DataError(f"the pictures show classes that the network does not have: {', '.join(unknown)}")
-        boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # borders, of pixels inside
+        boxes = tight_boxes(example.masks) + np.array([0, 0, 1, 1], np.float32)  # from pixels to their borders
         return Objects(
             boxes=torch.from_numpy(boxes),
             labels=torch.tensor([index[name] for name in example.class_names], dtype=torch.int64),
@@ -143,7 +138,7 @@ class Trainer:
 
     @torch.no_grad()
     def _average(self) -> None:
-        keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))  # the first weights are worth nothing
+        keep = min(self.schedule.averaging, (1 + self.step) / (10 + self.step))  # forgets the first weights faster
         for name, value in self.network.state_dict().items():
             if value.is_floating_point():
                 self.averaged[name].lerp_(value, 1 - keep)
@@ -175,7 +170,7 @@ class Trainer:
             self.averaged = state["averaged"]
             self._optimizer.load_state_dict(state["optimizer"])
             self.step, self.history = state["step"], state["history"]
-        except Exception as error:  # a damaged file can raise almost anything
+        except Exception as error:  # torch raises many types for a damaged file
             raise DataError(
                 f"{path} is damaged, or of another network than this one: {in_one_line(error)}; "
                 "remove it, or train in another folder"
@@ -183,7 +178,7 @@ class Trainer:
 
 
 def draw_losses(history: Sequence[dict[str, float]], path: Path) -> None:
-    """The terms of the loss over the steps, as running means, on a logarithmic scale."""
+    """Plot running means of the terms of the loss over the steps, on a logarithmic scale."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axes = figure.subplots()
     width = max(1, len(history) // 60)

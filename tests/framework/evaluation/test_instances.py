@@ -220,7 +220,7 @@ def test_empty_map_and_empty_truth():
 
 def test_inconsistent_predictions_are_refused():
     truth = scene([(1, 100)], {1: "chair"})
-    with pytest.raises(DataError, match="labelled 6"):
+    with pytest.raises(DataError, match="labeled 6"):
         prediction(truth, [(6, 10)], {5: ("chair", 1.0)})
     with pytest.raises(DataError, match="not finite"):
         prediction(truth, [(5, 10)], {5: ("chair", float("nan"))})

@@ -7,7 +7,7 @@ import math
 import pytest
 
 from framework.runs.run_rows import Run
-from framework.tables.sequences import mean_by_sequence, mean_difference, mean_over_sequences
+from framework.tables.comparison import mean_by_sequence, mean_difference, mean_over_sequences
 
 FIGURES: dict[Run, float] = {("0", "a"): 0.2, ("1", "a"): 0.4, ("0", "b"): 0.9, ("1", "b"): 0.7}
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from framework.detection.masks.boxes import decode
-from framework.training.targets import BACKGROUND, IGNORED, box_iou, encode, mask_targets, match, sample
+from framework.training.losses import BACKGROUND, IGNORED, box_iou, encode, mask_targets, match, sample
 
 
 def boxes(*rows: tuple[float, float, float, float]) -> torch.Tensor:
