@@ -12,20 +12,18 @@ from typing import Any
 import numpy as np
 
 from framework.registry import STAGES
+from framework.reporting.charts import RUN_COLORS, RUN_WIDTHS, CameraPath, stage_rows, top_view
 from framework.reporting.map_scene import MapScene
-from framework.reporting.markup import page, section, table, tag, words
+from framework.reporting.markup import page
 from framework.reporting.run_contents import RunContents
-from framework.reporting.run_page import lost_after, viewer
+from framework.reporting.run_page import lost_after
 from framework.reporting.source_frames import Footage
-from framework.reporting.time_charts import stage_rows
-from framework.reporting.trajectory_chart import Way, top_view
 from framework.reporting.visibility import NOT_CAMERA
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
 MOST_MAPS = 6  # runs whose maps are in the page: they share what one map may have
-RUN_COLORS = 6  # of report.css
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ ROWS = (
     Row("instances.ap50", "AP50", "", 3, better=1),
     Row("instances.ap25", "AP25", "", 3, better=1),
     Row("instances.ap", "AP", "", 3, better=1),
-    Row("instances.ap50_agnostic", "AP50, classes ignored", "", 3, better=1),
+    Row("instances.ap50_agnostic", "AP50, class-agnostic", "", 3, better=1),
     Row("instances.mean_iou", "Mean IoU", "", 3, better=1),
     Row("instances.precision50", "Precision", "", 3, better=1),
     Row("instances.recall50", "Recall", "", 3, better=1),
@@ -58,6 +56,36 @@ ROWS = (
     Row("map.bytes", "Map", "MiB", 0, 2.0**-20, better=-1),
     Row("peak_rss_bytes", "Peak memory", "MiB", 0, 2.0**-20, better=-1),
 )
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A value of one run."""
+
+    text: str  # "" = unknown
+    best: bool = False
+    difference: str = ""
+
+
+@dataclass(frozen=True)
+class TableRow:
+    """A value of all runs."""
+
+    name: str
+    cells: list[Cell]
+    unit: str = ""
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with a column for each run."""
+
+    id: str
+    title: str
+    first: str  # head of the first column
+    rows: list[TableRow]
+    lead: str = ""
+    empty: str = ""  # text instead of rows; "" = no section without rows
 
 
 @dataclass(frozen=True)
@@ -78,140 +106,113 @@ class Comparison:
         return cls(runs, short_names([run.record.directory for run in runs]), links, scenes)
 
     def html(self) -> str:
-        """The page, the same for the same records."""
+        """Return the page, identical for the same runs."""
         shown = [(name, scene) for name, scene in zip(self.names, self.scenes, strict=False) if scene is not None]
         sequences = {run.name for run in self.runs}
-        title = next(iter(sequences)) if len(sequences) == 1 else f"{len(sequences)} recordings"
-        head = tag(
-            "header",
-            tag("p", "InstanceMap", class_="brand"),
-            tag("h1", words(f"{len(self.runs)} runs of {title}")),
-            tag("ol", *(self._run(k) for k in range(len(self.runs))), class_="runs"),
-            class_="head",
-        )
-        parts = [self._notices(), self._map(shown), self._figures(), self._classes(), self._settings()]
-        parts += [self._trajectories(), self._times(), self._objects()]
-        footer = tag("footer", "Made by InstanceMap from the runs' records. Nothing here is loaded from elsewhere.")
+        title = next(iter(sequences)) if len(sequences) == 1 else f"{len(sequences)} sequences"
+        heading = f"{len(self.runs)} runs of {title}"
         data: dict[str, Any] = {
             "likely": LIKELY,
             "sameWorld": len(sequences) == 1,
             "maps": [{"name": name, **scene.data()} for name, scene in shown],
         }
-        body = "\n".join([head, tag("main", *parts), footer])
-        return page(f"{len(self.runs)} runs of {title} · InstanceMap", body, data, [scene.glb() for _, scene in shown])
+        context = {
+            "heading": heading,
+            "runs": [
+                (name, link, _choices(run)) for name, link, run in zip(self.names, self.links, self.runs, strict=True)
+            ],
+            "run_colors": len(RUN_COLORS),
+            "notices": self._notices(),
+            "shown": [name for name, _ in shown],
+            "likely": LIKELY,
+            "tables": [self._metrics(), self._classes(), self._settings(), self._times(), self._objects()],
+            **self._paths(),
+        }
+        return page("comparison.html", f"{heading} · InstanceMap", context, data, [scene.glb() for _, scene in shown])
 
-    def _run(self, k: int) -> str:
-        name = words(self.names[k])
-        linked = tag("a", name, href=self.links[k]) if self.links[k] else name
-        chosen = [str(self.runs[k].record.metrics.get(f"choice.{group}") or "") for group in ("detector", "fuser")]
-        said = ", ".join(filter(None, chosen))
-        return tag("li", _key(k), tag("b", linked), " ", tag("span", words(said), class_="faint"))
-
-    def _notices(self) -> str:
-        said = [
+    def _notices(self) -> list[str]:
+        notices = [
             f"{name} is partial: {run.partial}." for name, run in zip(self.names, self.runs, strict=True) if run.partial
         ]
         if len(self.runs) > MOST_MAPS:
-            said.append(f"The maps of the first {MOST_MAPS} runs are shown; the others are in their own pages.")
-        return "".join(tag("p", words(text), class_="notice", role="status") for text in said)
+            notices.append(f"Only the maps of the first {MOST_MAPS} runs are shown; see the pages of the other runs.")
+        return notices
 
-    def _map(self, shown: Sequence[tuple[str, MapScene]]) -> str:
-        if not shown:
-            return section("map", "Maps", tag("p", "Nothing was mapped.", class_="empty"))
-        buttons = [
-            tag("button", words(name), type="button", data_map=k, aria_pressed="false" if k else "true")
-            for k, (name, _) in enumerate(shown)
-        ]
-        choice = tag("div", tag("div", *buttons, class_="choice", role="group", aria_label="Run"), class_="tools")
-        return section("map", "Maps", choice, viewer(""))
-
-    def _figures(self) -> str:
+    def _metrics(self) -> Table:
         rows = []
         for row in ROWS:
-            values = [run.record.metrics.get(row.key) for run in self.runs]
-            numbers = [row.scale * value if is_number(value) else None for value in values]
-            if any(value is not None for value in numbers):
-                name = words(row.name) + (tag("span", f" {row.unit}", class_="faint") if row.unit else "")
-                rows.append([name, *compared(numbers, row.digits, row.better)])
-        lead = "Best in bold where one is better; below it the difference from the first run."
-        return section("figures", "Figures", self._table("Figure", rows), lead=lead)
+            values = self._values(row.key, row.scale)
+            if any(value is not None for value in values):
+                rows.append(TableRow(row.name, compared(values, row.digits, row.better), row.unit))
+        lead = "The best value is bold. Differences are relative to the first run."
+        return Table("figures", "Metrics", "Metric", rows, lead)
 
-    def _classes(self) -> str:
+    def _values(self, key: str, scale: float = 1.0) -> list[float | None]:
+        values = [run.record.metrics.get(key) for run in self.runs]
+        return [scale * value if is_number(value) else None for value in values]
+
+    def _classes(self) -> Table:
         prefix = "instances.ap50."
-        found = sorted({key for run in self.runs for key in run.record.metrics if key.startswith(prefix)})
-        rows = []
-        for key in found:
-            values = [run.record.metrics.get(key) for run in self.runs]
-            numbers = [value if is_number(value) else None for value in values]
-            rows.append([words(key.removeprefix(prefix)), *compared(numbers, 2, 1)])
-        return section("classes", "AP50 by class", self._table("Class", rows)) if rows else ""
+        keys = sorted({key for run in self.runs for key in run.record.metrics if key.startswith(prefix)})
+        rows = [TableRow(key.removeprefix(prefix), compared(self._values(key), 2, 1)) for key in keys]
+        return Table("classes", "AP50 by class", "Class", rows)
 
-    def _settings(self) -> str:
+    def _settings(self) -> Table:
         configs = [dict(run.record.config) for run in self.runs]
         rows = []
-        for group in STAGES:  # of another plugin all parameters are others
+        for group in STAGES:  # another plugin has other parameters
             targets = [_target(config.get(group)) for config in configs]
             if len(set(targets)) > 1:
-                rows.append([words(group), *map(words, targets)])
+                rows.append(TableRow(group, [Cell(target) for target in targets]))
                 configs = [{key: node for key, node in config.items() if key != group} for config in configs]
         settings = [dict(leaves(config)) for config in configs]
-        keys = list(dict.fromkeys(key for one in settings for key in one))
+        keys = dict.fromkeys(key for one in settings for key in one)
         rows += [
-            [words(key), *(words(one.get(key, "")) for one in settings)]
+            TableRow(key, [Cell(str(one.get(key, ""))) for one in settings])
             for key in keys
             if len({repr(one.get(key)) for one in settings}) > 1
         ]
-        body = (
-            self._table("Parameter", rows) if rows else tag("p", "None: all parameters are the same.", class_="empty")
-        )
-        return section("settings", "What was set otherwise", body)
+        empty = "None: all parameters are equal."
+        return Table("settings", "Parameter differences", "Parameter", rows, empty=empty)
 
-    def _trajectories(self) -> str:
+    def _paths(self) -> dict[str, Any]:
         chosen = [k for k, run in enumerate(self.runs) if len(run.poses) > 1 and run.name == self.runs[0].name]
         if not chosen:
-            return ""
-        ways = [Way(self.runs[k].poses[:, :3, 3], f"run-{k % RUN_COLORS}", lost_after(self.runs[k])) for k in chosen]
-        up = self.runs[chosen[0]].up
-        picture, _ = top_view(ways, [], [], np.array([0.0, 0.0, 1.0]) if up is None else up)
-        keys = [tag("span", _key(k), words(self.names[k]), class_="pair") for k in chosen]
-        caption = tag("figcaption", "From above, each in its own world. ", *keys)
-        return section("trajectory", "Trajectories", tag("div", tag("figure", picture, caption), class_="charts"))
-
-    def _times(self) -> str:
-        of_runs = [{row.stage: row for row in stage_rows(run.times)} if run.times else {} for run in self.runs]
-        stages = list(dict.fromkeys(stage for rows in of_runs for stage in rows))
-        rows = [
-            [words(stage), *compared([one[stage].median if stage in one else None for one in of_runs], 1, -1)]
-            for stage in stages
+            return {"paths": ""}
+        styles = list(zip(RUN_COLORS, RUN_WIDTHS, strict=True))
+        paths = [
+            CameraPath(self.runs[k].poses[:, :3, 3], lost_after(self.runs[k]), *styles[k % len(styles)]) for k in chosen
         ]
-        return section("times", "Stage times", self._table("Median, ms", rows)) if rows else ""
+        up = self.runs[chosen[0]].up
+        picture, _ = top_view(paths, [], [], np.array([0.0, 0.0, 1.0]) if up is None else up)
+        return {"paths": picture, "path_names": [(k, self.names[k]) for k in chosen]}
 
-    def _objects(self) -> str:
+    def _times(self) -> Table:
+        medians = [{row.stage: row.median for row in stage_rows(run.times)} if run.times else {} for run in self.runs]
+        stages = dict.fromkeys(stage for one in medians for stage in one)
+        rows = [TableRow(stage, compared([one.get(stage) for one in medians], 1, -1)) for stage in stages]
+        return Table("times", "Stage times", "Median, ms", rows)
+
+    def _objects(self) -> Table:
         counts = [Counter(one.class_name for one in run.objects if one.confidence >= LIKELY) for run in self.runs]
         names = sorted({name for one in counts for name in one}, key=lambda name: (-max(c[name] for c in counts), name))
-        rows = [[words(name), *compared([float(one[name]) for one in counts], 0, 0)] for name in names]
-        lead = f"Of a confidence of {LIKELY} or more."
-        return section("objects", "Objects by class", self._table("Class", rows), lead=lead) if rows else ""
-
-    def _table(self, first: str, rows: Sequence[Sequence[str]]) -> str:
-        return table([first, *self.names], rows, numbers=range(1, 1 + len(self.names)), class_="compared")
+        rows = [TableRow(name, compared([float(one[name]) for one in counts], 0, 0)) for name in names]
+        return Table("objects", "Objects by class", "Class", rows, f"With a confidence of at least {LIKELY}.")
 
 
-def compared(values: Sequence[float | None], digits: int, better: int) -> list[str]:
-    """Cells: the best is bold, and each tells how much it differs from the first as far as the digits show."""
+def compared(values: Sequence[float | None], digits: int, better: int) -> list[Cell]:
+    """Mark the best value, and add the differences from the first one that the digits show."""
     known = [round(value, digits) for value in values if value is not None]
     best = None if not better or len(set(known)) < 2 else max(known) if better > 0 else min(known)
     cells = []
     for k, value in enumerate(values):
         if value is None:
-            cells.append(tag("span", "–", class_="faint"))
+            cells.append(Cell(""))
             continue
-        text = f"{value:.{digits}f}"
-        cell = tag("b", text) if round(value, digits) == best else text
-        first = values[0]
+        first, difference = values[0], ""
         if k and first is not None and round(value - first, digits):
-            cell += tag("small", words(f"{value - first:+.{digits}f}".replace("-", "\u2212")))
-        cells.append(cell)
+            difference = f"{value - first:+.{digits}f}".replace("-", "\u2212")
+        cells.append(Cell(f"{value:.{digits}f}", best is not None and round(value, digits) == best, difference))
     return cells
 
 
@@ -227,5 +228,7 @@ def _target(node: Any) -> str:
     return str(node.get("_target_")).rpartition(".")[2] if isinstance(node, dict) else ""
 
 
-def _key(k: int) -> str:
-    return tag("span", class_=f"key run-{k % RUN_COLORS}")
+def _choices(run: RunContents) -> str:
+    """The detector and the fuser of a run."""
+    names = [run.record.metrics.get(f"choice.{group}") for group in ("detector", "fuser")]
+    return ", ".join(str(name) for name in names if name)

@@ -9,38 +9,52 @@ from typing import Any
 
 import numpy as np
 import yaml
+from markupsafe import Markup
 from PIL import Image
 
 from framework.data import Float64
 from framework.errors import FrameError
 from framework.files.image_files import read_color
 from framework.registry import STAGES
+from framework.reporting.charts import (
+    FLAT_HEIGHT,
+    HEIGHT,
+    CameraPath,
+    Footprint,
+    box_corners,
+    growth,
+    position_errors,
+    stage_areas,
+    stage_rows,
+    top_view,
+)
 from framework.reporting.map_scene import MapScene, colors_by_id, hex_color, likely_ids
-from framework.reporting.markup import figure, page, section, table, tag, words
-from framework.reporting.object_table import object_data, object_table
+from framework.reporting.markup import page
+from framework.reporting.object_table import object_data, object_rows
 from framework.reporting.pictures import Photographer, Picture, webp_url
-from framework.reporting.progress_pictures import GrowthPicture, growth_pictures
+from framework.reporting.progress_pictures import growth_pictures
 from framework.reporting.run_contents import RunContents
 from framework.reporting.run_source import RunSource, TruePath
 from framework.reporting.source_frames import Footage
-from framework.reporting.time_charts import growth, stage_areas, stage_rows
-from framework.reporting.trajectory_chart import (
-    FLAT_HEIGHT,
-    HEIGHT,
-    Footprint,
-    Way,
-    box_corners,
-    error_over_time,
-    top_view,
-)
 from framework.reporting.truth_check import TruthCheck
-from framework.reporting.truth_section import truth_section
+from framework.reporting.truth_section import TruthSection
 from framework.reporting.visibility import NOT_CAMERA, spread_out
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
 OVERVIEW_WIDTH = 1400  # px, of the picture for browsers without WebGL
+SMALL_PATH = 0.3  # of the width of the top view: a smaller path is also shown enlarged
+TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("end", "end"), ("lost", "tracking lost"))
+TABLE_HEADS = (
+    ("Object", "text"),
+    ("Confidence", "number"),
+    ("Size, cm", "number"),
+    ("Frames", "number"),
+    ("First seen", "number"),
+    ("Position, m", "text"),
+)
+TRUTH_HEADS = (("Truth", "text"), ("IoU", "number"))
 
 
 @dataclass(frozen=True)
@@ -74,23 +88,8 @@ class RunReport:
         )
 
     def html(self) -> str:
-        """The page, the same for the same record and recording."""
-        contents = self.contents
-        parts = [
-            self._head(),
-            tag(
-                "main",
-                self._notices(),
-                self._map(),
-                self._objects(),
-                truth_section(self.check, self.why_unchecked, contents, self.pictures),
-                self._trajectory(),
-                self._growth(),
-                self._times(),
-                _provenance(contents),
-            ),
-            tag("footer", "Made by InstanceMap from one run's record. Nothing in this page is loaded from elsewhere."),
-        ]
+        """Return the page, identical for the same run and sequence."""
+        contents, metrics = self.contents, self.contents.record.metrics
         judgements = self.check.judgements if self.check else {}
         data: dict[str, Any] = {
             "likely": LIKELY,
@@ -100,79 +99,57 @@ class RunReport:
                 for one in contents.objects
             ],
         }
+        colors = {key: hex_color(color) for key, color in colors_by_id(contents.objects).items()}
+        context = {
+            "name": contents.name,
+            "stages": [name for group in STAGES if (name := metrics.get(f"choice.{group}"))],
+            "numbers": headline_numbers(contents),
+            "notices": self._notices(),
+            "likely": LIKELY,
+            "mapped": self.scene is not None,
+            "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
+            "heads": TABLE_HEADS + (TRUTH_HEADS if self.check else ()),
+            "checked": self.check is not None,
+            "objects": object_rows(contents, colors, self.pictures, judgements),
+            "truth": TruthSection.of(self.check, self.why_unchecked, contents, self.pictures),
+            "trajectory": self._trajectory(),
+            "progress": self._progress(),
+            "times": stage_rows(contents.times) if contents.times else [],
+            "times_chart": stage_areas(contents.times) if contents.times else "",
+            **_provenance(contents),
+        }
         maps = [] if self.scene is None else [self.scene.glb()]
-        return page(f"{contents.name} · InstanceMap", "\n".join(parts), data, maps)
+        return page("run.html", f"{contents.name} · InstanceMap", context, data, maps)
 
-    def _head(self) -> str:
-        metrics = self.contents.record.metrics
-        chosen = [str(metrics.get(f"choice.{group}") or "") for group in STAGES]
-        stages = [tag("li", words(name)) for name in chosen if name]
-        figures = [figure(*one) for one in headline_figures(self.contents)]
-        return tag(
-            "header",
-            tag("p", "InstanceMap", class_="brand"),
-            tag("h1", words(self.contents.name)),
-            tag("ol", *stages, class_="stages", aria_label="dataset, detector, tracker, refiner and fuser"),
-            tag("dl", *figures, class_="figures"),
-            class_="head",
-        )
-
-    def _notices(self) -> str:
+    def _notices(self) -> list[str]:
         notices = []
         if self.contents.partial:
-            notices.append(f"This run is partial: {self.contents.partial}. What it had mapped until then is below.")
+            notices.append(f"This run is partial: {self.contents.partial}. The page shows the map up to that point.")
         if self.recording.why_not:
             notices.append(
-                f"The recording could not be read ({self.recording.why_not}): pictures of objects are renderings of "
-                "the map, and the true path is not known."
+                f"The sequence could not be read ({self.recording.why_not}): object pictures are rendered from the "
+                "map, and the true path is unknown."
             )
-        return "".join(tag("p", words(text), class_="notice", role="status") for text in notices)
+        return notices
 
-    def _map(self) -> str:
-        if self.scene is None:
-            return section("map", "Map", tag("p", "Nothing was mapped.", class_="empty"))
-        overview = overview_url(self.contents.record.directory / "overview.png")
-        still = f'<img class="still" src="{overview}" alt="The map and its instances, rendered">' if overview else ""
-        return section("map", "Map", viewer(still))
-
-    def _objects(self) -> str:
-        contents = self.contents
-        if not contents.objects:
-            return section("objects", "Objects", tag("p", "No object was found.", class_="empty"))
-        colors = {key: hex_color(color) for key, color in colors_by_id(contents.objects).items()}
-        search = tag(
-            "div",
-            '<input type="search" id="search" placeholder="Search by class or number" aria-label="Search objects">',
-            tag("span", id="count", class_="faint", role="status"),
-            class_="tools",
-        )
-        judgements = self.check.judgements if self.check else None
-        return section("objects", "Objects", search, object_table(contents, colors, self.pictures, judgements))
-
-    def _trajectory(self) -> str:
+    def _trajectory(self) -> dict[str, Any] | None:
         contents = self.contents
         if len(contents.poses) < 2:
-            return ""
+            return None
         up = self.scene.up if self.scene is not None else contents.up
-        if up is None:
-            up = np.array([0.0, 0.0, 1.0])
         absent = {"truth"} if self.true_path is None else set()
         absent |= set() if contents.lost_frames else {"lost"}
-        keys = tuple(key for key in TOP_VIEW_KEY if key[0] not in absent)
-        whole, larger = self._top_views(up)
-        beside = [(larger, "The same, larger.")] if larger else []
+        keys = [key for key in TOP_VIEW_KEY if key[0] not in absent]
+        whole, larger = self._top_views(np.array([0.0, 0.0, 1.0]) if up is None else up)
+        details = [(larger, "The path, enlarged.")] if larger else []
         if self.true_path is not None:
             frames = [contents.tracked_frames[k] for k in self.true_path.chosen]
-            height = FLAT_HEIGHT if larger else HEIGHT
-            beside += [(error_over_time(frames, self.true_path.errors, height), self._error_words())]
-        figures = [tag("figure", picture, _caption(said)) for picture, said in beside]
-        charts = [tag("figure", whole, _caption(self._way_words(), keys))]
-        if figures:
-            charts.append(tag("div", *figures, class_="column"))
-        return section("trajectory", "Trajectory", tag("div", *charts, class_="charts"))
+            chart = position_errors(frames, self.true_path.errors, FLAT_HEIGHT if larger else HEIGHT)
+            details.append((chart, self._error_text()))
+        return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
-    def _top_views(self, up: Float64) -> tuple[str, str]:
-        """Among the objects, and larger where it is small among them."""
+    def _top_views(self, up: Float64) -> tuple[Markup, Markup | None]:
+        """Return the path with the objects, and enlarged if it is small."""
         contents = self.contents
         colors = colors_by_id(contents.objects)
         likely = set(likely_ids(contents))
@@ -181,20 +158,20 @@ class RunReport:
             for one in contents.objects
             if one.id in likely
         ]
-        way = Way(contents.poses[:, :3, 3], "mine", lost_after(contents))
-        true_ways = [self.true_path.positions] if self.true_path is not None else []
-        whole, share = top_view([way], true_ways, footprints, up)
-        if share > SMALL_WAY:
-            return whole, ""
-        return whole, top_view([way], true_ways, [], up, FLAT_HEIGHT if true_ways else HEIGHT)[0]
+        path = CameraPath(contents.poses[:, :3, 3], lost_after(contents))
+        true_paths = [self.true_path.positions] if self.true_path is not None else []
+        whole, share = top_view([path], true_paths, footprints, up)
+        if share > SMALL_PATH:
+            return whole, None
+        return whole, top_view([path], true_paths, [], up, FLAT_HEIGHT if true_paths else HEIGHT)[0]
 
-    def _way_words(self) -> str:
+    def _path_text(self) -> str:
         steps = np.linalg.norm(np.diff(self.contents.poses[:, :3, 3], axis=0), axis=1)
         lost = len(self.contents.lost_frames)
-        text = f"From above: {steps.sum():.2f} m in {len(self.contents.poses)} frames"
+        text = f"Top view: {steps.sum():.2f} m in {len(self.contents.poses)} frames"
         return f"{text}, {lost} lost." if lost else f"{text}, none lost."
 
-    def _error_words(self) -> str:
+    def _error_text(self) -> str:
         metrics = self.contents.record.metrics
         parts = []
         for key, name in (("trajectory.ate_rmse_m", "ATE"), ("trajectory.rpe_rmse_m", "RPE")):
@@ -203,100 +180,22 @@ class RunReport:
         if is_number(value := metrics.get("trajectory.rpe_rotation_rmse_rad")):
             parts.append(f"RPE {np.rad2deg(value):.2f}° a frame")
         assert self.true_path is not None
-        looked = f"drawn from {len(self.true_path.chosen)} frames, after alignment"
+        looked = f"computed from {len(self.true_path.chosen)} frames, after alignment"
         return f"{', '.join(parts)} over all frames; {looked}." if parts else f"{looked.capitalize()}."
 
-    def _growth(self) -> str:
+    def _progress(self) -> dict[str, Any] | None:
         contents, scene = self.contents, self.scene
         if scene is None or not contents.tracked_frames:
-            return ""
+            return None
         frames = [contents.tracked_frames[k] for k in scene.sightings.chosen]
         likely = set(likely_ids(contents))
         first = [one.first_frame for one in contents.objects if one.id in likely]
-        lead = (
-            "When each part of the final map first came into sight, by looking at it again from the trajectory, and "
-            "when each of its likely objects was first detected. The slider below the map plays it."
-        )
-        picture = growth(frames, scene.sightings.growth, first, contents.tracked_frames[-1])
-        chart = tag("figure", picture, _caption("", GROWTH_KEY))
-        strip = [
-            tag("figure", f'<img src="{one.url}" alt="" width="480" height="320">', _caption(_seen_words(one)))
-            for one in growth_pictures(scene)
-        ]
-        charts = tag("div", chart, tag("div", *strip, class_="strip"), class_="charts")
-        return section("growth", "Growth", charts, lead=lead)
-
-    def _times(self) -> str:
-        times = self.contents.times
-        if times is None or not stage_rows(times):
-            return ""
-        rows = stage_rows(times)
-        widest = max(row.p95 for row in rows)
-        body = [
-            [
-                f'<span class="key stage-{row.stage}"></span>{words(row.stage)}',
-                _time_bar(row.lowest / widest, row.median / widest, row.p95 / widest),
-                f"{row.median:.1f}",
-                f"{row.p95:.1f}",
-            ]
-            for row in rows
-        ]
-        heads = ["Stage", "5% to 95%", "Median, ms", "p95, ms"]
-        lead = "Reading and detection of the next frame run beside the other stages: a frame takes less than their sum."
-        return section(
-            "times",
-            "Stage times",
-            tag(
-                "div",
-                table(heads, body, numbers=(2, 3), class_="stage-times"),
-                tag("figure", stage_areas(times)),
-                class_="charts",
-            ),
-            lead=lead,
-        )
+        chart = growth(frames, scene.sightings.growth, first, contents.tracked_frames[-1])
+        return {"chart": chart, "pictures": growth_pictures(scene)}
 
 
-SMALL_WAY = 0.3  # of the width of the view from above: what is smaller is shown larger, too
-TOP_VIEW_KEY = (("mine", "estimated"), ("truth", "true"), ("start", "start"), ("end", "end"), ("lost", "then lost"))
-GROWTH_KEY = (("seen", "surface in sight, share of all"), ("objects", "objects found"))
-
-
-def viewer(still: str) -> str:
-    """The map's place in the page, with its buttons; `still` is shown where there is no WebGL."""
-    views = [
-        tag("button", name, type="button", data_view=view, aria_pressed="true" if view == "color" else "false")
-        for view, name in (("color", "Colour"), ("instance", "Instances"), ("class", "Classes"))
-    ]
-    bar = tag(
-        "div",
-        tag("div", *views, class_="choice", role="group", aria_label="What the colours say"),
-        tag("label", '<input type="checkbox" id="path" checked>', "Camera path"),
-        tag(
-            "label",
-            "Confidence ≥ ",
-            tag("output", f"{LIKELY:.2f}", id="confidence-value"),
-            f'<input type="range" id="confidence" min="0" max="1" step="0.01" value="{LIKELY}">',
-        ),
-        tag("span", class_="spring"),
-        tag("button", "Reset view", type="button", id="reset"),
-        tag("button", "Save GLB", type="button", id="save"),
-        class_="tools",
-    )
-    time = tag(
-        "div",
-        tag("button", "Play growth", type="button", id="play"),
-        '<input type="range" id="time" min="0" max="1000" value="1000" aria-label="Growth of the map">',
-        tag("output", id="time-value", class_="faint"),
-        class_="tools time",
-    )
-    hint = tag("p", "Drag to turn, scroll or pinch to come closer, click an object for its numbers.", class_="faint")
-    panel = tag("aside", hint, tag("div", id="legend"), id="panel", aria_live="polite")
-    stage = tag("div", '<canvas id="canvas" tabindex="0" aria-label="The map in 3D"></canvas>', still, class_="stage")
-    return tag("div", bar, tag("div", stage, panel, class_="split"), time, class_="viewer")
-
-
-def headline_figures(contents: RunContents) -> list[tuple[str, str, str, str]]:
-    """Value, unit, label and note of a run's main figures, as far as there are any."""
+def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
+    """Return label, value, unit and note of the main metrics that the run has."""
     metrics = contents.record.metrics
 
     def known(key: str) -> float | None:
@@ -306,31 +205,26 @@ def headline_figures(contents: RunContents) -> list[tuple[str, str, str, str]]:
     found: list[tuple[str, str, str, str]] = []
     if (frames := known("frames")) is not None:
         lost = int(known("frames_lost") or 0)
-        found.append((f"{frames:.0f}", "", "Frames", f"{lost} lost" if lost else "none lost"))
+        found.append(("Frames", f"{frames:.0f}", "", f"{lost} lost" if lost else "none lost"))
     if (fps := known("fps")) is not None:
-        found.append((f"{fps:.1f}", "/s", "Speed", "whole loop"))
+        found.append(("Speed", f"{fps:.1f}", "/s", "whole loop"))
     if (count := known("instances.count")) is not None:
-        found.append((str(likely_count(contents)), "", "Objects", f"likely, of {count:.0f}"))
+        found.append(("Objects", str(len(likely_ids(contents))), "", f"likely, of {count:.0f}"))
     if (ap50 := known("instances.ap50")) is not None:
         ap25 = known("instances.ap25")
-        found.append((f"{ap50:.2f}", "", "AP50", "" if ap25 is None else f"AP25 {ap25:.2f}"))
+        found.append(("AP50", f"{ap50:.2f}", "", "" if ap25 is None else f"AP25 {ap25:.2f}"))
     if metrics.get("pose_source") == "ground_truth":
-        found.append(("given", "", "Poses", "not estimated"))
+        found.append(("Poses", "given", "", "not estimated"))
     elif (ate := known("trajectory.ate_rmse_m")) is not None:
-        found.append((f"{1e3 * ate:.1f}", "mm", "ATE", "after alignment"))
+        found.append(("ATE", f"{1e3 * ate:.1f}", "mm", "after alignment"))
     if (voxels := known("map.voxels")) is not None:
         taken = known("map.bytes")
-        found.append((f"{voxels / 1e6:.1f}", "M", "Voxels", "" if taken is None else f"{taken / 2**20:.0f} MiB"))
+        found.append(("Voxels", f"{voxels / 1e6:.1f}", "M", "" if taken is None else f"{taken / 2**20:.0f} MiB"))
     return found
 
 
-def likely_count(contents: RunContents) -> int:
-    """How many objects are likely."""
-    return len(likely_ids(contents))
-
-
 def lost_after(contents: RunContents) -> list[int]:
-    """The poses after which frames were lost."""
+    """Return the poses after which frames were lost."""
     numbers, lost = contents.tracked_frames, contents.lost_frames
     if not numbers or not lost:
         return []
@@ -348,40 +242,13 @@ def overview_url(path: Path) -> str:
     return webp_url(small, 80)
 
 
-def _seen_words(one: GrowthPicture) -> str:
-    return f"Frame {one.frame}: {100 * one.share:.0f}%"
-
-
-def _caption(text: str, keys: tuple[tuple[str, str], ...] = ()) -> str:
-    shown = [f'<span class="pair"><span class="key {css}"></span>{words(name)}</span> ' for css, name in keys]
-    return tag("figcaption", words(text), " ", tag("span", *shown, class_="keys") if shown else "")
-
-
-def _time_bar(lowest: float, median: float, p95: float) -> str:
-    low, middle, wide = (f"{100 * share:.1f}" for share in (lowest, median, p95 - lowest))
-    return (
-        '<svg class="spread" viewBox="0 0 100 10" preserveAspectRatio="none" aria-hidden="true">'
-        f'<rect class="spread-all" x="{low}" y="3" width="{wide}" height="4"/>'
-        f'<rect class="spread-median" x="{middle}" y="0" width="1" height="10"/></svg>'
-    )
-
-
-def _provenance(contents: RunContents) -> str:
+def _provenance(contents: RunContents) -> dict[str, Any]:
     record = contents.record
-    rows = [("Code", record.commit)]
-    rows += [
-        (key.removeprefix("environment."), str(value))
-        for key, value in record.metrics.items()
-        if key.startswith("environment.")
-    ]
-    rows += [("seed", str(record.metrics.get("seed"))), ("config_hash", str(record.metrics.get("config_hash")))]
-    listed = tag("dl", *(tag("dt", words(key)) + tag("dd", words(value)) for key, value in rows), class_="facts")
-    config = yaml.safe_dump(dict(record.config), sort_keys=False, allow_unicode=True)
-    figures = "\n".join(f"{key}: {value}" for key, value in leaves(dict(record.metrics)))
-    return section(
-        "provenance",
-        "How it was made",
-        listed,
-        tag("details", tag("summary", "Every parameter"), tag("pre", words(config))),
-        tag("details", tag("summary", "Every figure"), tag("pre", words(figures))),
-    )
+    prefix = "environment."
+    environment = [(key.removeprefix(prefix), record.metrics[key]) for key in record.metrics if key.startswith(prefix)]
+    facts = [(key, record.metrics.get(key)) for key in ("seed", "config_hash")]
+    return {
+        "facts": [("Code", record.commit), *environment, *facts],
+        "config": yaml.safe_dump(dict(record.config), sort_keys=False, allow_unicode=True),
+        "metrics": "\n".join(f"{key}: {value}" for key, value in leaves(dict(record.metrics))),
+    }

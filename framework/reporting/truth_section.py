@@ -1,13 +1,12 @@
-"""The part of a run's page that compares its objects with the true ones."""
+"""The section of a run's page that compares its objects with the ground truth."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from framework.evaluation.instances import Judgement, Outcome
-from framework.reporting.markup import section, table, tag, words
-from framework.reporting.object_table import image, meter
 from framework.reporting.pictures import Picture
 from framework.reporting.run_contents import RunContents
 from framework.reporting.truth_check import Missed, TruthCheck
@@ -18,107 +17,105 @@ MAIN = {
     "instances.ap50": "AP50",
     "instances.ap25": "AP25",
     "instances.ap": "AP",
-    "instances.ap50_agnostic": "AP50, classes ignored",
+    "instances.ap50_agnostic": "AP50, class-agnostic",
     "instances.mean_iou": "Mean IoU",
     "instances.precision50": "Precision",
     "instances.recall50": "Recall",
     "instances.pq50": "PQ",
 }
 GROUPS = {
-    Outcome.WRONG_CLASS: ("Wrong class", "they overlap a true object of another class by half or more"),
-    Outcome.FALSE: ("False", "they overlap no true object by half, or one that was found already"),
-    Outcome.RIGHT: ("Right", "class and at least half of the overlap agree"),
-    Outcome.IGNORED: ("Not judged", "where nobody knows the truth, or of a class that nobody looked for"),
+    Outcome.WRONG_CLASS: ("Wrong class", "IoU of at least 0.5 with a true object of another class"),
+    Outcome.FALSE: ("False positives", "IoU below 0.5 with every true object, or a duplicate"),
+    Outcome.RIGHT: ("Correct", "same class and an IoU of at least 0.5"),
+    Outcome.IGNORED: ("Ignored", "in unlabeled regions, or of a class that is not evaluated"),
 }
 
 
-def truth_section(
-    check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
-) -> str:
-    """Figures, classes, and what was missed, wrong and false with pictures; nothing where there never was a truth."""
-    metrics = contents.record.metrics
-    main = [(name, metrics[key]) for key, name in MAIN.items() if is_number(metrics.get(key))]
-    if not main and check is None:
-        return ""
-    figures = tag(
-        "dl",
-        *(tag("div", tag("dt", words(name)), tag("dd", f"{value:.2f}"), class_="figure") for name, value in main),
-        class_="figures small",
-    )
-    parts = [figures if main else "", _classes(metrics)]
-    if check is None:
-        reason = why_unchecked or "the record has no mesh"
-        parts.append(tag("p", words(f"The single objects cannot be compared any more: {reason}."), class_="notice"))
-    else:
-        parts += _galleries(check, contents, pictures)
-    return section("truth", "Against the truth", *parts, lead="Matched at an IoU of 0.5, the most confident first.")
+@dataclass(frozen=True)
+class Card:
+    """One picture of a gallery."""
+
+    class_name: str
+    confidence: str
+    note: str
+    picture: Picture | None
+    id: int | None  # of the object that a click selects
 
 
-def _classes(metrics: Mapping[str, Any]) -> str:
+@dataclass(frozen=True)
+class Gallery:
+    """The objects with one outcome."""
+
+    css: str
+    name: str
+    note: str
+    cards: list[Card]
+    open: bool
+
+
+@dataclass(frozen=True)
+class TruthSection:
+    """The metrics, and the galleries of missed, wrong and correct objects."""
+
+    metrics: list[tuple[str, str]]
+    classes: list[tuple[str, object, list[float | None]]]  # name, count of true objects, AP50 and AP25
+    unchecked: str  # the reason for missing galleries
+    galleries: list[Gallery]
+
+    @classmethod
+    def of(
+        cls, check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
+    ) -> TruthSection | None:
+        """Return None for a run without ground truth."""
+        metrics = contents.record.metrics
+        main = [(name, f"{metrics[key]:.2f}") for key, name in MAIN.items() if is_number(metrics.get(key))]
+        if check is None:
+            reason = why_unchecked or "the run has no mesh"
+            return cls(main, _classes(metrics), reason, []) if main else None
+        return cls(main, _classes(metrics), "", _galleries(check, contents, pictures))
+
+
+def _classes(metrics: Mapping[str, Any]) -> list[tuple[str, object, list[float | None]]]:
     prefix = "instances.true_count."
     rows = []
-    for key, count in metrics.items():
-        if not key.startswith(prefix):
-            continue
-        name = key.removeprefix(prefix)
-        cells = [words(name), str(count)]
-        for figure in ("ap50", "ap25"):
-            value = metrics.get(f"instances.{figure}.{name}")
-            cells.append(f"{meter(value)}{value:.2f}" if is_number(value) else "")
-        rows.append(cells)
-    if not rows:
-        return ""
-    return table(["Class", "True objects", "AP50", "AP25"], rows, numbers=(1, 2, 3), class_="classes")
+    for key in metrics:
+        if key.startswith(prefix):
+            name = key.removeprefix(prefix)
+            values = [metrics.get(f"instances.{figure}.{name}") for figure in ("ap50", "ap25")]
+            rows.append((name, metrics[key], [value if is_number(value) else None for value in values]))
+    return rows
 
 
-def _galleries(check: TruthCheck, contents: RunContents, pictures: Mapping[int, Picture]) -> list[str]:
+def _galleries(check: TruthCheck, contents: RunContents, pictures: Mapping[int, Picture]) -> list[Gallery]:
     by_id = {one.id: one for one in contents.objects}
-    cards = {outcome: list[str]() for outcome in GROUPS}
+    cards = {outcome: list[Card]() for outcome in GROUPS}
     for key, judgement in check.judgements.items():
         cards[judgement.outcome].append(_card(by_id[key], judgement, pictures.get(key)))
     missed = [_missed_card(one, check) for one in check.missed]
-    parts = [_gallery("missed", "Missed", "true objects that nothing of their class was matched with", missed)]
-    for outcome, (name, says) in GROUPS.items():
-        parts.append(_gallery(outcome.name.lower().replace("_", "-"), name, says, cards[outcome]))
-    return parts
+    galleries = [Gallery("missed", "Missed", "true objects without a match of their class", missed, bool(missed))]
+    for outcome, (name, note) in GROUPS.items():
+        open_first = outcome in (Outcome.WRONG_CLASS, Outcome.FALSE) and bool(cards[outcome])
+        css = outcome.name.lower().replace("_", "-")
+        galleries.append(Gallery(css, name, note, cards[outcome], open_first))
+    return galleries
 
 
-def _gallery(css: str, name: str, says: str, cards: list[str]) -> str:
-    count = tag("span", str(len(cards)), class_=f"outcome {css}")
-    head = tag("summary", tag("b", words(name)), " ", count, " ", tag("span", words(says), class_="faint"))
-    body = tag("div", *cards, class_="gallery") if cards else tag("p", "None.", class_="empty")
-    return tag("details", head, body, open=css not in ("right", "ignored") and bool(cards))
-
-
-def _card(one: StoredInstance, judgement: Judgement, picture: Picture | None) -> str:
-    near = judgement.truth_class or "something unknown"
-    lines = {
+def _card(one: StoredInstance, judgement: Judgement, picture: Picture | None) -> Card:
+    near = judgement.truth_class or "an unlabeled object"
+    notes = {
         Outcome.RIGHT: f"IoU {judgement.iou:.2f}",
         Outcome.WRONG_CLASS: f"truth: {near}, IoU {judgement.iou:.2f}",
-        Outcome.FALSE: f"nearest: {near}, IoU {judgement.iou:.2f}" if judgement.iou else "nothing is there",
+        Outcome.FALSE: f"nearest: {near}, IoU {judgement.iou:.2f}" if judgement.iou else "no overlap",
         Outcome.IGNORED: f"on {near}",
     }
-    title = tag("b", words(one.class_name), tag("span", f" {one.confidence:.2f}", class_="faint"))
-    return tag(
-        "button",
-        image(picture, f"{one.class_name} {one.id}"),
-        title,
-        tag("span", words(lines[judgement.outcome]), class_="faint"),
-        type="button",
-        class_="card",
-        data_id=one.id,
-    )
+    return Card(one.class_name, f"{one.confidence:.2f}", notes[judgement.outcome], picture, one.id)
 
 
-def _missed_card(one: Missed, check: TruthCheck) -> str:
+def _missed_card(one: Missed, check: TruthCheck) -> Card:
     near = max(
         (j for j in check.judgements.values() if j.truth_id == one.id), key=lambda j: (j.iou, -j.id), default=None
     )
-    said = "nothing was found there" if near is None else f"best overlap: IoU {near.iou:.2f}"
-    if one.picture is None:
-        said = "nothing was mapped there"
-    body = [image(one.picture, f"missed {one.class_name}"), tag("b", words(one.class_name))]
-    body.append(tag("span", words(said), class_="faint"))
-    if near is None:
-        return tag("div", *body, class_="card")
-    return tag("button", *body, type="button", class_="card", data_id=near.id)
+    note = "not detected" if near is None else f"best overlap: IoU {near.iou:.2f}"
+    return Card(
+        one.class_name, "", "not mapped" if one.picture is None else note, one.picture, near.id if near else None
+    )

@@ -63,7 +63,7 @@ class Page {
       this.viewer = viewer;
     } catch (error) {
       document.querySelector(".viewer").classList.add("no-webgl");
-      byId("panel").firstElementChild.textContent = `This browser cannot turn the map (${error.message}): here is a picture of it.`;
+      byId("panel").firstElementChild.textContent = `The 3D view is not available (${error.message}); showing a picture.`;
       this.legend();
       document.body.dataset.ready = "true";
       return;
@@ -141,7 +141,7 @@ class Page {
     const likely = this.table.rows.filter((row) => Number(row.dataset.confidence) >= this.confidence).length;
     byId("count").textContent = words
       ? `${shown} of ${this.table.rows.length} objects`
-      : `${likely} with a confidence of ${this.confidence.toFixed(2)} or more; the others are pale`;
+      : `${likely} with a confidence of ${this.confidence.toFixed(2)} or more; the others are dimmed`;
   }
 
   /** Chooses an object, or none, everywhere. */
@@ -176,7 +176,7 @@ class Page {
 
   details(object, { color }) {
     const close = made("button", "close", "×");
-    close.setAttribute("aria-label", "Choose nothing");
+    close.setAttribute("aria-label", "Clear selection");
     close.addEventListener("click", () => this.choose(null));
     const parts = [close, made("h3", "", swatch(color), object.class, " ", made("span", "faint", String(object.id)))];
     const picture = this.table && this.table.picture(object.id);
@@ -185,7 +185,7 @@ class Page {
       copy.loading = "eager";
       parts.push(copy, made("p", "source", object.source === "map" ? "rendered from the map" : `from ${object.source}`));
     }
-    parts.push(made("h4", "", "What it may be"));
+    parts.push(made("h4", "", "Class probabilities"));
     const likely = object.probabilities.filter(([, share], k) => k < 2 || share >= 0.005);
     const bars = likely.flatMap(([name, share]) => [
       made("span", "", name), meter(share), made("span", "", share < 0.005 ? "<0.01" : share.toFixed(2)),
@@ -201,7 +201,7 @@ class Page {
       ["Truth", object.truth],
     ];
     const shown = facts.filter(([, value]) => value);
-    parts.push(made("h4", "", "Numbers"));
+    parts.push(made("h4", "", "Details"));
     parts.push(made("dl", "facts", ...shown.flatMap(([name, value]) => [made("dt", "", name), made("dd", "", value)])));
     return made("div", "details", ...parts);
   }

@@ -104,7 +104,7 @@ def test_a_click_on_an_object_shows_its_numbers(pages: list[Path], opened: Any, 
         first["size"],
         first["place"],
         f"{first['confidence']:.2f}",
-        "What it may be",
+        "Class probabilities",
         "Truth",
     ):
         assert said in panel
@@ -114,7 +114,7 @@ def test_a_click_on_an_object_shows_its_numbers(pages: list[Path], opened: Any, 
     assert np.abs(canvas(page) - before).max() > 30, "nothing is highlighted"
     page.screenshot(path=tmp_path / "chosen.png", full_page=True)
     assert (tmp_path / "chosen.png").stat().st_size > 50_000
-    page.get_by_label("Choose nothing").click()
+    page.get_by_label("Clear selection").click()
     assert page.locator("#panel .details").count() == 0
 
 
@@ -217,5 +217,5 @@ def test_without_webgl_there_is_the_picture(pages: list[Path], browser: Any) -> 
     assert page.locator(".still").is_visible()
     assert page.evaluate("document.querySelector('.still').naturalWidth") > 1000
     page.locator("#objects-table tbody tr").first.click()
-    assert "What it may be" in page.inner_text("#panel")
+    assert "Class probabilities" in page.inner_text("#panel")
     context.close()

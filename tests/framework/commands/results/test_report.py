@@ -68,10 +68,10 @@ def test_a_run_becomes_one_page_the_same_each_time(stored: Path, command) -> Non
     assert "corner_room" in said
     assert f"AP50 {metrics['instances.ap50']:.2f}" in said
     assert f"likely, of {metrics['instances.count']}" in said
-    for heading in ("Map", "Objects", "Against the truth", "Trajectory", "Growth", "Stage times", "How it was made"):
+    for heading in ("Map", "Objects", "Ground truth", "Trajectory", "Mapping progress", "Stage times", "Provenance"):
         assert heading in said
     assert before.count(b"data:image/webp") > 3, "objects, growth and overview.png"
-    assert not re.search(rb'(src|href)="(?!data:)', before)
+    assert not re.search(rb'(src|href)="(?!data:|#)', before)
 
 
 def test_names_of_a_hostile_record_stay_text(stored: Path, command) -> None:
@@ -89,21 +89,21 @@ def test_without_the_recording_pictures_are_of_the_map_and_it_says_so(
     monkeypatch.setattr(composition, "_added", [])
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
-    assert "The recording could not be read" in texts(page)
+    assert "The sequence could not be read" in texts(page)
     sources = {one["source"] for one in json.loads(re.findall(r'id="report-data">(.*?)</script>', page)[0])["objects"]}
     assert sources == {"map"}
-    assert "The single objects cannot be compared any more" in texts(page)
+    assert "Individual objects cannot be compared" in texts(page)
 
 
 def test_a_view_from_above_alone_leaves_no_empty_place_beside_it(
     stored: Path, command, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(composition, "_added", [])  # no recording, and so no true way
-    monkeypatch.setattr(run_page, "SMALL_WAY", 0.0)  # the way is large enough among the objects
+    monkeypatch.setattr(run_page, "SMALL_PATH", 0.0)  # the way is large enough among the objects
     assert command(stored)[0] == 0
     page = (stored / "report.html").read_text()
-    assert "The camera&#x27;s way from above" in page
-    assert "The same, larger." not in page
+    assert "Camera path, top view" in page
+    assert "The path, enlarged." not in page
     assert '<div class="column">' not in page
 
 
@@ -143,7 +143,7 @@ def test_a_truth_that_cannot_be_read_is_said(stored: Path, command, monkeypatch:
     monkeypatch.setattr(CornerRoom, "scene_truth", unreadable)
     assert command(stored)[0] == 0
     said = texts((stored / "report.html").read_text())
-    assert "cannot be compared any more: instances.json is not valid JSON" in said
+    assert "cannot be compared: instances.json is not valid JSON" in said
     assert "AP50" in said
 
 
@@ -156,7 +156,7 @@ def test_a_partial_run_says_that_it_is_one(stored: Path, command) -> None:
     assert command(stored)[0] == 0
     said = texts((stored / "report.html").read_text())
     assert "This run is partial: interrupted by Ctrl-C." in said
-    assert "Nothing was mapped" in said
+    assert "The map is empty" in said
 
 
 def test_a_run_that_mapped_nothing_has_a_page(stored: Path, command) -> None:
@@ -166,8 +166,8 @@ def test_a_run_that_mapped_nothing_has_a_page(stored: Path, command) -> None:
     (stored / "timings.csv").write_text("frame,stage,milliseconds\n")
     assert command(stored)[0] == 0
     said = texts((stored / "report.html").read_text())
-    assert "Nothing was mapped" in said
-    assert "No object was found" in said
+    assert "The map is empty" in said
+    assert "No objects were found" in said
 
 
 @pytest.mark.parametrize(
@@ -232,5 +232,5 @@ def test_several_runs_are_set_side_by_side(mapped: Path, stored: Path, command) 
     assert 'href="sec%20%26%20ond/report.html"' in page
     assert "<b>1000.0</b>" in page
     assert "<small>\u22120.250</small>" in page
-    assert "None: all parameters are the same." in page
+    assert "None: all parameters are equal." in page
     assert page.count('<script type="text/plain" id="map-') == 2

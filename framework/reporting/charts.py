@@ -1,0 +1,262 @@
+"""Charts of a report: matplotlib figures as SVG elements whose colors follow the light or dark style of the page."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from io import StringIO
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, MaxNLocator
+from scipy.spatial import ConvexHull, QhullError
+
+from framework.data import Box, Float64
+from framework.figures.stage_times import STAGES, WINDOW, running_median
+from framework.runs.timings_file import StageTimes
+
+WIDTH, HEIGHT, FLAT_HEIGHT, TIMES_HEIGHT, GROWTH_HEIGHT = 560.0, 380.0, 180.0, 240.0, 390.0  # px
+LEFT, RIGHT, TOP, BOTTOM = 46.0, 12.0, 24.0, 40.0  # px around the axes
+TEXT_PX, DOT_PX = 12.0, 10.0
+FOOT = 36.0  # px below a top view, for the scale bar
+MARGIN = 0.08  # of the size of a top view
+MIN_EXTENT_M = 0.04  # of the shorter side of a top view
+LABEL_WIDTH_PX = 46.0  # of the smallest footprint with a label
+MAX_POINTS = 240  # of a line
+CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
+COLORS = {
+    "card": "#ffffff",
+    "line": "#e3e5e8",
+    "ink": "#20242a",
+    "faint": "#6b727b",
+    "accent": "#2f5bea",
+    "truth": "#8a9099",
+    "bad": "#c93a32",
+    "read": "#9aa5b1",
+    "detect": "#0072b2",
+    "track": "#009e73",
+    "lift": "#8c6bb1",
+    "refine": "#d55e00",
+    "fuse": "#b5830a",
+    "run-3": "#a2459e",
+    "run-4": "#8a6d00",
+    "run-5": "#5b6570",
+}
+"""The light colors of report.css by the name of their variable, which replaces them in the SVG."""
+RUN_COLORS = ("accent", "refine", "track", "run-3", "run-4", "run-5")
+RUN_WIDTHS = (6.0, 4.5, 3.0, 2.2, 1.6, 1.2)  # px: coinciding paths remain visible
+VARIABLES = {color: f"var(--{name})" for name, color in COLORS.items()}
+
+
+@dataclass(frozen=True)
+class Footprint:
+    """An object in the top view."""
+
+    corners_world: Float64  # (8, 3) m
+    name: str
+    color: str  # #rrggbb
+
+
+@dataclass(frozen=True)
+class CameraPath:
+    """The path of one camera."""
+
+    positions: Float64  # (P, 3) m, world
+    lost_after: Sequence[int] = ()  # positions after which the pose was unknown for a while
+    color: str = "accent"  # of COLORS
+    width: float = 2.0  # px
+
+
+@dataclass(frozen=True)
+class StageRow:
+    """The times of one stage, ms."""
+
+    stage: str
+    lowest: float  # the 5th percentile
+    median: float
+    p95: float
+
+
+def box_corners(box: Box) -> Float64:
+    """Return the corners of a box, (8, 3) m."""
+    return np.asarray(box.center + (CORNERS * box.extent) @ box.rotation.T)
+
+
+def stage_rows(times: StageTimes) -> list[StageRow]:
+    """Return the stages that ran, in their order."""
+    rows = []
+    for stage in ("read", *STAGES):
+        values = times.milliseconds.get(stage, np.zeros(0))
+        if np.isfinite(values).any():
+            rows.append(StageRow(stage, *np.nanpercentile(values, [5, 50, 95]).tolist()))
+    return rows
+
+
+def top_view(
+    paths: Sequence[CameraPath],
+    true_paths: Sequence[Float64],
+    objects: Sequence[Footprint],
+    up: Float64,
+    height: float = HEIGHT,
+) -> tuple[Markup, float]:
+    """Return the paths from above (true ones dashed) with the objects, and the size of the paths relative to WIDTH."""
+    space = height - FOOT
+    plane = _horizontal(paths[0].positions, up)
+    shown = np.concatenate([path.positions for path in paths] + list(true_paths)) @ plane.T
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    path_size = float((high - low).max())
+    if objects:
+        corners = np.concatenate([one.corners_world for one in objects]) @ plane.T
+        low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
+    center, size = (low + high) / 2, (high - low) * (1 + 2 * MARGIN)
+    scale = min(WIDTH / max(size[0], MIN_EXTENT_M * WIDTH / space), space / max(size[1], MIN_EXTENT_M))
+
+    def pixels(points_world: Float64) -> Float64:
+        return np.asarray((points_world @ plane.T - center) * scale * [1, -1] + [WIDTH / 2, space / 2])
+
+    figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
+    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH), ylim=(height, 0))
+    axes.axis("off")
+    titles = {}
+    for k, one in enumerate(objects):
+        if _draw_footprint(axes, one, pixels(one.corners_world), f"chart-object-{k}"):
+            titles[f"chart-object-{k}"] = one.name
+    for positions in true_paths:
+        axes.plot(*pixels(positions).T, color=COLORS["truth"], linewidth=2, dashes=(2.5, 2.5), gid="chart-true")
+    for path in paths:
+        points, color = pixels(path.positions), COLORS[path.color]
+        axes.plot(*points.T, color=color, linewidth=path.width, gid="chart-path", solid_capstyle="round")
+        dot: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": DOT_PX, "markeredgecolor": color}
+        lost = points[list(path.lost_after)]
+        axes.plot(*lost.T, color=COLORS["bad"], linestyle="none", marker="o", markersize=8, gid="chart-lost")
+        axes.plot(*points[:1].T, **dot, color=COLORS["card"], markeredgewidth=2.5)
+        axes.plot(*points[-1:].T, **dot, color=color)
+    length = round_length(0.12 * WIDTH / scale)
+    label = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
+    axes.plot([16, 16 + length * scale], [height - 8] * 2, color=COLORS["ink"], linewidth=2)
+    axes.text(16, height - 16, label, color=COLORS["faint"], fontsize=TEXT_PX)
+    return _svg(figure, "Camera path, top view", titles), path_size * scale / WIDTH
+
+
+def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> Markup:
+    """Draw the position error of each frame, errors (n,) m."""
+    figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
+    axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
+    axes.set_ylim(0, max(1.08e3 * float(errors.max(initial=0.0)), 1e-3))
+    return _svg(figure, "Position error over the frames")
+
+
+def stage_areas(times: StageTimes) -> Markup:
+    """Draw the stacked stage times as running medians."""
+    chosen = np.unique(np.linspace(0, len(times.frames) - 1, MAX_POINTS).astype(int))
+    stages = [row.stage for row in stage_rows(times)]
+    layers = [np.nan_to_num(running_median(times.milliseconds[stage], WINDOW))[chosen] for stage in stages]
+    figure, axes = _chart(TIMES_HEIGHT, times.frames[0], times.frames[-1], "Stacked stage times, ms")
+    if layers:
+        for stage, area in zip(
+            stages, axes.stackplot(times.frames[chosen], layers, colors=[COLORS[s] for s in stages]), strict=True
+        ):
+            area.set_gid(f"chart-stage-{stage}")
+        axes.set_ylim(0, max(float(np.percentile(np.sum(layers, axis=0), 98)) * 1.2, 1e-3))
+    return _svg(figure, "Stage times over the frames")
+
+
+def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> Markup:
+    """Draw the fraction of the final surface and the number of the final objects that each frame had reached.
+
+    Args:
+        frames: of `fraction` (n,).
+        first_frames: of the objects.
+        last_frame: of the sequence.
+    """
+    first, last = min([0, *frames]), max(last_frame, 1)
+    figure, axes = _chart(GROWTH_HEIGHT, first, last, "", LEFT)
+    axes.fill_between(frames, 100 * fraction, color=COLORS["truth"], alpha=0.16, linewidth=0)
+    axes.plot(frames, 100 * fraction, color=COLORS["truth"], linewidth=2, gid="chart-seen")
+    axes.set_ylim(0, 100)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}%"))
+    counts = axes.twinx()
+    for side in counts.spines.values():
+        side.set_visible(False)
+    ordered = sorted(first_frames)
+    steps = [first, *ordered, last], [0, *range(1, len(ordered) + 1), len(ordered)]
+    counts.step(*steps, where="post", color=COLORS["accent"], linewidth=2, gid="chart-objects")
+    counts.set_ylim(0, max(1, len(ordered)))
+    counts.yaxis.set_major_locator(MaxNLocator(4, integer=True))
+    counts.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["accent"])
+    return _svg(figure, "Visible surface and detected objects over the frames")
+
+
+def round_length(longest: float) -> float:
+    """Return the largest of 1, 2 or 5 times a power of ten that is at most as long."""
+    power = 10.0 ** np.floor(np.log10(max(longest, 1e-9)))
+    return float(max(factor * power for factor in (1, 2, 5) if factor * power <= longest * (1 + 1e-9) or factor == 1))
+
+
+def _chart(height: float, first: float, last: float, title: str, right: float = RIGHT) -> tuple[Figure, Axes]:
+    """Return empty axes over the frames."""
+    figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
+    inner = 1 - (LEFT + right) / WIDTH, 1 - (TOP + BOTTOM) / height
+    axes = figure.add_axes((LEFT / WIDTH, BOTTOM / height, *inner), facecolor="none")
+    axes.set_xlim(first, max(last, first + 1))
+    axes.spines[["top", "left", "right"]].set_visible(False)
+    axes.spines["bottom"].set_color(COLORS["faint"])
+    axes.grid(axis="y", color=COLORS["line"], linewidth=1)
+    axes.tick_params(length=0, labelsize=TEXT_PX, labelcolor=COLORS["faint"])
+    axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    axes.yaxis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+    axes.set_xlabel("frame", loc="right", fontsize=TEXT_PX, color=COLORS["faint"])
+    axes.set_title(title, loc="left", fontsize=TEXT_PX, color=COLORS["faint"])
+    return figure, axes
+
+
+def _horizontal(positions: Float64, up: Float64) -> Float64:
+    """Return the directions to the right and away, (2, 3), of the top view in which the path is widest."""
+    any_level = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    level = np.stack([any_level, np.cross(up, any_level)]) / np.linalg.norm(any_level)
+    _, _, Vt = np.linalg.svd((positions - positions.mean(axis=0)) @ level.T, full_matrices=True)
+    right = Vt[0] * (np.sign(Vt[0][np.abs(Vt[0]).argmax()]) or 1.0)
+    return np.asarray(np.stack([right, [-right[1], right[0]]]) @ level)
+
+
+def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, gid: str) -> bool:
+    try:
+        outline = corners[ConvexHull(corners).vertices]
+    except QhullError:  # an object that is a line from above
+        return False
+    axes.fill(*outline.T, facecolor=(one.color, 0.22), edgecolor=(one.color, 0.7), linewidth=1, gid=gid)
+    if np.ptp(outline[:, 0]) > LABEL_WIDTH_PX:
+        name = one.name.encode("utf-8", "backslashreplace").decode()
+        x, y = outline.mean(axis=0).tolist()
+        style: dict[str, Any] = {"ha": "center", "va": "center", "color": COLORS["faint"], "fontsize": TEXT_PX}
+        axes.text(x, y, name, **style, parse_math=False)
+    return True
+
+
+def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> Markup:
+    """Return an `<svg>` element without inline styles, which the policy of the page forbids."""
+    file = StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "instancemap"}), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph")  # the browser has further fonts
+        figure.savefig(file, format="svg", metadata={"Date": None, "Creator": None})
+    text = re.sub(r"<metadata>.*?</metadata>|<style.*?</style>|<!--.*?-->", "", file.getvalue(), flags=re.DOTALL)
+    text = re.sub(r' style="([^"]*)"', _attributes, text[text.index("<svg") :])
+    for gid, title in (titles or {}).items():
+        text = text.replace(f'<g id="{gid}">', f'<g id="{gid}"><title>{escape(title)}</title>')
+    size = f'viewBox="0 0 {figure.get_figwidth() * 72:g} {figure.get_figheight() * 72:g}"'
+    head = f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" {size} role="img"'
+    head += f' aria-label="{escape(label)}" stroke-linejoin="round">'
+    return Markup(re.sub(r"^<svg[^>]*>", lambda _: head, text))
+
+
+def _attributes(style: re.Match[str]) -> str:
+    """Return CSS properties as presentation attributes, with the color variables of the page."""
+    pairs = [item.split(":", 1) for item in style[1].split(";") if ":" in item]
+    kept = [(key.strip(), value.strip()) for key, value in pairs if not key.strip().startswith("font")]
+    return "".join(f' {key}="{VARIABLES.get(value, value)}"' for key, value in kept)
