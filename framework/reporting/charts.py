@@ -6,11 +6,11 @@ import re
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
 from io import StringIO
 from typing import Any
 
 import numpy as np
-from markupsafe import Markup, escape
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -104,7 +104,7 @@ def top_view(
     objects: Sequence[Footprint],
     up: Float64,
     height: float = HEIGHT,
-) -> tuple[Markup, float]:
+) -> tuple[str, float]:
     """Return the paths from above (true ones dashed) with the objects, and the size of the paths relative to WIDTH."""
     space = height - FOOT
     plane = _horizontal(paths[0].positions, up)
@@ -144,7 +144,7 @@ def top_view(
     return _svg(figure, "Camera path, top view", titles), path_size * scale / WIDTH
 
 
-def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> Markup:
+def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
     """Draw the position error of each frame, errors (n,) m."""
     figure, axes = _chart(height, frames[0], frames[-1], "Position error, mm")
     axes.plot(frames, 1e3 * errors, color=COLORS["accent"], linewidth=2, gid="chart-errors")
@@ -152,7 +152,7 @@ def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT
     return _svg(figure, "Position error over the frames")
 
 
-def stage_areas(times: StageTimes) -> Markup:
+def stage_areas(times: StageTimes) -> str:
     """Draw the stacked stage times as running medians."""
     chosen = np.unique(np.linspace(0, len(times.frames) - 1, MAX_POINTS).astype(int))
     stages = [row.stage for row in stage_rows(times)]
@@ -167,7 +167,7 @@ def stage_areas(times: StageTimes) -> Markup:
     return _svg(figure, "Stage times over the frames")
 
 
-def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> Markup:
+def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int], last_frame: int) -> str:
     """Draw the fraction of the final surface and the number of the final objects that each frame had reached.
 
     Args:
@@ -239,7 +239,7 @@ def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, gid: str) -> b
     return True
 
 
-def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> Markup:
+def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) -> str:
     """Return an `<svg>` element without inline styles, which the policy of the page forbids."""
     file = StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "instancemap"}), warnings.catch_warnings():
@@ -252,7 +252,7 @@ def _svg(figure: Figure, label: str, titles: Mapping[str, str] | None = None) ->
     size = f'viewBox="0 0 {figure.get_figwidth() * 72:g} {figure.get_figheight() * 72:g}"'
     head = f'<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" {size} role="img"'
     head += f' aria-label="{escape(label)}" stroke-linejoin="round">'
-    return Markup(re.sub(r"^<svg[^>]*>", lambda _: head, text))
+    return re.sub(r"^<svg[^>]*>", lambda _: head, text)
 
 
 def _attributes(style: re.Match[str]) -> str:

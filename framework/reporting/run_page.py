@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import yaml
-from markupsafe import Markup
 from PIL import Image
 
 from framework.data import Float64
@@ -148,7 +147,7 @@ class RunReport:
             details.append((chart, self._error_text()))
         return {"whole": whole, "text": self._path_text(), "legend": keys, "details": details}
 
-    def _top_views(self, up: Float64) -> tuple[Markup, Markup | None]:
+    def _top_views(self, up: Float64) -> tuple[str, str | None]:
         """Return the path with the objects, and enlarged if it is small."""
         contents = self.contents
         colors = colors_by_id(contents.objects)

@@ -124,7 +124,8 @@ def test_the_wheel_has_networks_and_configs_where_an_installed_run_looks(tmp_pat
     assert {f"framework/desk/{path.relative_to(DESK)}" for path in DESK.rglob("*") if path.is_file()} <= names
     assert any(name.endswith(f"licenses/{WEIGHTS}/LICENSE") for name in names)
     assert "plugins/detectors/mask_rcnn_rooms.safetensors" in names
-    assert {f"framework/reporting/assets/{name}" for name in (*SCRIPTS, STYLE, "page.html", "three.LICENSE")} <= names
+    assert {f"framework/reporting/assets/{name}" for name in (*SCRIPTS, STYLE, "three.LICENSE")} <= names
+    assert {f"framework/reporting/templates/{name}.html" for name in ("page", "parts", "run", "comparison")} <= names
     assert any(name.endswith("licenses/framework/reporting/assets/three.LICENSE") for name in names)
     assert not [name for name in names if "viewer_source" in name]
     assert not GROUPS.keys() - {name.split("/")[2] for name in names if name.startswith("framework/conf/")}
