@@ -64,7 +64,7 @@ class Footprint:
 
 
 @dataclass(frozen=True)
-class CameraPath:
+class PlottedPath:
     """The path of one camera."""
 
     positions: Float64  # (P, 3) m, world
@@ -99,7 +99,7 @@ def stage_rows(times: StageTimes) -> list[StageRow]:
 
 
 def top_view(
-    paths: Sequence[CameraPath],
+    paths: Sequence[PlottedPath],
     true_paths: Sequence[Float64],
     objects: Sequence[Footprint],
     up: Float64,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from framework.registry import STAGES
-from framework.reporting.charts import RUN_COLORS, RUN_WIDTHS, CameraPath, stage_rows, top_view
+from framework.reporting.charts import RUN_COLORS, RUN_WIDTHS, PlottedPath, stage_rows, top_view
 from framework.reporting.map_scene import MapScene
 from framework.reporting.markup import page
 from framework.reporting.run_contents import RunContents
@@ -181,7 +181,8 @@ class Comparison:
             return {"paths": ""}
         styles = list(zip(RUN_COLORS, RUN_WIDTHS, strict=True))
         paths = [
-            CameraPath(self.runs[k].poses[:, :3, 3], lost_after(self.runs[k]), *styles[k % len(styles)]) for k in chosen
+            PlottedPath(self.runs[k].poses[:, :3, 3], lost_after(self.runs[k]), *styles[k % len(styles)])
+            for k in chosen
         ]
         up = self.runs[chosen[0]].up
         picture, _ = top_view(paths, [], [], np.array([0.0, 0.0, 1.0]) if up is None else up)

@@ -18,7 +18,7 @@ from framework.registry import STAGES
 from framework.reporting.charts import (
     FLAT_HEIGHT,
     HEIGHT,
-    CameraPath,
+    PlottedPath,
     Footprint,
     box_corners,
     growth,
@@ -157,7 +157,7 @@ class RunReport:
             for one in contents.objects
             if one.id in likely
         ]
-        path = CameraPath(contents.poses[:, :3, 3], lost_after(contents))
+        path = PlottedPath(contents.poses[:, :3, 3], lost_after(contents))
         true_paths = [self.true_path.positions] if self.true_path is not None else []
         whole, share = top_view([path], true_paths, footprints, up)
         if share > SMALL_PATH:

@@ -12,7 +12,7 @@ from framework.data import Box
 from framework.reporting.charts import (
     HEIGHT,
     WIDTH,
-    CameraPath,
+    PlottedPath,
     Footprint,
     box_corners,
     growth,
@@ -49,7 +49,7 @@ def circle(radius: float) -> np.ndarray:
 
 
 def test_top_view_keeps_shapes_and_marks_lost_poses() -> None:
-    picture, share = top_view([CameraPath(circle(2.0), [5])], [circle(2.2)], [], UP)
+    picture, share = top_view([PlottedPath(circle(2.0), [5])], [circle(2.2)], [], UP)
     [mine], [true] = paths(picture, "chart-path"), paths(picture, "chart-true")
     assert np.ptp(mine, axis=0) == pytest.approx(np.full(2, np.ptp(mine[:, 1])), rel=0.03), "a circle stays one"
     assert np.ptp(true[:, 1]) / np.ptp(mine[:, 1]) == pytest.approx(1.1, rel=0.01)
@@ -63,7 +63,7 @@ def test_top_view_keeps_shapes_and_marks_lost_poses() -> None:
 
 def test_top_view_escapes_object_names() -> None:
     corners = box_corners(Box(np.array([4.0, 0, 0]), np.array([2.0, 1.0, 0.5]), np.eye(3)))
-    picture, share = top_view([CameraPath(circle(0.1))], [], [Footprint(corners, "<cup>", "#ff0000")], UP)
+    picture, share = top_view([PlottedPath(circle(0.1))], [], [Footprint(corners, "<cup>", "#ff0000")], UP)
     [shape] = paths(picture, "chart-object-0")
     shape = shape[:4]
     sides = np.linalg.norm(shape - np.roll(shape, 1, axis=0), axis=1)  # turned, so that the way is level
@@ -78,7 +78,7 @@ def test_top_view_escapes_object_names() -> None:
 def test_top_view_of_degenerate_path_is_valid(positions: np.ndarray) -> None:
     flat = Footprint(np.zeros((8, 3)), "line", "#000000")
     for objects in ([], [flat]):
-        parsed(top_view([CameraPath(positions)], [positions], objects, UP)[0])
+        parsed(top_view([PlottedPath(positions)], [positions], objects, UP)[0])
 
 
 def test_position_errors_are_in_millimeters() -> None:
