@@ -1,4 +1,4 @@
-"""How a frame's clusters are marked in a picture: colours, what was dropped, what was added."""
+"""Colors of a frame's clusters in the refinement figure, with the pixels that refinement dropped and added."""
 
 from __future__ import annotations
 
@@ -8,71 +8,71 @@ import numpy as np
 
 from framework.data import Array, Bool, Frame, Int32, PointClusters, UInt8
 from framework.evaluation.refined_points import Refinement, pixel_index, point_counts
-from framework.figures.drawing import DROPPED
 from framework.rendering.palette import instance_colors
 
-LIKE_DROPPED = 160  # sum of the differences in red, green and blue up to which a colour is too much like that
+DROPPED = (214, 28, 44)  # RGB
+DROPPED_DISTANCE = 160  # sum of the channel differences that a cluster color has to DROPPED, at least
 
 
 @dataclass(frozen=True)
 class ClusterMarks:
-    """The clusters of one column of the picture, and how they are marked."""
+    """The clusters before or after refinement, and how they are drawn."""
 
     heading: str
     clusters: PointClusters
-    colors: UInt8  # (K, 3)
-    owner: Int32  # (H, W) the cluster that shows: of several over a pixel the smallest; -1 = none
-    dropped: Bool  # (H, W) in some cluster before, in none now
-    added: Bool  # (H, W) new in the cluster that shows
+    colors: UInt8  # (K, 3) RGB
+    owner: Int32  # (H, W) the smallest cluster with this pixel, -1 = none
+    dropped: Bool  # (H, W) in a cluster before refinement, in none after it
+    added: Bool  # (H, W) not in the owner before refinement
 
     @classmethod
     def before(cls, refinement: Refinement) -> ClusterMarks:
         clusters, frame = refinement.before, refinement.frame
-        owner = _owner(clusters, frame, point_counts(clusters))
+        owner = _owner(clusters, frame)
         nowhere = np.zeros(owner.shape, np.bool_)
         return cls("before", clusters, _colors(len(clusters)), owner, nowhere, nowhere)
 
     @classmethod
     def after(cls, refinement: Refinement) -> ClusterMarks:
         before, after, frame = refinement.before, refinement.after, refinement.frame
-        # points that come from the same cluster's same pixel are the same
+        # a point is identified by its original cluster and its pixel
         origin = np.append(refinement.origin, -1)[after.cluster]
-        size = frame.depth.size
-        keys_before = before.cluster.astype(np.int64) * size + pixel_index(before, frame)
-        keys_after = origin.astype(np.int64) * size + pixel_index(after, frame)
+        keys_before = before.cluster.astype(np.int64) * frame.depth.size + pixel_index(before, frame)
+        keys_after = origin.astype(np.int64) * frame.depth.size + pixel_index(after, frame)
         new = ~np.isin(keys_after, keys_before[before.cluster >= 0])
-        sizes = point_counts(after)
-        owner = _owner(after, frame, sizes)
-        added = _painted(after, frame, sizes, new, False)
-        was = _owner(before, frame, refinement.points_before) >= 0
-        return cls("after", after, _colors_after(refinement), owner, was & (owner < 0), np.asarray(added, np.bool_))
+        owner = _owner(after, frame)
+        added = np.asarray(_painted(after, frame, new, False), np.bool_)
+        dropped = (_owner(before, frame) >= 0) & (owner < 0)
+        return cls("after", after, _colors_after(refinement), owner, dropped, added)
 
     def mask(self, k: int) -> Bool:
-        """(H, W) of cluster k."""
+        """Return the pixels of cluster k, (H, W)."""
         mask = np.zeros(self.owner.shape, np.bool_)
         u, v = self.clusters.pixels[self.clusters.cluster == k].T
         mask[v, u] = True
         return mask
 
     def by_size(self) -> list[int]:
-        """The clusters that have points, the largest first."""
+        """Return the clusters with points, the largest first."""
         sizes = point_counts(self.clusters)
-        order = np.argsort(-sizes, kind="stable")
-        return [k for k in order.tolist() if sizes[k]]
+        return [k for k in np.argsort(-sizes, kind="stable").tolist() if sizes[k]]
+
+    def name(self, k: int) -> str:
+        """Return the class and score of cluster k."""
+        probabilities = self.clusters.class_probabilities[k]
+        label = self.clusters.classes[int(probabilities.argmax())] if len(probabilities) else "object"
+        return f"{label} {self.clusters.scores[k]:.2f}"
 
 
 def _colors(count: int) -> UInt8:
-    """(count, 3) colours unlike each other, wherever the objects are, as all are near in the view from the side.
-
-    Colours that could be taken for that of dropped points are left out.
-    """
+    """Return colors (count, 3) that differ from each other and from DROPPED."""
     palette = instance_colors(np.zeros((2 * count + 8, 3)))
-    unlike = np.abs(palette.astype(np.int64) - DROPPED).sum(axis=1) > LIKE_DROPPED
+    unlike = np.abs(palette.astype(np.int64) - DROPPED).sum(axis=1) > DROPPED_DISTANCE
     return np.asarray(palette[unlike][:count])
 
 
 def _colors_after(refinement: Refinement) -> UInt8:
-    """(M, 3) the largest part of a cluster keeps its colour; further parts, and clusters from nowhere, get new ones."""
+    """Return the colors (M, 3): the largest part of a cluster keeps its color, all other clusters get new ones."""
     n, m = len(refinement.before), len(refinement.after)
     color_index = np.full(m, -1)
     known = np.flatnonzero(refinement.main_part >= 0)
@@ -81,22 +81,14 @@ def _colors_after(refinement: Refinement) -> UInt8:
     return np.asarray(_colors(n + m)[color_index])
 
 
-def _owner(clusters: PointClusters, frame: Frame, sizes: Int32) -> Int32:
-    """(H, W) the smallest cluster over each pixel, -1 = none."""
-    return np.asarray(_painted(clusters, frame, sizes, clusters.cluster, -1), np.int32)
+def _owner(clusters: PointClusters, frame: Frame) -> Int32:
+    return np.asarray(_painted(clusters, frame, clusters.cluster, -1), np.int32)
 
 
-def _painted(clusters: PointClusters, frame: Frame, sizes: Int32, values: Array, nothing: int) -> Array:
-    """(H, W) the values (P,) of the points, those of small clusters over those of large ones."""
+def _painted(clusters: PointClusters, frame: Frame, values: Array, nothing: int) -> Array:
+    """Return the values (P,) of the points as an image (H, W), small clusters over large ones."""
     held = np.flatnonzero(clusters.cluster >= 0)
-    held = held[np.argsort(-sizes[clusters.cluster[held]], kind="stable")]
+    held = held[np.argsort(-point_counts(clusters)[clusters.cluster[held]], kind="stable")]
     image = np.full(frame.depth.size, nothing, values.dtype)
-    image[pixel_index(clusters, frame)[held]] = values[held]  # of several the last one stays
+    image[pixel_index(clusters, frame)[held]] = values[held]
     return image.reshape(frame.depth.shape)
-
-
-def name_of(clusters: PointClusters, k: int) -> str:
-    """Class and score of cluster k."""
-    probabilities = clusters.class_probabilities[k]
-    label = clusters.classes[int(probabilities.argmax())] if len(probabilities) else "object"
-    return f"{label} {clusters.scores[k]:.2f}"

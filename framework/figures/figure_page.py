@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +11,12 @@ from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties
+from matplotlib.patheffects import withStroke
 from matplotlib.textpath import text_to_path
 
+from framework.data import Int32
 from framework.files.atomic_write import written_whole
+from framework.rendering.labels import place_labels
 
 COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of a journal's column, and of two
 TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0
@@ -79,6 +83,27 @@ def _wrapped(text: str, width: float) -> list[str]:
         else:
             lines.append(word)
     return lines
+
+
+def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, width_mm: float) -> None:
+    """Write names on the objects of a picture, or next to them with a line.
+
+    Args:
+        ids: (H, W) object of each pixel, 0 = none; the axes have these pixels as unit.
+        names: by object; one without space is omitted.
+        size: of the letters, pt.
+        width_mm: of the printed picture.
+    """
+    scale = ids.shape[1] / width_mm  # px by mm
+    halo = [withStroke(linewidth=0.25 * size, foreground="white", alpha=0.85)]
+    style: dict[str, Any] = {"ha": "center", "va": "center", "fontsize": size, "color": INK, "path_effects": halo}
+    line = {"arrowstyle": "-", "color": INK, "linewidth": 0.07 * size, "shrinkA": 0, "shrinkB": 0}
+    height = size / 72 * INCH_MM
+    for label in place_labels(ids, names, lambda text: (text_width(text, size) * scale, height * scale)):
+        if label.target is None:
+            axes.text(label.u, label.v, label.text, **style)
+        else:
+            axes.annotate(label.text, label.target, (label.u, label.v), arrowprops=line, **style)
 
 
 def say_inside(axes: Axes, text: str) -> None:

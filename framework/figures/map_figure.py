@@ -1,15 +1,13 @@
-"""The paper's Figures 4 and 5: maps side by side with the true instances beside them, as a page."""
+"""Maps side by side with the ground truth (Figures 4 and 5 of the paper)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.patches import Rectangle
-from matplotlib.patheffects import withStroke
 
 from framework.figures.figure_page import (
     FAINT_INK,
@@ -21,22 +19,21 @@ from framework.figures.figure_page import (
     SMALL_PT,
     TEXT_PT,
     Page,
+    draw_names,
     say_inside,
     text_width,
 )
-from framework.figures.map_panels import Name, Panel, PanelLine, Window
+from framework.figures.map_panels import Panel, PanelLine, Window
 from framework.rendering.camera_path import ProjectedPath
 
 HEAD_MM, CAPTION_MM, GAP_MM = 4.5, 4.0, 1.2  # above the columns, below a line, between panels
-LEFT_MM, RIGHT_MM = 3.5, 0.3  # beside the panels
+LEFT_MM, RIGHT_MM = 3.5, 0.3  # left and right of the panels
 ASPECT = 0.78  # height by width of a panel
-NAME_ROOM_MM = 0.8  # around the middle of an object, for its name to be written there
-NAME_HEIGHT_MM = 1.9
 
 
 @dataclass(frozen=True)
 class CaptionedLine:
-    """A line of panels with what is said beside and below them."""
+    """A line of panels with its name and captions."""
 
     name: str  # the sequence
     panels: PanelLine
@@ -44,18 +41,18 @@ class CaptionedLine:
 
     @property
     def rows(self) -> int:
-        """Of panels, below each other."""
+        """Number of panels below each other."""
         return 2 if self.panels.window else 1
 
 
 def panel_size(columns: int) -> tuple[int, int]:
-    """Width and height of one of so many panels beside each other, px."""
+    """Return the width and height of a panel, px."""
     width = _panel_mm(columns)
     return round(width * PDF_DPI / INCH_MM), round(width * ASPECT * PDF_DPI / INCH_MM)
 
 
 def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) -> Page:
-    """The page. `heads` name the columns, the truth as the last one; `note` stands below in small type."""
+    """Draw the page. `heads` name the columns, the last one is the ground truth; `note` is the small print."""
     width = _panel_mm(len(heads))
     height = width * ASPECT
     lefts = [LEFT_MM + k * (width + GAP_MM) for k in range(len(heads))]
@@ -74,7 +71,7 @@ def map_figure(heads: Sequence[str], lines: Sequence[CaptionedLine], note: str) 
         for axes, panel in zip(overall, line.panels.maps, strict=False):
             _draw(axes, panel, "not complete")
         _draw(overall[-1], line.panels.truth, "no true instances")
-        _draw_names(overall[-1], line.panels.truth, width)  # they tell the colours of the other columns, too
+        _draw_names(overall[-1], line.panels.truth, width)
         if line.panels.window:
             for left, axes, panel in zip(lefts, overall, line.panels.zoomed, strict=True):
                 larger = page.axes(left, foot, width, height)
@@ -101,7 +98,7 @@ def _draw(axes: Axes, panel: Panel | None, otherwise: str) -> None:
 
 
 def _draw_path(axes: Axes, path: ProjectedPath) -> None:
-    """Thin where something stands before it."""
+    """Draw the path, thin where it is occluded."""
     shades = path.shades() / 255.0
     segments = [path.pixels[k : k + 2] for k in range(len(path.pixels) - 1)]
     widths = [0.4 if hidden else 0.9 for hidden in path.hidden[:-1]]
@@ -117,19 +114,5 @@ def _draw_window(axes: Axes, panel: Panel | None, window: Window) -> None:
 
 
 def _draw_names(axes: Axes, panel: Panel | None, width_mm: float) -> None:
-    """On the objects that have room for their names, the large ones first; none over another."""
-    if panel is None:
-        return
-    scale = panel.image.shape[1] / width_mm  # px by mm
-    taken: list[tuple[Name, float]] = []  # with half the width, px
-    for name in panel.names:
-        half = text_width(name.text, NOTE_PT) * scale / 2
-        if name.room < NAME_ROOM_MM * scale or any(
-            abs(name.v - other.v) < NAME_HEIGHT_MM * scale and abs(name.u - other.u) < half + other_half
-            for other, other_half in taken
-        ):
-            continue
-        taken.append((name, half))
-        halo = [withStroke(linewidth=1.2, foreground="white", alpha=0.85)]
-        place: dict[str, Any] = {"ha": "center", "va": "center", "path_effects": halo}
-        axes.text(name.u, name.v, name.text, fontsize=NOTE_PT, color=INK, **place)
+    if panel is not None:
+        draw_names(axes, panel.objects, panel.names, NOTE_PT, width_mm)

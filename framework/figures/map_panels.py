@@ -1,4 +1,4 @@
-"""Maps of one scene beside its truth: from one point of view, and with one colour for each object."""
+"""Maps of one scene next to the ground truth: from one viewpoint, with one color for each object."""
 
 from __future__ import annotations
 
@@ -16,19 +16,8 @@ from framework.rendering.surface import FrontSides, Surface
 from framework.rendering.viewpoint import best_view, fitted
 from framework.runs.stored_map import StoredMap
 
-ZOOM = 2.5  # how much larger the place is shown in which the columns differ most
-
+ZOOM = 2.5  # magnification of the window in which the columns differ most
 FRAMING_SCALE = 0.1  # of the small picture whose points a view is framed for
-
-
-@dataclass(frozen=True)
-class Name:
-    """What an object is called, and where in the picture there is most room for it."""
-
-    text: str
-    u: float  # px
-    v: float  # px
-    room: float  # px, from there to the object's border
 
 
 @dataclass(frozen=True)
@@ -36,13 +25,14 @@ class Panel:
     """A picture of one map."""
 
     image: UInt8  # (H, W, 3) RGB
-    names: Sequence[Name]  # the largest first
-    path: ProjectedPath | None = None  # None = it says nothing that the other columns do not
+    objects: Int32  # (H, W) of each pixel, 0 = none
+    names: Mapping[int, str]  # by object
+    path: ProjectedPath | None = None  # None = the same in all columns
 
 
 @dataclass(frozen=True)
 class Window:
-    """A part of a picture, in px from its upper left corner."""
+    """A part of a picture, px from its upper left corner."""
 
     left: int
     top: int
@@ -50,7 +40,7 @@ class Window:
     height: int
 
     def seen_by(self, camera: Camera) -> Camera:
-        """The camera whose whole image is what `camera` sees in the window, in as many pixels."""
+        """Return the camera whose image is the window, enlarged to the image size of `camera`."""
         scale = camera.width / self.width
         return replace(
             camera,
@@ -65,23 +55,23 @@ class Window:
 class PanelLine:
     """The maps of one scene."""
 
-    maps: Sequence[Panel | None]  # one for each column; None = there is no map
-    truth: Panel | None  # None = nobody labelled the scene
-    true_count: int  # instances of known class in the truth's picture
-    window: Window | None = None  # what the panels below show larger
-    zoomed: Sequence[Panel | None] = ()  # of the maps, and of the truth as the last one
+    maps: Sequence[Panel | None]  # by column; None = no map
+    truth: Panel | None  # None = no ground truth
+    true_count: int  # instances of known class in the picture of the ground truth
+    window: Window | None = None  # None = no enlarged panels
+    zoomed: Sequence[Panel | None] = ()  # the window in the maps and in the ground truth
 
 
 def panel_line(
     maps: Sequence[StoredMap | None], truth: SceneTruth | None, size: tuple[int, int], zoom: bool
 ) -> PanelLine:
-    """Draws the maps of one scene; the last one that there is chooses the point of view and shows the truth.
+    """Draw the maps of one scene. The last map determines the viewpoint and the surface of the ground truth.
 
     Args:
-        maps: one or more of them not None.
-        truth: None = unknown; then the objects are those of that last map.
+        maps: at least one is not None.
+        truth: None = unknown; then the objects are those of the last map.
         size: width and height of a panel, px.
-        zoom: whether the place where the maps differ most is drawn larger, too.
+        zoom: also draw the window in which the maps differ most.
     """
     last = [one for one in maps if one is not None][-1]
     reference = truth or SceneTruth(last.mesh.vertices, last.ids, last.class_names)
@@ -89,26 +79,23 @@ def panel_line(
     columns = [None if one is None else _Column.of(one, reference, colors) for one in maps]
     true_column = _Column.of_truth(last, reference, colors)
     camera, T_world_camera = best_view(true_column.surface, true_column.objects, last.poses, *size)
-    lengths = {len(one.poses) for one in maps if one is not None}
-    with_path = len(lengths) > 1
+    with_path = len({len(one.poses) for one in maps if one is not None}) > 1
     if with_path:
         camera, T_world_camera = _with_path(true_column, camera, T_world_camera)
-    views = [None if column is None else column.seen_from(camera, T_world_camera) for column in columns]
-    true_view = true_column.seen_from(camera, T_world_camera)
+    panels = [one.panel(camera, T_world_camera, colors, with_path) if one else None for one in columns]
+    true_panel = true_column.panel(camera, T_world_camera, colors, with_path=False)
     line = PanelLine(
-        maps=[None if view is None else view.panel(colors, with_path) for view in views],
-        truth=true_view.panel(colors, with_path=False) if truth is not None else None,
+        maps=panels,
+        truth=true_panel if truth is not None else None,
         true_count=len(set(true_column.objects.tolist()) & set(colors.name_of)),
     )
-    window = _most_different([view.objects for view in views if view], colors) if zoom else None
+    window = _most_different([panel.objects for panel in panels if panel], colors) if zoom else None
     if window is None:
         return line
     camera = window.seen_by(camera)
-    larger = [
-        None if column is None else column.seen_from(camera, T_world_camera).panel(colors, with_path=False)
-        for column in (*columns, true_column if truth is not None else None)
-    ]
-    return replace(line, window=window, zoomed=larger)
+    columns.append(true_column if truth is not None else None)
+    zoomed = [one.panel(camera, T_world_camera, colors, with_path=False) if one else None for one in columns]
+    return replace(line, window=window, zoomed=zoomed)
 
 
 @dataclass(frozen=True)
@@ -129,34 +116,23 @@ class _Column:
 
     @classmethod
     def of_truth(cls, stored: StoredMap, truth: SceneTruth, colors: ObjectColors) -> _Column:
-        """The true instances on a map's surface: as much of them as it can have."""
+        """Return the true instances on the surface of a map."""
         objects = relabeled(stored.true_ids(truth), colors.true_objects)
         return cls(_surface(stored), stored.mesh.colors, objects, colors.name_of, stored.poses)
 
-    def seen_from(self, camera: Camera, T_world_camera: Float64) -> _View:
-        lit = LitView(self.surface, camera, T_world_camera)
-        path = ProjectedPath.of(self.poses, camera, T_world_camera, lit.hits)
-        return _View(self, lit, lit.hits.nearest(self.objects), path)
-
-
-@dataclass(frozen=True)
-class _View:
-    column: _Column
-    lit: LitView
-    objects: Int32  # (H, W)
-    path: ProjectedPath
-
-    def panel(self, colors: ObjectColors, with_path: bool) -> Panel:
-        image = self.lit.in_instances(self.column.colors, self.column.objects, colors.color_of)
-        return Panel(image, _names(self.objects, self.column.names), self.path if with_path else None)
+    def panel(self, camera: Camera, T_world_camera: Float64, colors: ObjectColors, with_path: bool) -> Panel:
+        view = LitView(self.surface, camera, T_world_camera)
+        image = view.in_instances(self.colors, self.objects, colors.color_of)
+        path = ProjectedPath.of(self.poses, camera, T_world_camera, view.hits) if with_path else None
+        return Panel(image, view.hits.nearest(self.objects), self.names, path)
 
 
 def _with_path(column: _Column, camera: Camera, T_world_camera: Float64) -> tuple[Camera, Float64]:
-    """The same view from so far that the path of the column's cameras is in it, too."""
+    """Move the view back until it contains the path of the column's cameras."""
     R_world_camera = T_world_camera[:3, :3]
     hits = FrontSides(column.surface, T_world_camera[:3, 3]).seen_by(camera.scaled(FRAMING_SCALE), R_world_camera)
     path = column.poses[:, :3, 3].astype(np.float32)
-    # as many points as the surface has, so that a short path is no stray point at the border
+    # as many points as the surface has, because outliers are not framed
     path = path[np.linspace(0, len(path) - 1, int(hits.seen.sum())).astype(int)]
     return fitted(R_world_camera, np.concatenate([hits.points_world[hits.seen], path]), camera.width, camera.height)
 
@@ -165,26 +141,10 @@ def _surface(stored: StoredMap) -> Surface:
     return Surface.seen_from(stored.mesh.vertices, stored.mesh.triangles, stored.poses)
 
 
-def _names(objects: Int32, names: Mapping[int, str]) -> list[Name]:
-    """The names of the objects in a picture (H, W), each at the middle of its object's widest part."""
-    found = []
-    sizes = np.bincount(objects.ravel(), minlength=max(names, default=0) + 1)
-    for key in sorted(names, key=lambda key: -sizes[key]):
-        if not sizes[key]:
-            break
-        v, u = np.nonzero(objects == key)
-        left, top = u.min(), v.min()
-        part = np.pad(objects[top : v.max() + 1, left : u.max() + 1] == key, 1)
-        depth = cv2.distanceTransform(part.astype(np.uint8), cv2.DIST_L2, 3)
-        y, x = np.unravel_index(int(depth.argmax()), depth.shape)
-        found.append(Name(names[key], float(left + x - 1), float(top + y - 1), float(depth[y, x])))
-    return found
-
-
 def _most_different(images: Sequence[Int32], colors: ObjectColors) -> Window | None:
-    """Where pictures (H, W) of objects differ in most pixels; None where they are the same.
+    """Return the window in which object images (H, W) differ in most pixels, None if they are equal.
 
-    A difference counts where one of them shows an object of the truth: what only a map has can be anywhere.
+    A difference counts if one of the images shows a true object there.
     """
     stack = np.stack(images)
     true = np.isin(stack, list(colors.name_of)).any(axis=0)

@@ -1,73 +1,140 @@
-"""The clusters of one frame before and after refinement, in the image and from the side: the paper's Figure 5."""
+"""Clusters of one frame before and after refinement, in the image and from the side (Figure 5 of the paper)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
-from PIL import Image, ImageDraw
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+from matplotlib.patheffects import withStroke
 
-from framework.data import Int32, UInt8
+from framework.data import Array, Bool, Frame, Int32, UInt8
 from framework.evaluation.refined_points import Refinement, point_counts
-from framework.figures.cluster_image import image_panel
-from framework.figures.cluster_marks import ClusterMarks, name_of
-from framework.figures.drawing import (
-    GAP,
-    MARGIN,
-    PANEL_WIDTH,
-    TAG_PX,
-    TEXT_PX,
-    TITLE_PX,
-    WIDTH,
-    font_of,
-    rgb_of,
-    shortened,
-)
-from framework.figures.side_view import SideView, side_panel
+from framework.figures.cluster_marks import DROPPED, ClusterMarks
+from framework.figures.figure_page import FAINT_INK, INCH_MM, INK, draw_names
+from framework.figures.side_view import SideView, draw_side
 from framework.files.atomic_write import written_whole
-from framework.rendering.palette import FAINT_INK, INK, PAPER
+from framework.rendering.palette import PAPER
 
-TITLE_HEIGHT, FIGURES_HEIGHT, ROW_HEIGHT = 52, 46, 30  # px
-TABLE_COLUMNS, TABLE_ROWS_MAX = 3, 8
-BETTER, WORSE = (24, 128, 72), (190, 40, 40)
+DPI = 100
+WIDTH_IN, MARGIN_IN, GAP_IN, HEAD_IN = 16.4, 0.2, 0.16, 0.35  # HEAD_IN above each panel
+PANEL_IN = (WIDTH_IN - 2 * MARGIN_IN - GAP_IN) / 2  # width
+MAX_IMAGE_IN, SIDE_IN, TITLE_IN, ROW_IN = 6.6, 4.6, 0.4, 0.3  # heights
+TITLE_PT, TEXT_PT, SMALL_PT = 15.0, 12.0, 10.5
+MAX_TITLE, MAX_REFINER, MAX_NAME = 90, 45, 18  # characters
+TABLE_COLUMNS, MAX_ROWS = 3, 8
+NAME_AT, POINTS_AT = 0.016, 0.12  # in a column, relative to the width of the table
+BETTER, WORSE = "#188048", "#be2828"
 
 
 def write_refinement(path: Path, refinement: Refinement, title: str, refiner: str) -> None:
-    """Draws `refinement_picture` to a PNG."""
-    image = refinement_picture(refinement, title, refiner)
+    """Write `refinement_figure` as a PNG."""
     with written_whole(path) as temporary:
-        Image.fromarray(image).save(temporary)
+        refinement_figure(refinement, title, refiner).savefig(temporary)
 
 
-def refinement_picture(refinement: Refinement, title: str, refiner: str) -> UInt8:
-    """The picture (H, WIDTH, 3) RGB.
+def refinement_figure(refinement: Refinement, title: str, refiner: str) -> Figure:
+    """Draw the clusters of one frame before and after refinement.
 
     Args:
-        title: what the frame is, and whose clusters these are.
-        refiner: how the refiner is called.
+        title: frame and detector.
+        refiner: name of the refiner.
     """
-    columns = ClusterMarks.before(refinement), ClusterMarks.after(refinement)
     frame = refinement.frame
-    side = SideView.of(frame, *columns)
-    rows = [
-        _title(title, refiner),
-        _beside([image_panel(frame, column) for column in columns]),
-        _blank(GAP),
-        _beside([side_panel(frame, column, side) for column in columns]),
-        _figures(refinement),
-        _table(refinement, columns[0]),
-        _blank(MARGIN // 2),
-    ]
-    return np.concatenate(rows)
+    columns = ClusterMarks.before(refinement), ClusterMarks.after(refinement)
+    height, width = frame.depth.shape
+    image_in = min(MAX_IMAGE_IN, PANEL_IN * height / width)
+    image_width_in = image_in * width / height
+    rows = -(-min(len(refinement.before), TABLE_COLUMNS * MAX_ROWS) // TABLE_COLUMNS)
+    table_in = ROW_IN * (rows + 2)
+    total_in = TITLE_IN + HEAD_IN + image_in + HEAD_IN + SIDE_IN + table_in + MARGIN_IN
+    side = SideView.of(frame, *columns, PANEL_IN / SIDE_IN)
+    with rc_context({"text.parse_math": False, "hatch.linewidth": 2.2}):
+        figure = Figure((WIDTH_IN, total_in), dpi=DPI, facecolor=np.array(PAPER) / 255)
+
+        def axes_at(left: float, bottom: float, width: float, height: float) -> Axes:
+            return figure.add_axes((left / WIDTH_IN, bottom / total_in, width / WIDTH_IN, height / total_in))
+
+        titles = axes_at(MARGIN_IN, total_in - TITLE_IN, WIDTH_IN - 2 * MARGIN_IN, TITLE_IN)
+        titles.axis("off")
+        titles.text(0, 0.4, _shortened(title, MAX_TITLE), fontsize=TITLE_PT, color=INK, va="center")
+        name = _shortened(refiner, MAX_REFINER)
+        titles.text(1, 0.4, name, fontsize=TITLE_PT, color=INK, weight="bold", ha="right", va="center")
+        for k, marks in enumerate(columns):
+            left = MARGIN_IN + k * (PANEL_IN + GAP_IN)
+            bottom = table_in + MARGIN_IN + SIDE_IN + HEAD_IN
+            axes = axes_at(left + (PANEL_IN - image_width_in) / 2, bottom, image_width_in, image_in)
+            draw_image(axes, frame, marks, image_width_in)
+            side_axes = axes_at(left, table_in + MARGIN_IN, PANEL_IN, SIDE_IN)
+            draw_side(side_axes, frame, marks, side, SIDE_IN)
+            for panel, heading in ((axes, marks.heading), (side_axes, f"{marks.heading}, side view")):
+                panel.set_title(heading, loc="left", fontsize=TEXT_PT, weight="bold", color=INK)
+        table = axes_at(MARGIN_IN, MARGIN_IN / 2, WIDTH_IN - 2 * MARGIN_IN, table_in)
+        table.set(ylim=(rows + 2, 0), xlim=(0, 1))
+        table.axis("off")
+        table.text(0, 0.5, _summary(refinement), fontsize=TEXT_PT, weight="bold", color=INK, va="center")
+        _draw_table(table, refinement, columns[0], rows)
+    return figure
 
 
-def _figures(refinement: Refinement) -> UInt8:
-    """The line below the panels."""
+def draw_image(axes: Axes, frame: Frame, marks: ClusterMarks, width_in: float) -> None:
+    """Draw the image with tinted, outlined and named clusters; dropped and added pixels are hatched."""
+    axes.imshow(tinted(frame, marks), interpolation="antialiased", aspect="auto")
+    axes.axis("off")
+    for k in marks.by_size():
+        smooth = cv2.medianBlur(_filled(marks.mask(k), frame).astype(np.uint8), 5)
+        if smooth.any():
+            outline = axes.contour(*_region(smooth), [0.5], colors=[0.62 * marks.colors[k] / 255], linewidths=1.2)
+            outline.set(path_effects=[withStroke(linewidth=2.2, foreground="white")])
+    legend = []
+    for name, mask, hatch, color in (
+        ("dropped", marks.dropped, "////", np.array(DROPPED) / 255),
+        ("added", marks.added, "\\\\\\\\", np.ones(3)),
+    ):
+        if mask.any():
+            area = axes.contourf(*_region(mask), [0.5, 1.5], colors="none", hatches=[hatch])
+            area.set(edgecolor=color, linewidth=0)
+            legend.append(Patch(facecolor="0.6", edgecolor=color, hatch=hatch, linewidth=0, label=name))
+    height, width = frame.depth.shape
+    axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
+    if legend:
+        place = {"loc": "lower right", "bbox_to_anchor": (1, 1), "borderaxespad": 0.2}
+        axes.legend(handles=legend, ncols=2, frameon=False, fontsize=SMALL_PT, **place)
+    names = {k + 1: marks.name(k) for k in marks.by_size()}
+    draw_names(axes, marks.owner + 1, names, SMALL_PT, width_in * INCH_MM)
+
+
+def tinted(frame: Frame, marks: ClusterMarks) -> UInt8:
+    """Return the pale image (H, W, 3) with the clusters in their colors."""
+    gray = frame.color.mean(axis=2, keepdims=True)
+    image = 0.55 * frame.color + 0.28 * gray + 38.0
+    for k in marks.by_size():
+        mask = marks.mask(k)
+        image[mask] = (0.42 * gray[mask] + 0.30 * frame.color[mask]) * 0.72 + 0.5 * marks.colors[k]
+    return np.asarray(np.clip(image, 0, 255), np.uint8)
+
+
+def _filled(mask: Bool, frame: Frame) -> Bool:
+    """Fill single pixels without depth, so that the outline is one line."""
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8)) > 0
+    return np.asarray(mask | (closed & (frame.depth == 0)))
+
+
+def _region(mask: Array) -> tuple[Array, Array, Array]:
+    """Return x, y and values of a mask (H, W) with a border, so that its contours are closed."""
+    height, width = mask.shape
+    return np.arange(-1, width + 1), np.arange(-1, height + 1), np.pad(mask.astype(float), 1)
+
+
+def _summary(refinement: Refinement) -> str:
     n, m = len(refinement.before), len(refinement.after)
     before, after = int(refinement.points_before.sum()), int(point_counts(refinement.after).sum())
     was, now = refinement.fit_before, refinement.fit_after
-    parts = ["nothing was detected"]
+    parts = ["no detections"]
     if n:
         parts = ["1 cluster" if n == m == 1 else f"{n} clusters" if n == m else f"{n} → {m} clusters"]
         parts.append(f"{before:,} → {after:,} points{_change(before, after)}")
@@ -76,23 +143,53 @@ def _figures(refinement: Refinement) -> UInt8:
         iou = was.iou[judged[0]].mean(), now.iou[judged[1]].mean()
         parts.append(f"mean IoU with the true masks {iou[0]:.2f} → {iou[1]:.2f}")
         inside = (
-            _share(was.points_inside[judged[0]], refinement.points_before[judged[0]]),
-            _share(now.points_inside[judged[1]], point_counts(refinement.after)[judged[1]]),
+            _percentage(was.points_inside[judged[0]], refinement.points_before[judged[0]]),
+            _percentage(now.points_inside[judged[1]], point_counts(refinement.after)[judged[1]]),
         )
         parts.append(f"points on the true object {inside[0]} → {inside[1]}")
-    parts.append(f"{refinement.milliseconds:.1f} ms")
-    image = Image.new("RGB", (WIDTH, FIGURES_HEIGHT), PAPER)
-    text = "   ·   ".join(parts)
-    ImageDraw.Draw(image).text((MARGIN, FIGURES_HEIGHT / 2), text, INK, font_of(TEXT_PX, bold=True), anchor="lm")
-    return np.asarray(image)
+    return "   ·   ".join([*parts, f"{refinement.milliseconds:.1f} ms"])
 
 
-def _share(points: Int32, of: Int32) -> str:
+def _draw_table(axes: Axes, refinement: Refinement, marks: ClusterMarks, rows: int) -> None:
+    """Draw the change of each cluster, in the order of the detections, one unit of y per row."""
+    n, places = len(refinement.before), TABLE_COLUMNS * MAX_ROWS
+    shown = n if n <= places else places - 1
+    was, now = refinement.fit_before, refinement.fit_after
+
+    def write(x: float, y: float, text: str, color: str = FAINT_INK, size: float = SMALL_PT, ha: str = "left") -> None:
+        axes.text(x, y, text, fontsize=size, color=color, ha=ha, va="center")
+
+    for k in range(shown):
+        left, y = k // rows / TABLE_COLUMNS, k % rows + 2.5
+        right = left + 0.95 / TABLE_COLUMNS
+        if k % rows == 0:
+            write(left + POINTS_AT, 1.5, "points")
+            if was is not None:
+                write(right, 1.5, "IoU with the true mask", ha="right")
+        axes.plot(left + 0.005, y, "s", markersize=10, color=marks.colors[k] / 255, clip_on=False)
+        write(left + NAME_AT, y, _shortened(marks.name(k), MAX_NAME), INK, TEXT_PT)
+        before, after = int(refinement.points_before[k]), int(refinement.points_after[k])
+        parts = np.count_nonzero(refinement.origin == k)
+        split = f" in {parts}" if parts > 1 else ""
+        write(left + POINTS_AT, y, f"{before:,} → {after:,}{split}{_change(before, after)}")
+        if was is not None and now is not None:
+            if not refinement.judged_before[k]:
+                write(right, y, "unknown", ha="right")
+                continue
+            part = refinement.main_part[k]
+            iou = round(float(was.iou[k]), 2), round(float(now.iou[part]), 2) if part >= 0 else 0.0
+            color = INK if iou[0] == iou[1] else BETTER if iou[1] > iou[0] else WORSE
+            write(right, y, f"{iou[0]:.2f} → {iou[1]:.2f}", color, TEXT_PT, "right")
+    if shown < n:
+        write((TABLE_COLUMNS - 1) / TABLE_COLUMNS, rows + 1.5, f"and {n - shown} more", size=TEXT_PT)
+
+
+def _percentage(points: Int32, of: Int32) -> str:
     return f"{100 * points.sum() / of.sum():.0f} %" if of.any() else "none"
 
 
 def _change(before: int, after: int) -> str:
-    """By how much a number of points has changed, in brackets."""
+    """Return the relative change of a number of points, in parentheses."""
     if before == 0:
         return ""
     change = round(100 * (after - before) / before)
@@ -100,62 +197,5 @@ def _change(before: int, after: int) -> str:
     return f" ({sign}{abs(change)} %)"
 
 
-def _table(refinement: Refinement, column: ClusterMarks) -> UInt8:
-    """What happened to each cluster, in the order of the detections."""
-    n, places = len(refinement.before), TABLE_COLUMNS * TABLE_ROWS_MAX
-    shown = n if n <= places else places - 1
-    rows = -(-min(n, places) // TABLE_COLUMNS)
-    image = Image.new("RGB", (WIDTH, ROW_HEIGHT * (rows + 1 if rows else 0)), PAPER)
-    canvas, font, small = ImageDraw.Draw(image), font_of(TEXT_PX), font_of(TAG_PX)
-    step = (WIDTH - 2 * MARGIN) / TABLE_COLUMNS
-    name_at, points_at, iou_at = 24, 184, step - 24  # px in a column; the last one is where it ends
-    was, now = refinement.fit_before, refinement.fit_after
-    for k in range(shown):
-        x, y = MARGIN + step * (k // rows), ROW_HEIGHT * (k % rows + 1.5)
-        if k % rows == 0:
-            canvas.text((x + points_at, ROW_HEIGHT / 2), "points", FAINT_INK, small, anchor="lm")
-            if was is not None:
-                canvas.text((x + iou_at, ROW_HEIGHT / 2), "IoU with the true mask", FAINT_INK, small, anchor="rm")
-        canvas.rounded_rectangle((x, y - 8, x + 16, y + 8), 4, fill=rgb_of(column.colors[k]))
-        name = shortened(name_of(column.clusters, k), canvas, font, points_at - name_at - 8)
-        canvas.text((x + name_at, y), name, INK, font, anchor="lm")
-        before, after = int(refinement.points_before[k]), int(refinement.points_after[k])
-        parts = np.count_nonzero(refinement.origin == k)
-        split = f" in {parts}" if parts > 1 else ""
-        text = f"{before:,} → {after:,}{split}{_change(before, after)}"
-        canvas.text((x + points_at, y), text, FAINT_INK, small, anchor="lm")
-        if was is not None and now is not None:
-            text, ink = "not known", FAINT_INK
-            if refinement.judged_before[k]:
-                part = refinement.main_part[k]
-                iou = round(float(was.iou[k]), 2), round(float(now.iou[part]), 2) if part >= 0 else 0.0
-                text = f"{iou[0]:.2f} → {iou[1]:.2f}"
-                ink = INK if iou[0] == iou[1] else BETTER if iou[1] > iou[0] else WORSE
-            canvas.text((x + iou_at, y), text, ink, font if ink != FAINT_INK else small, anchor="rm")
-    if shown < n:
-        x, y = MARGIN + step * (TABLE_COLUMNS - 1), ROW_HEIGHT * (rows + 0.5)
-        canvas.text((x, y), f"and {n - shown} more", FAINT_INK, font, anchor="lm")
-    return np.asarray(image)
-
-
-def _title(text: str, refiner: str) -> UInt8:
-    image = Image.new("RGB", (WIDTH, TITLE_HEIGHT), PAPER)
-    canvas, font, bold = ImageDraw.Draw(image), font_of(TITLE_PX), font_of(TITLE_PX, bold=True)
-    refiner = shortened(refiner, canvas, bold, PANEL_WIDTH)
-    text = shortened(text, canvas, font, WIDTH - 2 * MARGIN - GAP - canvas.textlength(refiner, bold))
-    canvas.text((MARGIN, TITLE_HEIGHT / 2), text, INK, font, anchor="lm")
-    canvas.text((WIDTH - MARGIN, TITLE_HEIGHT / 2), refiner, INK, bold, anchor="rm")
-    return np.asarray(image)
-
-
-def _beside(panels: Sequence[UInt8]) -> UInt8:
-    height = panels[0].shape[0]
-    row = np.tile(np.array(PAPER, np.uint8), (height, WIDTH, 1))
-    for k, panel in enumerate(panels):
-        left = MARGIN + k * (PANEL_WIDTH + GAP)
-        row[:, left : left + PANEL_WIDTH] = panel
-    return row
-
-
-def _blank(height: int) -> UInt8:
-    return np.tile(np.array(PAPER, np.uint8), (height, WIDTH, 1))
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else f"{text[: length - 1]}…"

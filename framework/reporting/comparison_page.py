@@ -180,10 +180,10 @@ class Comparison:
         if not chosen:
             return {"paths": ""}
         styles = list(zip(RUN_COLORS, RUN_WIDTHS, strict=True))
-        paths = [
-            PlottedPath(self.runs[k].poses[:, :3, 3], lost_after(self.runs[k]), *styles[k % len(styles)])
-            for k in chosen
-        ]
+        paths = []
+        for k in chosen:
+            color, width = styles[k % len(styles)]
+            paths.append(PlottedPath(self.runs[k].poses[:, :3, 3], lost_after(self.runs[k]), color, width))
         up = self.runs[chosen[0]].up
         picture, _ = top_view(paths, [], [], np.array([0.0, 0.0, 1.0]) if up is None else up)
         return {"paths": picture, "path_names": [(k, self.names[k]) for k in chosen]}

@@ -18,8 +18,8 @@ from framework.registry import STAGES
 from framework.reporting.charts import (
     FLAT_HEIGHT,
     HEIGHT,
-    PlottedPath,
     Footprint,
+    PlottedPath,
     box_corners,
     growth,
     position_errors,

@@ -1,4 +1,4 @@
-"""The picture of a refinement: what is marked where, on frames that are known exactly."""
+"""Refinement figure: marks and layout on synthetic frames with known answers."""
 
 from __future__ import annotations
 
@@ -7,15 +7,23 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from PIL import Image
 
 from framework.data import Camera, Frame, FrameTruth, PointClusters, Pose
 from framework.evaluation.refined_points import Refinement
-from framework.figures import drawing, side_view
-from framework.figures.cluster_image import _free_place, image_panel
-from framework.figures.cluster_marks import ClusterMarks
-from framework.figures.refinement_figure import refinement_picture, write_refinement
-from framework.figures.side_view import SideView, side_panel
+from framework.figures import side_view
+from framework.figures.cluster_marks import DROPPED, ClusterMarks
+from framework.figures.refinement_figure import (
+    DPI,
+    WIDTH_IN,
+    draw_image,
+    refinement_figure,
+    tinted,
+    write_refinement,
+)
+from framework.figures.side_view import SideView, draw_side
 from framework.geometry import exp_se3
 from framework.refinement.lifting import lift
 from framework.refinement.selection import keep_points
@@ -54,6 +62,17 @@ def box(frame: Frame, top: int, bottom: int, left: int, right: int) -> np.ndarra
 
 def refined(frame: Frame, before: Masks, after: Masks) -> Refinement:
     return Refinement(frame, clusters_of(frame, before), clusters_of(frame, after), 1.5)
+
+
+def pixels(figure: Figure) -> np.ndarray:
+    """Return the drawn figure, (H, W, 3) RGB."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3].astype(int)
+
+
+def picture(refinement: Refinement, title: str, refiner: str) -> np.ndarray:
+    return pixels(refinement_figure(refinement, title, refiner))
 
 
 def test_a_pixel_shows_the_smallest_cluster_over_it() -> None:
@@ -96,62 +115,52 @@ def test_colors_stay_and_further_parts_get_their_own() -> None:
     assert (np.abs(after[0].astype(int) - before).max(axis=1) > 60).all()
     many = ClusterMarks.before(refined(frame, [a] * 100, [a] * 100)).colors.astype(int)
     assert many.shape == (100, 3)
-    apart = np.abs(many - np.array(drawing.DROPPED)).sum(axis=1)
+    apart = np.abs(many - np.array(DROPPED)).sum(axis=1)
     assert apart.min() > 100, "nothing looks like what was dropped"
 
 
-def test_the_image_is_tinted_and_hatched_where_it_should_be() -> None:
+def test_image_is_tinted_and_hatched() -> None:
     frame = two_walls()
     change = refined(frame, [box(frame, 16, 40, 16, 48)], [box(frame, 16, 40, 16, 32)])
     before, after = ClusterMarks.before(change), ClusterMarks.after(change)
-    left, right = image_panel(frame, before).astype(int), image_panel(frame, after).astype(int)
-    scale = left.shape[0] / 48
-    kept = np.s_[round(30 * scale) : round(38 * scale), round(18 * scale) : round(30 * scale)]
-    lost = np.s_[round(30 * scale) : round(38 * scale), round(34 * scale) : round(46 * scale)]
-    beside = np.s_[round(4 * scale) : round(10 * scale), round(50 * scale) : round(60 * scale)]
+    left, right = tinted(frame, before).astype(int), tinted(frame, after).astype(int)
+    kept, other = np.s_[17:39, 17:31], np.s_[4:10, 50:60]
     np.testing.assert_array_equal(left[kept], right[kept])
-    assert np.ptp(left[beside].reshape(-1, 3).mean(axis=0)) < 1, "gray stays gray"
+    assert np.ptp(left[other].reshape(-1, 3).mean(axis=0)) < 1, "gray stays gray"
     hue = left[kept].reshape(-1, 3).mean(axis=0) - left[kept].mean()
     color = before.colors[0] - before.colors[0].mean()
     assert hue @ color > 0.98 * np.linalg.norm(hue) * np.linalg.norm(color)
-    red = (right[lost][..., 0] > 150) & (right[lost][..., 1] < 90)
-    assert 0.35 < red.mean() < 0.65, "stripes"
-    assert not ((left[lost][..., 0] > 150) & (left[lost][..., 1] < 90)).any()
+    hatched = []
+    for marks in (before, after):
+        figure = Figure((6.4, 4.8), dpi=100)
+        draw_image(figure.add_axes((0, 0, 1, 1)), frame, marks, 6.4)
+        lost = pixels(figure)[300:380, 340:460]
+        hatched.append(((lost[..., 0] > 150) & (lost[..., 1] < 110)).mean())
+    assert hatched[0] == 0
+    assert 0.1 < hatched[1] < 0.6, "stripes"
 
 
-def test_tags_never_overlap() -> None:
-    taken: list[tuple[float, float, float, float]] = []
-    for _ in range(200):
-        place = _free_place((50.0, 40.0), (60.0, 20.0), (300, 200), taken)
-        if place is None:
-            break
-        assert place[0] >= 0 and place[1] >= 0 and place[2] <= 300 and place[3] <= 200  # noqa: PT018
-        for other in taken:
-            assert place[0] >= other[2] or other[0] >= place[2] or place[1] >= other[3] or other[1] >= place[3]
-        taken.append(place)
-    assert 4 <= len(taken) < 200
-
-
-def test_from_the_side_distances_in_depth_show() -> None:
+def test_side_view_shows_distances_in_depth() -> None:
     frame = two_walls()
     mask = box(frame, 16, 32, 24, 40)  # bleeds from the near wall to the far one
     change = refined(frame, [mask], [mask & (frame.depth < 2.5)])
-    side = SideView.of(frame, ClusterMarks.before(change), ClusterMarks.after(change))
+    after = ClusterMarks.after(change)
+    side = SideView.of(frame, ClusterMarks.before(change), after, 1.7)
     assert side is not None
-    rows, columns = side.places
-    at = {column: side.pixels[(rows == 24) & (columns == column)][0] for column in (31, 32)}
-    moved = (at[32] - at[31]) / side.scale  # the two readings are 1 m apart in depth, and 3/60 + 0.5/60 in x
-    angle, sign = side_view.AZIMUTH_RAD, np.sign(side.forward[0])
+    at = {column: side.points[(side.rows == 24) & (side.columns == column)][0] for column in (31, 32)}
+    moved = at[32] - at[31]  # the two readings are 1 m apart in depth, and 3/60 + 0.5/60 in x
+    angle, sign = side_view.AZIMUTH_RAD, np.sign(side.forward)
     x = 0.5 / 60 * 3 + 0.5 / 60 * 2
     assert moved[0] == pytest.approx(sign * np.sin(angle) + x * np.cos(angle), abs=0.01)
-    panel = side_panel(frame, ClusterMarks.after(change), side).astype(int)
-    red = (panel[..., 0] > 120) & (panel[..., 1] < 70) & (panel[..., 2] < 90)
-    colored = np.ptp(panel, axis=2) > 60
-    u_red, u_kept = np.nonzero(red)[1], np.nonzero(colored & ~red)[1]
-    assert len(u_red) > 20
-    assert len(u_kept) > 20
-    expected = sign * np.sin(angle) * side.scale / drawing.SUPERSAMPLING
-    assert np.median(u_red) - np.median(u_kept) == pytest.approx(expected, rel=0.25)
+    axes = Figure().add_subplot()
+    draw_side(axes, frame, after, side, 4.6)
+    clusters = axes.collections[-1]
+    red = (np.abs(clusters.get_facecolors()[:, :3] - np.array(DROPPED) / 255) < 1e-6).all(axis=1)
+    u = np.asarray(clusters.get_offsets())[:, 0]
+    assert red.sum() == (~red).sum() == 16 * 8
+    assert np.median(u[red]) - np.median(u[~red]) == pytest.approx(sign * np.sin(angle), rel=0.25)
+    low, high = axes.get_xlim()
+    assert ((u > low) & (u < high)).all()
 
 
 @pytest.mark.parametrize("tilt", [-0.8, -0.5, -0.2, 0.0])
@@ -175,10 +184,9 @@ def test_the_picture_of_a_room() -> None:
     frame = CornerRoom()[0]
     before = lift(SphereDetector().detect(frame), frame, Pose(np.eye(4)))
     after = keep_points(before, before.pixels[:, 0] % 3 > 0)
-    image = refinement_picture(Refinement(frame, before, after, 1.0), "a room", "refiner=thirds")
-    assert image.dtype == np.uint8
-    assert image.shape[1:] == (drawing.WIDTH, 3)
-    again = refinement_picture(Refinement(frame, before, after, 1.0), "a room", "refiner=thirds")
+    image = picture(Refinement(frame, before, after, 1.0), "a room", "refiner=thirds")
+    assert image.shape[1:] == (round(WIDTH_IN * DPI), 3)
+    again = picture(Refinement(frame, before, after, 1.0), "a room", "refiner=thirds")
     np.testing.assert_array_equal(image, again)
 
 
@@ -200,25 +208,23 @@ def test_whatever_the_frame_there_is_a_picture(name: str) -> None:
     frame = odd_frames()[name]
     held = frame.depth > 0
     some = held & (np.indices(held.shape)[1] % 8 < 5)
-    image = refinement_picture(refined(frame, [held] * 3, [some, held, held & False]), "title " * 60, "refiner=x " * 60)
-    assert image.shape[1] == drawing.WIDTH
+    image = picture(refined(frame, [held] * 3, [some, held, held & False]), "title " * 60, "refiner=x " * 60)
+    assert image.shape[1] == round(WIDTH_IN * DPI)
 
 
 @pytest.mark.parametrize("after", [0, 1, 2])
 @pytest.mark.parametrize("before", [0, 1])
 def test_clusters_may_be_none_come_and_go(before: int, after: int) -> None:
     frame = two_walls()
-    image = refinement_picture(
-        refined(frame, [box(frame, 5, 9, 0, 30)] * before, [box(frame, 7, 9, 0, 30)] * after), "", ""
-    )
-    assert image.shape[1] == drawing.WIDTH
+    image = picture(refined(frame, [box(frame, 5, 9, 0, 30)] * before, [box(frame, 7, 9, 0, 30)] * after), "", "")
+    assert image.shape[1] == round(WIDTH_IN * DPI)
 
 
 def test_many_clusters_and_parts_fit_on_the_picture() -> None:
     frame = two_walls()
     stripes = [box(frame, k, k + 1, 4, 20) for k in range(30)]
-    few = refinement_picture(refined(frame, stripes[:24], stripes[:24]), "all", "refiner=identity")
-    many = refinement_picture(refined(frame, stripes, [*stripes, *stripes[:3]]), "all", "refiner=split")
+    few = picture(refined(frame, stripes[:24], stripes[:24]), "all", "refiner=identity")
+    many = picture(refined(frame, stripes, [*stripes, *stripes[:3]]), "all", "refiner=split")
     assert many.shape == few.shape, "the table has an end"
 
 
@@ -227,4 +233,4 @@ def test_it_is_written_whole(tmp_path: Path) -> None:
     mask = box(frame, 10, 30, 10, 50)
     write_refinement(tmp_path / "refinement.png", refined(frame, [mask], [mask]), "title", "refiner=identity")
     assert [path.name for path in tmp_path.iterdir()] == ["refinement.png"]
-    assert Image.open(tmp_path / "refinement.png").width == drawing.WIDTH
+    assert Image.open(tmp_path / "refinement.png").width == round(WIDTH_IN * DPI)

@@ -12,8 +12,8 @@ from framework.data import Box
 from framework.reporting.charts import (
     HEIGHT,
     WIDTH,
-    PlottedPath,
     Footprint,
+    PlottedPath,
     box_corners,
     growth,
     position_errors,
