@@ -40,7 +40,7 @@ check: $(INSTALLED_DEV) ## lint, check types, run the unit tests
 
 .PHONY: test
 test: check ## make check, then the integration tests
-	$(PYTEST) -m integration
+	$(PYTEST) -m "integration and not acceptance"
 
 .PHONY: acceptance
 acceptance: $(INSTALLED_DEV) ## measure missing or outdated acceptance lines; LINE=name measures one

@@ -226,7 +226,7 @@ TRACKERS = {
     "Open3D, intensity": lambda first: Open3DSlam(first, 0.01, Method.Intensity),
     "Open3D, hybrid": lambda first: Open3DSlam(first, 0.01, Method.Hybrid),
 }
-ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 15", ("room without noise", "voxel_hashing_icp"): "end <= 2"}
+ACCURACY = {("redkitchen", "voxel_hashing_icp"): "ATE <= 25", ("room without noise", "voxel_hashing_icp"): "end <= 2"}
 
 
 @pytest.mark.parametrize("tracker", TRACKERS)

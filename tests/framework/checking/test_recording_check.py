@@ -92,6 +92,7 @@ def settings(findings: tuple[Finding, ...]) -> list[str]:
     return [finding.setting for finding in findings if finding.verdict is Verdict.FAULT]
 
 
+@pytest.mark.acceptance
 @pytest.mark.parametrize(("name", "damage", "setting"), ELEVEN)
 def test_eleven_damaged_recordings(
     shared_data: Path, tmp_path: Path, name: str, damage: Mapping[str, Any], setting: str
@@ -117,6 +118,7 @@ def test_the_desk_with_one_convention_changed(tmp_path: Path, damage: Mapping[st
     assert " ".join(settings(check(RgbdFolder(place), FARTHEST).findings)) == setting
 
 
+@pytest.mark.acceptance
 def test_the_originals_are_sound(shared_data: Path) -> None:
     originals = shared_data / "originals"
     recordings: list[Recording] = [

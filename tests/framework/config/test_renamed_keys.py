@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 from omegaconf import OmegaConf
 
@@ -10,6 +13,8 @@ from framework.config.renamed_keys import RENAMED, new_name
 from framework.errors import ConfigError
 from framework.interfaces import MapFuser
 from framework.registry import build
+
+CHECKOUT = Path(__file__).resolve().parents[3]
 
 
 @pytest.mark.parametrize(
@@ -34,3 +39,13 @@ def test_configs_contain_no_renamed_key() -> None:
     groups = {group: node for group, node in config.items() if isinstance(node, dict)}
     flat = {*config, *(f"{group}.{key}" for group, node in groups.items() for key in node)}
     assert not flat & RENAMED.keys()
+
+
+def test_docs_contain_no_renamed_key() -> None:
+    pages = [CHECKOUT / "README.md", CHECKOUT / "CONTRIBUTING.md"]
+    pages += [path for folder in ("docs", "examples", "conf") for path in (CHECKOUT / folder).rglob("*.md")]
+    pages += [path for folder in ("examples", "conf") for path in (CHECKOUT / folder).rglob("*.yaml")]
+    names = [re.escape(key) if "." in key else f"{key}=" for key in RENAMED]
+    old = re.compile(rf"(?<![\w.])(?:{'|'.join(names)})(?![\w./-])")
+    found = [f"{path.relative_to(CHECKOUT)}: {m.group()}" for path in pages for m in old.finditer(path.read_text())]
+    assert not found

@@ -155,6 +155,7 @@ def test_each_plugins_own_tests_pass_where_it_is_installed(place: Path) -> None:
     assert "skipped" not in said
 
 
+@pytest.mark.acceptance
 def test_a_plugin_is_swept_beside_one_of_ours_and_both_are_in_the_table(place: Path) -> None:
     (place / "DIR").mkdir()
     option_files.overrides("dataset", "rgbd_folder", place / "DIR")

@@ -73,6 +73,7 @@ def test_a_place_that_is_taken_is_told_before_anything_is_read(
     )
 
 
+@pytest.mark.acceptance
 def test_a_phones_recording_gives_a_map(shared_data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """256x192 depth, a video and ARKit's poses, made of a real kitchen: no fault, no frame lost."""
     kitchen = RgbdFolder(shared_data / "redkitchen", stride=3, stop=180)

@@ -270,6 +270,7 @@ def test_a_second_signal_ends_the_workers_at_once(tmp_path: Path) -> None:
     assert [each["frames"] > 0 for each in partial] == [True, True]
 
 
+@pytest.mark.acceptance
 def test_runs_of_a_killed_sweep_that_still_go_on_are_waited_for(tmp_path: Path) -> None:
     """`kill -9` of the sweep alone leaves its workers to their runs."""
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher")
@@ -308,7 +309,11 @@ def test_two_sweeps_do_not_share_a_place(tmp_path: Path) -> None:
     ("package", "arguments"),
     [
         ("hydra_plugins.hydra_submitit_launcher", ["launcher=submitit_local"]),
-        ("hydra_plugins.hydra_ray_launcher", ["launcher=ray", "hydra.launcher.ray.init.num_cpus=2"]),
+        pytest.param(
+            "hydra_plugins.hydra_ray_launcher",
+            ["launcher=ray", "hydra.launcher.ray.init.num_cpus=2"],
+            marks=pytest.mark.acceptance,
+        ),
     ],
 )
 def test_the_launchers_of_clusters_run_here(tmp_path: Path, package: str, arguments: list[str]) -> None:
