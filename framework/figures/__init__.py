@@ -1,1 +1,1 @@
-"""Run records become the paper's figures."""
+"""Figures of runs, refinements and checked recordings."""

@@ -1,4 +1,4 @@
-"""The picture of a checked recording: what lies on what, and by how much which reading misses."""
+"""Figure of a checked recording: alignment of depth, color and poses, and the error of each pose convention."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from framework.geometry import back_project, project, transform
 
 SIZE_IN, DPI = (15.0, 9.4), 100
 TITLE_PT, TEXT_PT = 10.0, 9.0
-LINE = 180  # letters of a line of findings
+LINE = 180  # characters of a line of findings
 COLORS = {Verdict.FINE: "#1a7f37", Verdict.UNKNOWN: "#787e86", Verdict.NOTE: "#9a6700", Verdict.FAULT: "#cf222e"}
 CHOSEN, OTHER = "#1a7f37", "#b0b6be"
 
 
 def write_check(path: Path, check: RecordingCheck) -> None:
-    """Writes the picture as a PNG, whole or not at all."""
+    """Write the figure as a PNG, atomically."""
     figure = Figure(SIZE_IN, facecolor="white")
     grid = figure.add_gridspec(
         3, 4, height_ratios=(1, 1, 0.75), left=0.02, right=0.98, top=0.9, bottom=0.01, wspace=0.16
     )
     figure.suptitle(check.summary, fontsize=TITLE_PT + 2, x=0.02, ha="left")
     frame = check.pair.first if check.pair is not None else check.frames[len(check.frames) // 2]
-    _image(figure.add_subplot(grid[0, 0]), f"colour of frame {frame.index}", frame.color)
+    _image(figure.add_subplot(grid[0, 0]), f"color of frame {frame.index}", frame.color)
     _depth(figure.add_subplot(grid[0, 1]), frame)
-    _image(figure.add_subplot(grid[0, 2]), "edges of its depth (red) on colour", _edges_on_color(frame))
+    _image(figure.add_subplot(grid[0, 2]), "depth edges (red) on color", _edges_on_color(frame))
     _delays(figure.add_subplot(grid[0, 3]), check)
-    _warped(figure.add_subplot(grid[1, 0]), "as it is read", check.pair, check.poses.given)
+    _warped(figure.add_subplot(grid[1, 0]), "as configured", check.pair, check.poses.given)
     if check.poses.best is not None:
-        _warped(figure.add_subplot(grid[1, 1]), "as it fits best", check.meant, check.poses.best)
+        _warped(figure.add_subplot(grid[1, 1]), "best fit", check.meant, check.poses.best)
     _readings(figure.add_subplot(grid[1, 2:]), check.poses)
     _findings(figure.add_subplot(grid[2, :]), check)
     with written_whole(path) as temporary:
@@ -51,16 +51,14 @@ def write_check(path: Path, check: RecordingCheck) -> None:
 def _image(axes: Axes, title: str, image: UInt8) -> None:
     axes.imshow(image)
     axes.set_title(title, fontsize=TITLE_PT)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set(xticks=[], yticks=[])
 
 
 def _depth(axes: Axes, frame: Frame) -> None:
     shown = axes.imshow(np.ma.masked_equal(frame.depth, 0), cmap="turbo_r")
     axes.set_facecolor("black")
-    axes.set_title("depth, m (black: no reading)", fontsize=TITLE_PT)
-    axes.set_xticks([])
-    axes.set_yticks([])
+    axes.set_title("depth, m (black: missing)", fontsize=TITLE_PT)
+    axes.set(xticks=[], yticks=[])
     assert axes.figure is not None
     axes.figure.colorbar(shown, ax=axes, fraction=0.035, pad=0.02).ax.tick_params(labelsize=TEXT_PT)
 
@@ -74,15 +72,15 @@ def _edges_on_color(frame: Frame) -> UInt8:
 
 
 def _warped(axes: Axes, title: str, pair: MatchedPair | None, fit: PoseFit | None) -> None:
-    """A frame in red, and where its points lie in its neighbour, in cyan: what fits is grey."""
+    """Draw a frame in red and a second frame, warped to it, in cyan: aligned pixels are gray."""
     if pair is None:
-        _say(axes, "no two frames show enough in common")
+        _say(axes, "no pair of frames with enough overlap")
         return
     if fit is None:
-        T_second_first, factor, title = pair.T_second_first, 1.0, "by the images alone"
+        T_second_first, factor, title = pair.T_second_first, 1.0, "from image matches"
     else:
         T_second_first, factor = motion_of(pair, fit.reading), fit.depth_factor
-    title = f"{title}: frame {pair.first.index} red,\n{pair.second.index} moved into it cyan, grey = they fit"
+    title = f"{title}: frame {pair.first.index} red,\n{pair.second.index} warped to it cyan, gray = aligned"
     _image(axes, title, _moved(pair, T_second_first, factor))
 
 
@@ -104,7 +102,7 @@ def _moved(pair: MatchedPair, T_second_first: Float64, factor: float) -> UInt8:
 
 
 def _readings(axes: Axes, poses: PoseJudgement) -> None:
-    """How far each reading of the poses leaves points from where they belong."""
+    """Draw the reprojection error of each pose convention."""
     if poses.best is None or not poses.others:
         _say(axes, f"poses: {poses.findings[0].text}")
         return
@@ -117,33 +115,32 @@ def _readings(axes: Axes, poses: PoseJudgement) -> None:
     axes.set_yticks([])
     axes.invert_yaxis()
     axes.tick_params(axis="x", labelsize=TEXT_PT)
-    axes.set_title("how far each reading of the poses leaves points from where they belong, px", fontsize=TITLE_PT)
+    axes.set_title("reprojection error of each pose convention, px", fontsize=TITLE_PT)
 
 
 def _delays(axes: Axes, check: RecordingCheck) -> None:
-    """How well depth edges lie on colour edges, by which frame's depth is taken."""
+    """Draw the agreement of depth and color edges by delay."""
     if not check.by_delay:
-        _say(axes, "too few edges to compare colour and depth")
+        _say(axes, "too few edges to compare color and depth")
         return
-    best = max(agreement.strength for agreement in check.by_delay)
     delays = [agreement.delay for agreement in check.by_delay]
     strengths = [agreement.strength for agreement in check.by_delay]
+    best = max(strengths)
     axes.bar(delays, strengths, color=[CHOSEN if strength == best else OTHER for strength in strengths])
     axes.set_xticks(delays)
     axes.tick_params(labelsize=TEXT_PT)
     axes.set_ylim(0, 1.1 * max(best, 1e-3))
-    axes.set_title("how well the depth so many frames\nlater fits to colour", fontsize=TITLE_PT)
+    axes.set_title("agreement of color and depth edges,\nby delay of depth in frames", fontsize=TITLE_PT)
 
 
 def _findings(axes: Axes, check: RecordingCheck) -> None:
     axes.axis("off")
-    place = 1.0
+    y = 1.0
     for finding in check.findings:
         lines = textwrap.wrap(str(finding), LINE, subsequent_indent=" " * 7)
-        axes.text(
-            0, place, "\n".join(lines), color=COLORS[finding.verdict], fontsize=TEXT_PT, va="top", family="monospace"
-        )
-        place -= 0.1 * len(lines) + 0.02
+        color = COLORS[finding.verdict]
+        axes.text(0, y, "\n".join(lines), color=color, fontsize=TEXT_PT, va="top", family="monospace")
+        y -= 0.1 * len(lines) + 0.02
 
 
 def _say(axes: Axes, text: str) -> None:

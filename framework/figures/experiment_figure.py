@@ -1,4 +1,4 @@
-"""The picture of an experiment, from the records of its runs to PNG and PDF."""
+"""Figure of an experiment, from its runs to PNG and PDF."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from framework.runs.sweep_file import SWEEP
 from framework.runs.timings_file import StageTimes, read_timings
 from framework.tables.table_notes import counted, machine
 
-NAME = "figure"  # of the files, and of the block in the experiment's config
+NAME = "figure"  # of the files, and of the config block
 
 log = logging.getLogger(__name__)
 
@@ -34,30 +34,29 @@ Read = TypeVar("Read")
 
 
 def write_figure(directory: Path) -> list[Path]:
-    """Writes figure.png and figure.pdf into `directory`, from the records below it; returns their paths.
+    """Write figure.png and figure.pdf into `directory`, from the runs below it, and return their paths.
 
-    Runs that are not complete, or cannot be read, are named in the log and left out. Raises DataError when there is
-    nothing to draw.
+    Incomplete or unreadable runs are logged and omitted. Raises DataError if nothing is left.
     """
     pictured = Pictured.below(directory)
     if missing := list(pictured.missing()):
-        log.warning("not in the picture: %s", "; ".join(missing))
+        log.warning("not in the figure: %s", "; ".join(missing))
     return DRAWN[pictured.choice.kind](pictured).write(directory / NAME)
 
 
 @dataclass(frozen=True)
 class Pictured:
-    """The runs that a picture shows."""
+    """The runs of a figure."""
 
     choice: FigureChoice
-    rows: Mapping[str, RunRow | None]  # by what it is called; None = no run of it is complete
+    rows: Mapping[str, RunRow | None]  # by display name; None = no complete run
     incomplete: Sequence[Incomplete]
 
     @classmethod
     def below(cls, directory: Path) -> Pictured:
-        """From the records at and below `directory`, as the experiment that ran there says.
+        """Read the runs in and below `directory`, according to the sweep's config.
 
-        Raises DataError when it has no picture or no run is complete, ConfigError when its picture is nonsense.
+        Raises DataError for a sweep without figure or complete runs, ConfigError for an invalid figure.
         """
         if not directory.is_dir():
             raise DataError(f"{directory} is not a folder with records of runs")
@@ -86,7 +85,7 @@ class Pictured:
 
     @property
     def runs(self) -> list[Run]:
-        """All that a row has, by sequence."""
+        """All runs of the rows, by sequence."""
         found = {run for row in self.rows.values() if row for run in row.records}
         return sorted(found, key=lambda run: natural(run[::-1]))
 
@@ -95,12 +94,12 @@ class Pictured:
         return [record for row in self.rows.values() if row for record in row.records.values()]
 
     def called(self, run: Run) -> str:
-        """The sequence, and the seed where there are several."""
+        """Return the sequence, and the seed if there are several."""
         seeds = {other[0] for other in self.runs}
         return run[-1] if len(run) == 1 or len(seeds) == 1 else f"{run[-1]}, seed {run[0]}"
 
     def missing(self) -> Iterator[str]:
-        """The runs that are not complete, and why; and those that only other rows have."""
+        """Yield incomplete runs with their reason, and the runs that a row lacks."""
         for one in self.incomplete:
             yield f"{one.directory.name}: {one.reason}"
         for name, row in self.rows.items():
@@ -117,17 +116,17 @@ def _stage_times(pictured: Pictured) -> Page:
     counts = "/".join(map(str, dict.fromkeys(one.count for one in shown)))
     sequences = [pictured.called(run) for run in pictured.runs if any(run in times for times in read.values())]
     note = (
-        f"Mean of {counts} sequences ({', '.join(sequences)}), of running medians over {WINDOW} frames; bands: from "
-        f"the fastest sequence to the slowest. Right: median over all frames, and × the median of the last third of "
-        f"the frames by that of the first."
+        f"Mean of {counts} sequences ({', '.join(sequences)}) of running medians over {WINDOW} frames; bands: fastest "
+        f"to slowest sequence. Right: median over all frames, and × the median of the last third of the frames divided "
+        f"by that of the first third."
     )
     if any(one.longest > one.frames[-1] for one in shown):
-        note += " Lines end where the shortest sequence does."
+        note += " Lines end with the shortest sequence."
     return stage_times_figure(means, f"{note} {_origin(pictured.records)}")
 
 
 def _times_of(row: RunRow | None) -> dict[Run, StageTimes]:
-    """Of the runs that can be read."""
+    """Return the times of the readable runs."""
     records = row.records if row else {}
     read = {run: _if_readable(_times, record) for run, record in records.items()}
     return {run: times for run, times in read.items() if times is not None}
@@ -153,11 +152,11 @@ def _maps(pictured: Pictured) -> Page:
     if not lines:
         raise DataError("no map can be read; the log says why")
     note = (
-        "An object has one colour in all pictures of a line. Dark: it is no true object, or too little of one. "
+        "An object has the same color in all pictures of a line. Dark: no match with a true object. "
         "Beige: a true object of unknown class, which is not evaluated."
     )
     if any(record.annotation for record in pictured.records):
-        note += f" Annotation: {counted(record.annotation or 'not told' for record in pictured.records)}."
+        note += f" Annotation: {counted(record.annotation or 'unknown' for record in pictured.records)}."
     return map_figure(heads, lines, f"{note} {_origin(pictured.records)}")
 
 
@@ -179,11 +178,11 @@ def _caption(stored: StoredMap | None) -> str:
 
 
 def _if_readable(read: Callable[[Record], Read], record: Record) -> Read | None:
-    """None, with the reason in the log, where the record's files, or its dataset's, cannot be read."""
+    """Return None, and log the reason, if files of the run or its dataset cannot be read."""
     try:
         return read(record)
     except InstanceMapError as error:
-        log.warning("not in the picture: %s", error)
+        log.warning("not in the figure: %s", error)
         return None
 
 

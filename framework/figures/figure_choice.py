@@ -1,4 +1,4 @@
-"""What the picture of an experiment shows: the block `figure` of its config."""
+"""The block `figure` of an experiment's config."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ KINDS = ("stage_times", "maps")
 
 @dataclass(frozen=True)
 class FigureChoice:
-    """A picture of an experiment's runs.
+    """A figure of an experiment's runs.
 
-    `stage_times` shows how long the stages took over the frames, averaged over sequences, one diagram for each row.
-    `maps` shows the maps of each sequence side by side, a column for each row, and the true instances beside them.
+    `stage_times` shows the stage times over the frames, averaged over sequences, in one diagram for each row.
+    `maps` shows the maps of each sequence, in a column for each row, next to the ground truth.
     """
 
     kind: str = "maps"  # one of KINDS
-    sequences: str = "dataset.scene"  # key of the config that tells the sequences apart
-    names: dict[str, str] = field(default_factory=dict)  # what rows are called in the picture; others go by their name
-    zoom: bool = False  # of `maps`: whether the place where the columns differ most is shown below, larger
+    sequences: str = "dataset.scene"  # config key that identifies the sequence
+    names: dict[str, str] = field(default_factory=dict)  # display names of rows
+    zoom: bool = False  # of `maps`: also show the window in which the columns differ most
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -33,14 +33,14 @@ class FigureChoice:
 
     @classmethod
     def of(cls, node: Any) -> FigureChoice:
-        """What a config's `figure` describes. Raises ConfigError for keys and types that it does not have."""
+        """Build from a config block. Raises ConfigError for unknown keys and wrong types."""
         return cls(**checked_block(cls, "figure", node))
 
     def called(self, row: RunRow) -> str:
-        """What a row is called in the picture."""
+        """Return the display name of a row."""
         return ", ".join([self.names.get(row.system, row.system), *row.variant])
 
     @property
     def over(self) -> list[str]:
-        """The keys in which the runs of one row differ."""
+        """Config keys in which the runs of one row differ."""
         return list(dict.fromkeys(("seed", self.sequences)))

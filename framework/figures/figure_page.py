@@ -1,4 +1,4 @@
-"""A page for a printed figure: places in millimetres, letters in points, small type below, and the two files."""
+"""A page for a printed figure, with a note at the bottom, written as PNG and PDF."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from framework.data import Int32
 from framework.files.atomic_write import written_whole
 from framework.rendering.labels import place_labels
 
-COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of a journal's column, and of two
+COLUMN_MM, PAGE_MM = 88.0, 181.0  # widths of one and two columns of a journal
 TEXT_PT, SMALL_PT, NOTE_PT = 7.0, 6.0, 5.0
 INK, FAINT_INK = "#20242a", "#787e86"
 INCH_MM = 25.4
 PNG_DPI = 200
-PDF_DPI = 300  # of the rasters in it
-NOTE_LINE_MM = 2.35  # from one line of small type to the next
+PDF_DPI = 300  # of raster images
+NOTE_LINE_MM = 2.35  # line spacing of the note
 MARGIN_MM = 1.0
-HINTED = 1.03  # letters in a PNG are up to so much wider than their outlines: each begins at a whole pixel
+HINTED = 1.03  # maximum ratio of the width of text in a PNG to its outlines, because of hinting
 
-logging.getLogger("fontTools").setLevel(logging.WARNING)  # it tells a hundred lines about each font in a PDF
+logging.getLogger("fontTools").setLevel(logging.WARNING)  # it logs a hundred lines about each font in a PDF
 
 
 class Page:
-    """A white page with a note at its foot. Places are mm from the lower left corner of what is above the note."""
+    """A white page with a note at the bottom. Coordinates: mm from the lower left corner of the area above the note."""
 
     def __init__(self, width: float, height: float, note: str) -> None:
         lines = _wrapped(note, (width - 2 * MARGIN_MM) / HINTED)
@@ -42,24 +42,22 @@ class Page:
         self.text(MARGIN_MM, MARGIN_MM - self._foot, "\n".join(lines), fontsize=NOTE_PT, color=FAINT_INK, va="bottom")
 
     def axes(self, left: float, bottom: float, width: float, height: float) -> Axes:
-        """Axes without ticks, in a thin frame."""
+        """Add axes without ticks, in a thin frame."""
         x, y = self._share(left, bottom)
         axes = self.figure.add_axes((x, y, width / self._size[0], height / self._size[1]))
-        axes.set_xticks([])
-        axes.set_yticks([])
-        for side in axes.spines.values():
-            side.set(color=FAINT_INK, linewidth=0.3)
+        axes.set(xticks=[], yticks=[])
+        axes.spines[:].set(color=FAINT_INK, linewidth=0.3)
         return axes
 
     def text(self, x: float, y: float, text: str, **style: Any) -> None:
         self.figure.text(*self._share(x, y), text, **style)
 
     def write(self, path: Path) -> list[Path]:
-        """Writes the page as `path`.png and `path`.pdf, and returns these; the same page gives the same bytes."""
+        """Write `path`.png and `path`.pdf and return their paths. The bytes are deterministic."""
         png, pdf = path.with_suffix(".png"), path.with_suffix(".pdf")
         with written_whole(png) as temporary:
             self.figure.savefig(temporary, dpi=PNG_DPI)
-        with written_whole(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # letters that can be searched
+        with written_whole(pdf) as temporary, rc_context({"pdf.fonttype": 42}):  # searchable text
             self.figure.savefig(temporary, dpi=PDF_DPI, metadata={"CreationDate": None})
         return [png, pdf]
 
@@ -68,13 +66,13 @@ class Page:
 
 
 def text_width(text: str, size: float) -> float:
-    """How wide a text of this size, pt, is printed, mm."""
+    """Return the printed width, mm, of a text of this size, pt."""
     width, _, _ = text_to_path.get_text_width_height_descent(text, FontProperties(size=size), ismath=False)
     return float(width) / 72 * INCH_MM
 
 
 def _wrapped(text: str, width: float) -> list[str]:
-    """The lines of small type, mm wide at most, that hold the text."""
+    """Wrap the note into lines of at most `width` mm."""
     lines: list[str] = []
     for word in text.split():
         longer = f"{lines[-1]} {word}" if lines else word
@@ -107,5 +105,5 @@ def draw_names(axes: Axes, ids: Int32, names: Mapping[int, str], size: float, wi
 
 
 def say_inside(axes: Axes, text: str) -> None:
-    """Writes why there is nothing else in the axes."""
+    """Write a message into empty axes."""
     axes.text(0.5, 0.5, text, transform=axes.transAxes, ha="center", va="center", fontsize=TEXT_PT, color=FAINT_INK)

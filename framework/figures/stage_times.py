@@ -1,4 +1,4 @@
-"""The paper's Figure 3: how long each stage takes over the frames of a sequence, averaged over sequences."""
+"""Stage times over the frames of a sequence, averaged over sequences (Figure 3 of the paper)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from framework.data import Float64, Int64
 from framework.figures.figure_page import COLUMN_MM, FAINT_INK, INK, NOTE_PT, SMALL_PT, TEXT_PT, Page, say_inside
 from framework.runs.timings_file import StageTimes
 
-WINDOW = 9  # frames, of the running median: single slow frames, such as the first, are no trend
+WINDOW = 9  # frames, of the running median
 SUM = "sum"
 COLORS = {
     "detect": "#0072b2",
@@ -27,32 +27,32 @@ COLORS = {
     "fuse": "#b5830a",
     SUM: "#20242a",
 }
-"""By stage, in the order of the pipeline; colours that the colour-blind tell apart, too."""
+"""By stage, in the order of the pipeline; suitable for color-blind readers."""
 
 STAGES = tuple(stage for stage in COLORS if stage != SUM)
 RATES = {1000 / 30: "30 Hz", 100.0: "10 Hz"}  # ms a frame
-PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights, of one row's diagram, its heading and what is below its axis
-LEFT_MM, RIGHT_MM = 9.5, 27.5  # beside the diagram
+PLOT_MM, HEAD_MM, AXIS_MM = 48.0, 5.0, 6.5  # heights of a diagram, its heading and its axis labels
+LEFT_MM, RIGHT_MM = 9.5, 27.5  # left and right of the diagram
 PLOT_WIDTH_MM = COLUMN_MM - LEFT_MM - RIGHT_MM
-LABEL_PLACES_MM = (2.2, 2.8, 20.0, 27.0)  # right of the diagram: the end of the line, the stage, its median, its growth
-LABEL_MM = 2.9  # from one label's line to the next
-LOWEST_MS = 0.1  # what is shorter is drawn as long
+LABEL_PLACES_MM = (2.2, 2.8, 20.0, 27.0)  # right of the diagram: line end, stage, median, growth
+LABEL_MM = 2.9  # line spacing of the labels
+LOWEST_MS = 0.1  # shorter times are drawn with this value
 
 
 @dataclass(frozen=True)
 class MeanTimes:
-    """The times of several sequences, smoothed, as far as the shortest of them goes."""
+    """The smoothed times of several sequences, up to the end of the shortest one."""
 
-    frames: Int64  # (G,) numbers of the video's frames
-    mean: Mapping[str, Float64]  # by stage, and SUM: (G,) ms, NaN where no sequence knows it
-    lowest: Mapping[str, Float64]  # the same of the sequence that was fastest there
-    highest: Mapping[str, Float64]  # and of the slowest
+    frames: Int64  # (G,) frame numbers
+    mean: Mapping[str, Float64]  # by stage, and SUM: (G,) ms, NaN = unknown
+    lowest: Mapping[str, Float64]  # of the fastest sequence at each frame
+    highest: Mapping[str, Float64]  # of the slowest sequence at each frame
     count: int  # sequences
     longest: int  # the last frame of the longest sequence
 
     @classmethod
     def of(cls, runs: Sequence[StageTimes]) -> MeanTimes:
-        """Of one run or more, each with a frame or more."""
+        """Average one or more runs, each with at least one frame."""
         end = min(int(run.frames[-1]) for run in runs)
         frames = np.unique(np.concatenate([run.frames[run.frames <= end] for run in runs]))
         mean, lowest, highest = {}, {}, {}
@@ -70,11 +70,11 @@ class MeanTimes:
 
     @property
     def stages(self) -> list[str]:
-        """Those that took some time."""
+        """Stages with known times."""
         return [stage for stage, values in self.mean.items() if np.isfinite(values).any()]
 
     def growth(self, stage: str) -> float:
-        """The median over the last third of the frames by that over the first; NaN where either is not known."""
+        """Return the ratio of the medians over the last and the first third of the frames, NaN if unknown."""
         third = max(1, len(self.frames) // 3)
         first, last = self.mean[stage][:third], self.mean[stage][-third:]
         if not np.isfinite(first).any() or not np.isfinite(last).any():
@@ -83,10 +83,7 @@ class MeanTimes:
 
 
 def running_median(values: Float64, window: int) -> Float64:
-    """(F,) the median of the `window` (odd) values around each of `values` (F,), of fewer at the ends.
-
-    NaN are left out, and stay.
-    """
+    """Return the median (F,) of the `window` (odd) values around each value, fewer at the ends. NaN values stay NaN."""
     half = window // 2
     around = np.lib.stride_tricks.sliding_window_view(np.pad(values, half, constant_values=np.nan), window)
     with warnings.catch_warnings():
@@ -96,10 +93,7 @@ def running_median(values: Float64, window: int) -> Float64:
 
 
 def spread(positions: Sequence[float], gap: float) -> list[float]:
-    """The positions moved apart, as little as can be, until neighbours are `gap` or more from each other.
-
-    Least squares: those that would touch become a group, evenly spaced about its own mean, as often as groups touch.
-    """
+    """Move positions apart until neighbors have a distance of at least `gap`, with the least squared displacement."""
     order = np.argsort(positions, kind="stable")
     steps = gap * np.arange(len(order))
     result = np.empty(len(order))
@@ -108,7 +102,7 @@ def spread(positions: Sequence[float], gap: float) -> list[float]:
 
 
 def stage_times_figure(rows: Mapping[str, MeanTimes | None], note: str) -> Page:
-    """One diagram for each row, below each other; None = it has no run. `note` stands below in small type."""
+    """Draw one diagram for each row, None = no run. `note` is the small print."""
     step = HEAD_MM + PLOT_MM + AXIS_MM
     page = Page(COLUMN_MM, step * len(rows), note)
     for k, (name, times) in enumerate(rows.items(), start=1):
@@ -157,7 +151,7 @@ def _draw(axes: Axes, times: MeanTimes) -> None:
 
 
 def _draw_labels(axes: Axes, times: MeanTimes) -> None:
-    """At the right ends of the lines: the stage, its median and its growth."""
+    """Draw the stage, its median and its growth at the right end of each line."""
     low, high = np.log10(axes.get_ylim())
     ends = [np.maximum(times.mean[stage][np.isfinite(times.mean[stage])][-1], LOWEST_MS) for stage in times.stages]
     heights = [float((np.log10(end) - low) / (high - low)) for end in ends]  # as shares of the diagram

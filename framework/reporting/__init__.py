@@ -1,1 +1,1 @@
-"""What a run left behind as one page for the browser: the map to turn, its objects, and how well they were found."""
+"""Reports: self-contained HTML pages with an interactive map, its objects, and their evaluation."""

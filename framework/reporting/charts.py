@@ -105,8 +105,8 @@ def top_view(
     up: Float64,
     height: float = HEIGHT,
 ) -> tuple[str, float]:
-    """Return the paths from above (true ones dashed) with the objects, and the size of the paths relative to WIDTH."""
-    space = height - FOOT
+    """Draw the paths from above (true ones dashed) with the objects. Also return the size of the paths by the width."""
+    plot_height = height - FOOT
     plane = _horizontal(paths[0].positions, up)
     shown = np.concatenate([path.positions for path in paths] + list(true_paths)) @ plane.T
     low, high = shown.min(axis=0), shown.max(axis=0)
@@ -114,34 +114,34 @@ def top_view(
     if objects:
         corners = np.concatenate([one.corners_world for one in objects]) @ plane.T
         low, high = np.minimum(low, corners.min(axis=0)), np.maximum(high, corners.max(axis=0))
-    center, size = (low + high) / 2, (high - low) * (1 + 2 * MARGIN)
-    scale = min(WIDTH / max(size[0], MIN_EXTENT_M * WIDTH / space), space / max(size[1], MIN_EXTENT_M))
-
-    def pixels(points_world: Float64) -> Float64:
-        return np.asarray((points_world @ plane.T - center) * scale * [1, -1] + [WIDTH / 2, space / 2])
+    size = (high - low) * (1 + 2 * MARGIN)
+    px = max(size[0] / WIDTH, max(size[1], MIN_EXTENT_M) / plot_height)  # m
+    left, bottom = (low + high) / 2 - px * np.array([WIDTH, plot_height]) / 2
 
     figure = Figure((WIDTH / 72, height / 72), dpi=72, facecolor="none")
-    axes = figure.add_axes((0, 0, 1, 1), xlim=(0, WIDTH), ylim=(height, 0))
+    limits: dict[str, Any] = {"xlim": (left, left + px * WIDTH), "ylim": (bottom, bottom + px * plot_height)}
+    axes = figure.add_axes((0, FOOT / height, 1, plot_height / height), **limits)
     axes.axis("off")
     titles = {}
     for k, one in enumerate(objects):
-        if _draw_footprint(axes, one, pixels(one.corners_world), f"chart-object-{k}"):
+        if _draw_footprint(axes, one, one.corners_world @ plane.T, px, f"chart-object-{k}"):
             titles[f"chart-object-{k}"] = one.name
     for positions in true_paths:
-        axes.plot(*pixels(positions).T, color=COLORS["truth"], linewidth=2, dashes=(2.5, 2.5), gid="chart-true")
+        line = (positions @ plane.T).T
+        axes.plot(*line, color=COLORS["truth"], linewidth=2, dashes=(2.5, 2.5), gid="chart-true")
     for path in paths:
-        points, color = pixels(path.positions), COLORS[path.color]
+        points, color = path.positions @ plane.T, COLORS[path.color]
         axes.plot(*points.T, color=color, linewidth=path.width, gid="chart-path", solid_capstyle="round")
-        dot: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": DOT_PX, "markeredgecolor": color}
         lost = points[list(path.lost_after)]
-        axes.plot(*lost.T, color=COLORS["bad"], linestyle="none", marker="o", markersize=8, gid="chart-lost")
-        axes.plot(*points[:1].T, **dot, color=COLORS["card"], markeredgewidth=2.5)
-        axes.plot(*points[-1:].T, **dot, color=color)
-    length = round_length(0.12 * WIDTH / scale)
+        axes.plot(*lost.T, "o", color=COLORS["bad"], markersize=8, gid="chart-lost")
+        for point, fill in ((points[0], COLORS["card"]), (points[-1], color)):
+            axes.plot(*point, "o", color=fill, markersize=DOT_PX, markeredgecolor=color, markeredgewidth=2.5)
+    length = round_length(0.12 * WIDTH * px)
     label = f"{length:g} m" if length >= 1 else f"{100 * length:g} cm"
-    axes.plot([16, 16 + length * scale], [height - 8] * 2, color=COLORS["ink"], linewidth=2)
-    axes.text(16, height - 16, label, color=COLORS["faint"], fontsize=TEXT_PX)
-    return _svg(figure, "Camera path, top view", titles), path_size * scale / WIDTH
+    x, y = left + 16 * px, bottom - 28 * px
+    axes.plot([x, x + length], [y, y], color=COLORS["ink"], linewidth=2, clip_on=False)
+    axes.text(x, y + 8 * px, label, color=COLORS["faint"], fontsize=TEXT_PX)
+    return _svg(figure, "Camera path, top view", titles), path_size / (px * WIDTH)
 
 
 def position_errors(frames: Sequence[int], errors: Float64, height: float = FLAT_HEIGHT) -> str:
@@ -159,9 +159,8 @@ def stage_areas(times: StageTimes) -> str:
     layers = [np.nan_to_num(running_median(times.milliseconds[stage], WINDOW))[chosen] for stage in stages]
     figure, axes = _chart(TIMES_HEIGHT, times.frames[0], times.frames[-1], "Stacked stage times, ms")
     if layers:
-        for stage, area in zip(
-            stages, axes.stackplot(times.frames[chosen], layers, colors=[COLORS[s] for s in stages]), strict=True
-        ):
+        areas = axes.stackplot(times.frames[chosen], layers, colors=[COLORS[stage] for stage in stages])
+        for stage, area in zip(stages, areas, strict=True):
             area.set_gid(f"chart-stage-{stage}")
         axes.set_ylim(0, max(float(np.percentile(np.sum(layers, axis=0), 98)) * 1.2, 1e-3))
     return _svg(figure, "Stage times over the frames")
@@ -182,8 +181,7 @@ def growth(frames: Sequence[int], fraction: Float64, first_frames: Sequence[int]
     axes.set_ylim(0, 100)
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:.0f}%"))
     counts = axes.twinx()
-    for side in counts.spines.values():
-        side.set_visible(False)
+    counts.spines[:].set_visible(False)
     ordered = sorted(first_frames)
     steps = [first, *ordered, last], [0, *range(1, len(ordered) + 1), len(ordered)]
     counts.step(*steps, where="post", color=COLORS["accent"], linewidth=2, gid="chart-objects")
@@ -225,13 +223,14 @@ def _horizontal(positions: Float64, up: Float64) -> Float64:
     return np.asarray(np.stack([right, [-right[1], right[0]]]) @ level)
 
 
-def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, gid: str) -> bool:
+def _draw_footprint(axes: Axes, one: Footprint, corners: Float64, px: float, gid: str) -> bool:
+    """Return whether the object at `corners` (8, 2) m has an area; `px` is the size of a pixel, m."""
     try:
         outline = corners[ConvexHull(corners).vertices]
-    except QhullError:  # an object that is a line from above
+    except QhullError:  # a line from above
         return False
     axes.fill(*outline.T, facecolor=(one.color, 0.22), edgecolor=(one.color, 0.7), linewidth=1, gid=gid)
-    if np.ptp(outline[:, 0]) > LABEL_WIDTH_PX:
+    if np.ptp(outline[:, 0]) > LABEL_WIDTH_PX * px:
         name = one.name.encode("utf-8", "backslashreplace").decode()
         x, y = outline.mean(axis=0).tolist()
         style: dict[str, Any] = {"ha": "center", "va": "center", "color": COLORS["faint"], "fontsize": TEXT_PX}

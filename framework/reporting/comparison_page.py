@@ -1,4 +1,4 @@
-"""The page that sets several runs side by side."""
+"""Comparison page of several runs."""
 
 from __future__ import annotations
 
@@ -16,26 +16,25 @@ from framework.reporting.charts import RUN_COLORS, RUN_WIDTHS, PlottedPath, stag
 from framework.reporting.map_scene import MapScene
 from framework.reporting.markup import page
 from framework.reporting.run_contents import RunContents
-from framework.reporting.run_page import lost_after
-from framework.reporting.source_frames import Footage
+from framework.reporting.run_source import Footage
 from framework.reporting.visibility import NOT_CAMERA
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
 from framework.runs.stored_runs import is_number
 
-MOST_MAPS = 6  # runs whose maps are in the page: they share what one map may have
+MOST_MAPS = 6  # runs with a map in the page; the size limit of one map applies to all of them together
 
 
 @dataclass(frozen=True)
 class Row:
-    """A figure of several runs."""
+    """A metric of several runs."""
 
     key: str  # of metrics.json
     name: str
     unit: str
     digits: int
     scale: float = 1.0
-    better: int = 0  # 1 = more is better, -1 = less is
+    better: int = 0  # 1 = higher is better, -1 = lower is better
 
 
 ROWS = (
@@ -90,19 +89,19 @@ class Table:
 
 @dataclass(frozen=True)
 class Comparison:
-    """N runs, the first of which the others are compared with."""
+    """N runs that are compared with the first one."""
 
     runs: Sequence[RunContents]
-    names: Sequence[str]  # short, each another one
-    links: Sequence[str]  # to the page of each run, "" = it has none
+    names: Sequence[str]  # unique
+    links: Sequence[str]  # to the page of each run, "" = none
     scenes: Sequence[MapScene | None]  # of the first MOST_MAPS
 
     @classmethod
     def of(cls, runs: Sequence[RunContents], links: Sequence[str]) -> Comparison:
-        """Decimates the maps, so that all of them together are as light as that of one run."""
+        """Decimate the maps so that together they are as large as the map of one run."""
         mapped = runs[:MOST_MAPS]
-        nothing = Footage(NOT_CAMERA, {}, {}, {}, {})
-        scenes = [MapScene.of(run, nothing, 1 / len(mapped)) for run in mapped]
+        no_footage = Footage(NOT_CAMERA, {}, {}, {}, {})
+        scenes = [MapScene.of(run, no_footage, 1 / len(mapped)) for run in mapped]
         return cls(runs, short_names([run.record.directory for run in runs]), links, scenes)
 
     def html(self) -> str:
@@ -183,7 +182,7 @@ class Comparison:
         paths = []
         for k in chosen:
             color, width = styles[k % len(styles)]
-            paths.append(PlottedPath(self.runs[k].poses[:, :3, 3], lost_after(self.runs[k]), color, width))
+            paths.append(PlottedPath(self.runs[k].poses[:, :3, 3], self.runs[k].lost_after, color, width))
         up = self.runs[chosen[0]].up
         picture, _ = top_view(paths, [], [], np.array([0.0, 0.0, 1.0]) if up is None else up)
         return {"paths": picture, "path_names": [(k, self.names[k]) for k in chosen]}
@@ -218,14 +217,14 @@ def compared(values: Sequence[float | None], digits: int, better: int) -> list[C
 
 
 def short_names(directories: Sequence[Path]) -> list[str]:
-    """What tells the directories apart: their paths below the folder that they are all in."""
+    """Return the paths of the directories relative to their common parent."""
     resolved = [path.resolve() for path in directories]
     common = Path(os.path.commonpath([path.parent for path in resolved]))
     return [str(path.relative_to(common)) for path in resolved]
 
 
 def _target(node: Any) -> str:
-    """The name of a plugin's class."""
+    """Return the class name of a plugin."""
     return str(node.get("_target_")).rpartition(".")[2] if isinstance(node, dict) else ""
 
 

@@ -1,4 +1,4 @@
-"""A run's map as it is shown: light, with colours for its objects and a place to look at it from."""
+"""The map of a run in the viewer: decimated, with colors for its objects and an initial view."""
 
 from __future__ import annotations
 
@@ -9,36 +9,51 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from PIL import Image
 
 from framework.data import Camera, Float64, InstanceMesh, Int32, UInt8
 from framework.exporting.decimation import with_finer_objects
+from framework.rendering.lit_view import LitView
 from framework.rendering.palette import class_colors, object_colors
 from framework.rendering.surface import Surface
 from framework.rendering.viewpoint import FIELD_OF_VIEW_RAD, best_view, upward
+from framework.reporting.pictures import webp_url
 from framework.reporting.run_contents import RunContents
+from framework.reporting.run_source import Footage
 from framework.reporting.scene_glb import MOST_BYTES, MOST_TRIANGLES, light_enough, scene_glb
-from framework.reporting.source_frames import Footage
 from framework.reporting.visibility import Sightings, sightings, spread_out
 from framework.runs.instances_file import StoredInstance
 from framework.runs.run_directory import LIKELY
 
-VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, whose proportions the first view is chosen for
-PATH_POINTS = 400  # of the camera's way
+VIEW_WIDTH, VIEW_HEIGHT = 960, 640  # px, aspect ratio of the initial view
+PATH_POINTS = 400  # of the camera path
+PROGRESS_PICTURES = 4  # at equal intervals; the last one shows the whole map
+PROGRESS_SCALE = 0.5  # of their size, relative to the initial view
+PROGRESS_QUALITY = 80  # of WebP
+
+
+@dataclass(frozen=True)
+class ProgressPicture:
+    """The part of the final map that was visible up to a frame."""
+
+    url: str  # data:
+    frame: int
+    fraction: float  # of the surface
 
 
 @dataclass(frozen=True)
 class MapScene:
-    """What the viewer shows of one run."""
+    """The map of one run in the viewer."""
 
     contents: RunContents
-    mesh: InstanceMesh  # light, wound so that it shows its front to where the camera was
-    surface: Surface  # the same
+    mesh: InstanceMesh  # decimated; its front faces the cameras
+    surface: Surface  # of the mesh
     sightings: Sightings
     up: Float64  # (3,)
 
     @classmethod
     def of(cls, contents: RunContents, footage: Footage, share: float = 1.0) -> MapScene | None:
-        """None where nothing was mapped. `share` of the triangles and bytes that a file may have is for this one."""
+        """Decimate the map, to `share` of the maximum triangles and bytes. Return None for an empty map."""
         if contents.mesh is None or not len(contents.poses):
             return None
         mesh = replace(contents.mesh, instance_ids=contents.instance_ids(contents.mesh))
@@ -53,7 +68,7 @@ class MapScene:
         return cls(contents, mesh, surface, seen, up)
 
     def glb(self) -> str:
-        """The map as GLB, compressed by gzip, in base64: the same for the same record."""
+        """Return the map as GLB, compressed by gzip, in base64. The result is deterministic."""
         steps = max(1, len(self.sightings.chosen))
         names = {one.id: one.class_name for one in self.contents.objects}
         content = scene_glb(self.mesh, (self.sightings.first_seen / steps).astype(np.float32), names, self.up)
@@ -61,23 +76,23 @@ class MapScene:
 
     @property
     def likely_labels(self) -> Int32:
-        """(V,) 1 + the place among the likely objects of the one that a vertex is of, 0 = of none."""
+        """For each vertex (V,) the index of its likely object, from 1; 0 = none."""
         likely = np.array([0, *likely_ids(self.contents)])
-        places = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
-        return np.where(likely[places] == self.mesh.instance_ids, places, 0).astype(np.int32)
+        indices = np.minimum(np.searchsorted(likely, self.mesh.instance_ids), len(likely) - 1)
+        return np.where(likely[indices] == self.mesh.instance_ids, indices, 0).astype(np.int32)
 
     @cached_property
     def view(self) -> tuple[Camera, Float64]:
-        """From where the map is looked at first: a camera and its T_world_camera."""
+        """The initial view: a camera and its T_world_camera."""
         return best_view(self.surface, self.likely_labels, self.contents.poses, VIEW_WIDTH, VIEW_HEIGHT)
 
     def data(self) -> dict[str, Any]:
-        """What the viewer's script needs beside the GLB."""
+        """Return what the viewer's script needs besides the GLB."""
         poses = self.contents.poses
         _, T_world_camera = self.view
         eye, forward = T_world_camera[:3, 3], T_world_camera[:3, 2]
         distance = float(np.median((self.mesh.vertices - eye) @ forward))
-        numbers = self.contents.tracked_frames or tuple(range(len(poses)))
+        numbers = self.contents.frame_numbers
         objects = self.contents.objects
         colors, of_class = colors_by_id(objects), class_colors([(one.class_name, one.confidence) for one in objects])
         return {
@@ -99,21 +114,41 @@ class MapScene:
             ],
         }
 
+    def progress_pictures(self) -> list[ProgressPicture]:
+        """Render the visible instances at some frames from the initial view. Short runs have no pictures."""
+        steps = len(self.sightings.chosen)
+        if steps < PROGRESS_PICTURES:
+            return []
+        camera, T_world_camera = self.view
+        color_of = colors_by_id(self.contents.objects)
+        colors = {index: color_of[key] for index, key in enumerate(likely_ids(self.contents), start=1)}
+        labels, growth, triangles = self.likely_labels, self.sightings.growth, self.surface.triangles
+        pictures = []
+        for part in range(1, PROGRESS_PICTURES + 1):
+            last = part * steps // PROGRESS_PICTURES - 1
+            seen = self.sightings.first_seen <= (last if part < PROGRESS_PICTURES else steps)
+            surface = Surface(self.surface.vertices, triangles[seen[triangles].all(axis=1)])
+            view = LitView(surface, camera.scaled(PROGRESS_SCALE), T_world_camera)
+            image = Image.fromarray(view.in_instances(self.mesh.colors, labels, colors))
+            frame = self.contents.frame_numbers[self.sightings.chosen[last]]
+            pictures.append(ProgressPicture(webp_url(image, PROGRESS_QUALITY), frame, float(growth[last])))
+        return pictures
+
 
 def likely_ids(contents: RunContents) -> list[int]:
-    """The objects that are in a run's overview.png."""
+    """Return the objects that overview.png shows."""
     return [one.id for one in contents.objects if one.confidence >= LIKELY]
 
 
 def colors_by_id(objects: tuple[StoredInstance, ...]) -> dict[int, UInt8]:
-    """RGB (3,) by id; grey for what has no place."""
-    places = {one.id: one.centroid for one in objects if one.centroid is not None}
-    colors = object_colors(places, {one.id for one in objects if one.confidence >= LIKELY})
+    """Return the RGB colors (3,), gray for objects without a position."""
+    positions = {one.id: one.centroid for one in objects if one.centroid is not None}
+    colors = object_colors(positions, {one.id for one in objects if one.confidence >= LIKELY})
     return {one.id: colors.get(one.id, np.array((150, 150, 150), np.uint8)) for one in objects}
 
 
 def hex_color(color: UInt8) -> str:
-    """#rrggbb."""
+    """Return a color as #rrggbb."""
     return "#" + bytes(color.tolist()).hex()
 
 

@@ -10,46 +10,18 @@ import numpy as np
 
 from framework.data import Float64
 from framework.evaluation.instances import Judgement, Outcome
+from framework.reporting.map_scene import colors_by_id, hex_color
 from framework.reporting.pictures import Picture
 from framework.reporting.run_contents import RunContents
+from framework.reporting.truth_section import css_class
 from framework.runs.instances_file import StoredInstance
 
-LIKELY_CLASSES = 6  # of an object's class distribution, that a page shows
-
-
-def sides_cm(one: StoredInstance, up: Float64 | None) -> tuple[float, float, float]:
-    """The sides of an object's box: the longer and the shorter level one, and its height; without `up`, by length."""
-    extent = 100 * one.obb.extent
-    if up is None:
-        a, b, c = sorted(extent.tolist(), reverse=True)
-        return a, b, c
-    upright = int(np.abs(one.obb.rotation.T @ up).argmax())
-    level = sorted(np.delete(extent, upright).tolist(), reverse=True)
-    return level[0], level[1], float(extent[upright])
-
-
-def size_words(one: StoredInstance, up: Float64 | None) -> str:
-    """The sides in cm."""
-    return " × ".join(f"{side:.0f}" for side in sides_cm(one, up))
-
-
-def above_floor(one: StoredInstance, contents: RunContents) -> float | None:
-    """How high an object's box ends below, m above the floor; None where that is not known."""
-    floor, up = contents.record.metrics.get("map.floor_m"), contents.up
-    if not isinstance(floor, float) or up is None:
-        return None
-    half = float(0.5 * np.abs(one.obb.rotation.T @ up) @ one.obb.extent)
-    return float(one.obb.center @ up) - half - floor
-
-
-def likeliest(one: StoredInstance) -> list[tuple[str, float]]:
-    """The classes that a page shows of an object's distribution, the most probable first."""
-    return sorted(one.class_probabilities.items(), key=lambda share: (-share[1], share[0]))[:LIKELY_CLASSES]
+SHOWN_CLASSES = 6  # of an object's class distribution
 
 
 @dataclass(frozen=True)
 class ObjectRow:
-    """An object as the table shows it."""
+    """An object in the table."""
 
     instance: StoredInstance
     color: str  # #rrggbb
@@ -63,25 +35,23 @@ class ObjectRow:
 
 
 def object_rows(
-    contents: RunContents,
-    colors: Mapping[int, str],
-    pictures: Mapping[int, Picture],
-    judgements: Mapping[int, Judgement],
+    contents: RunContents, pictures: Mapping[int, Picture], judgements: Mapping[int, Judgement]
 ) -> list[ObjectRow]:
     """Return the rows of the table, the most confident object first."""
+    colors = colors_by_id(contents.objects)
     rows = []
     for one in sorted(contents.objects, key=lambda one: (-one.confidence, one.id)):
         judgement = judgements.get(one.id)
         rows.append(
             ObjectRow(
                 one,
-                colors[one.id],
+                hex_color(colors[one.id]),
                 pictures.get(one.id),
-                size_words(one, contents.up),
-                max(sides_cm(one, contents.up)),
+                _size(one, contents.up),
+                100 * float(one.obb.extent.max()),
                 _position(one),
-                outcome_words(judgement),
-                "faint" if judgement is None else judgement.outcome.name.lower().replace("_", "-"),
+                _truth(judgement),
+                css_class(judgement.outcome) if judgement else "faint",
                 f"{judgement.iou:.2f}" if judgement and judgement.iou else "",
             )
         )
@@ -91,26 +61,45 @@ def object_rows(
 def object_data(
     one: StoredInstance, contents: RunContents, picture: Picture | None, judgement: Judgement | None
 ) -> dict[str, Any]:
-    """What the panel shows of an object."""
-    height = above_floor(one, contents)
+    """Return the data of an object in the panel."""
+    likeliest = sorted(one.class_probabilities.items(), key=lambda entry: (-entry[1], entry[0]))[:SHOWN_CLASSES]
+    height = _height_above_floor(one, contents)
     return {
         "id": one.id,
         "class": one.class_name,
         "confidence": one.confidence,
-        "probabilities": [[name, round(share, 4)] for name, share in likeliest(one)],
-        "size": f"{size_words(one, contents.up)} cm",
+        "probabilities": [[name, round(probability, 4)] for name, probability in likeliest],
+        "size": f"{_size(one, contents.up)} cm",
         "place": ", ".join(_position(one).split()) + " m",
         "height": None if height is None else f"{max(height, 0.0):.2f} m above the floor",
         "observations": one.observations,
         "frames": f"{one.first_frame} to {one.last_frame}",
         "vertices": one.vertices,
         "source": picture.source if picture else "",
-        "truth": outcome_words(judgement) + (f", IoU {judgement.iou:.2f}" if judgement and judgement.iou else ""),
+        "truth": _truth(judgement) + (f", IoU {judgement.iou:.2f}" if judgement and judgement.iou else ""),
     }
 
 
-def outcome_words(judgement: Judgement | None) -> str:
-    """What became of an object, in a few words."""
+def _size(one: StoredInstance, up: Float64 | None) -> str:
+    """Return the sides of the box in cm: length, width and height; without `up` sorted by length."""
+    sides = np.sort(one.obb.extent)[::-1]
+    if up is not None:
+        upright = int(np.abs(one.obb.rotation.T @ up).argmax())
+        level = np.sort(np.delete(one.obb.extent, upright))[::-1]
+        sides = np.array([*level, one.obb.extent[upright]])
+    return " × ".join(f"{100 * side:.0f}" for side in sides)
+
+
+def _height_above_floor(one: StoredInstance, contents: RunContents) -> float | None:
+    """Return the height of the lower end of the box, m; None if the floor is unknown."""
+    floor, up = contents.record.metrics.get("map.floor_m"), contents.up
+    if not isinstance(floor, float) or up is None:
+        return None
+    half = float(0.5 * np.abs(one.obb.rotation.T @ up) @ one.obb.extent)
+    return float(one.obb.center @ up) - half - floor
+
+
+def _truth(judgement: Judgement | None) -> str:
     if judgement is None:
         return ""
     if judgement.outcome is Outcome.WRONG_CLASS:

@@ -1,4 +1,4 @@
-"""Small pictures of objects: cut from the frame that sees each best, or from a rendering of the map there."""
+"""Pictures of objects: cropped from the frame with the best view, or from a rendering of the map."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from framework.data import Bool, Float64, InstanceMesh, Int32, UInt8
 from framework.rendering.lit_view import LitView
 from framework.rendering.rasterizer import Rasterizer
 from framework.rendering.surface import Surface
-from framework.reporting.source_frames import Footage
+from framework.reporting.run_source import Footage
 
-WIDTH, HEIGHT = 264, 198  # px; shown half as large, or full in the panel
-MANY = 120  # objects from which on pictures are smaller, so that pages stay light
+WIDTH, HEIGHT = 264, 198  # px
+MANY = 120  # objects; with more of them, pictures are smaller
 QUALITY = 78  # of WebP
-MARGIN = 0.25  # of an object's size, around it
-SMALLEST = 0.12  # of the picture's width, that a cut has
-OUTLINE = (255, 255, 255)  # around the object's colour, so that the line shows on all grounds
+MARGIN = 0.25  # around an object, relative to its size
+MIN_CROP = 0.12  # relative to the width of the image
+OUTLINE = (255, 255, 255)  # on both sides of the colored outline
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A picture for the page."""
+    """A picture in the page."""
 
     url: str  # data:
     source: str  # "frame 12" or "map"
 
 
 class Photographer:
-    """Takes pictures of the objects of one map."""
+    """Renderer of object pictures of one map."""
 
     def __init__(self, mesh: InstanceMesh, surface: Surface, poses: Float64, footage: Footage) -> None:
         self._mesh, self._surface, self._poses, self._footage = mesh, surface, poses, footage
@@ -42,11 +42,11 @@ class Photographer:
         self._rasterizer = Rasterizer(mesh.vertices, mesh.triangles)
 
     def pictures(self, labels: Int32, best: Mapping[int, int], colors: Mapping[int, UInt8]) -> dict[int, Picture]:
-        """Of each label with its outline in its colour (3,), from the pose that sees it best.
+        """Return a picture of each label, outlined in its color (3,), from the pose with the best view.
 
         Args:
             labels: (V,) of the mesh's vertices, 0 = none.
-            best: pose by label.
+            best: index of the pose, by label.
         """
         taken: dict[int, Picture] = {}
         scale = 1.0 if len(best) <= MANY else 0.6
@@ -55,29 +55,29 @@ class Photographer:
             ids = self._rasterizer.draw(self._camera, self._poses[k]).nearest(self._mesh.triangles, labels)
             for key in sorted(key for key, pose in best.items() if pose == k):
                 if (mask := ids == key).any():
-                    taken[key] = Picture(_data_url(_cut(image, mask, colors[key], scale)), source)
+                    crop = _crop(image, mask, colors[key], scale)
+                    taken[key] = Picture(webp_url(Image.fromarray(crop), QUALITY), source)
         return taken
 
     def _seen_from(self, k: int) -> tuple[UInt8, str]:
-        """(H, W, 3) RGB and where it is from."""
+        """Return the image (H, W, 3) RGB and its source."""
         if k in self._footage.images:
             return self._footage.images[k], f"frame {self._footage.frames[k]}"
         return LitView(self._surface, self._camera, self._poses[k]).in_colors(self._mesh.colors), "map"
 
 
-def _cut(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
-    """The part of an image (H, W, 3) around a mask (H, W), which is outlined."""
+def _crop(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
+    """Return the part of an image (H, W, 3) around a mask (H, W), with the outline of the mask."""
     height, width = mask.shape
     rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
     center_u, center_v = (columns[0] + columns[-1] + 1) / 2, (rows[0] + rows[-1] + 1) / 2
     wide, high = (1 + 2 * MARGIN) * (columns[-1] - columns[0] + 1), (1 + 2 * MARGIN) * (rows[-1] - rows[0] + 1)
-    cut_width = round(min(max(wide, high * WIDTH / HEIGHT, SMALLEST * width), width, height * WIDTH / HEIGHT))
+    cut_width = round(min(max(wide, high * WIDTH / HEIGHT, MIN_CROP * width), width, height * WIDTH / HEIGHT))
     cut_height = min(round(cut_width * HEIGHT / WIDTH), height)
     left = round(min(max(center_u - cut_width / 2, 0), width - cut_width))
     top = round(min(max(center_v - cut_height / 2, 0), height - cut_height))
     window = slice(top, top + cut_height), slice(left, left + cut_width)
     size = round(WIDTH * scale), round(HEIGHT * scale)
-    # enlarged, pixels are interpolated; reduced, they are averaged
     cut = cv2.resize(image[window], size, interpolation=cv2.INTER_AREA if cut_width > size[0] else cv2.INTER_CUBIC)
     outlined = cv2.resize(mask[window].astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
     smooth = cv2.GaussianBlur(outlined, (0, 0), 1.5) > 0.5
@@ -87,12 +87,8 @@ def _cut(image: UInt8, mask: Bool, color: UInt8, scale: float) -> UInt8:
     return np.asarray(cut)
 
 
-def _data_url(image: UInt8) -> str:
-    return webp_url(Image.fromarray(image), QUALITY)
-
-
 def webp_url(image: Image.Image, quality: int) -> str:
-    """A picture as a `data:` URL."""
+    """Return a picture as a `data:` URL."""
     file = BytesIO()
     image.save(file, "WEBP", quality=quality, method=4)
     return f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"

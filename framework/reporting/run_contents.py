@@ -1,4 +1,4 @@
-"""What a run left behind, read for its report: all of a complete record, of a partial one what there is."""
+"""The outputs of a run that its report shows."""
 
 from __future__ import annotations
 
@@ -27,13 +27,15 @@ from framework.runs.stored_runs import (
 )
 from framework.runs.timings_file import StageTimes, read_timings
 
+TIMINGS_HEADER = "frame,stage,milliseconds\n"
+
 
 @dataclass(frozen=True)
 class RunContents:
-    """A run's record. What is None is not there."""
+    """The outputs of a run; None = missing."""
 
     record: Record
-    partial: str  # why the run ended early, "" = it completed
+    partial: str  # why the run ended early, "" = it is complete
     mesh: InstanceMesh | None
     objects: tuple[StoredInstance, ...]  # by id
     timestamps: Float64  # (P,) s, of the frames that were mapped
@@ -42,7 +44,7 @@ class RunContents:
 
     @classmethod
     def read(cls, directory: Path) -> RunContents:
-        """Raises DataError, naming the file, when there is no record, or a file of it is damaged or of another run."""
+        """Read a run. Raise DataError, naming the file, if there is no run or a file is damaged or of another run."""
         if is_there(directory / METRICS):
             record, partial = read_record(directory), ""
         elif is_there(directory / PARTIAL_METRICS):
@@ -61,48 +63,56 @@ class RunContents:
             tuple(sorted(objects, key=lambda one: one.id)),
             timestamps,
             poses,
-            read_timings(timings) if is_there(timings) and timings.stat().st_size > len(_NO_TIMES) else None,
+            read_timings(timings) if is_there(timings) and timings.stat().st_size > len(TIMINGS_HEADER) else None,
         )
 
     @property
     def name(self) -> str:
-        """Of what was mapped."""
+        """Name of the sequence."""
         return str(self.record.metrics.get("sequence") or self.record.directory.resolve().name)
 
     @property
     def up(self) -> Float64 | None:
-        """(3,) against gravity, None where the map does not tell."""
+        """Unit vector (3,) against gravity, None if unknown."""
         values = [self.record.metrics.get(f"map.up.{axis}") for axis in "xyz"]
         up = np.array([value if is_number(value) else np.nan for value in values], np.float64)
         length = np.linalg.norm(up)
-        return np.asarray(up / length) if abs(length - 1) < UNIT_TOLERANCE else None  # NaN is not
+        return np.asarray(up / length) if abs(length - 1) < UNIT_TOLERANCE else None  # false for NaN
 
     @property
     def tracked_frames(self) -> tuple[int, ...]:
-        """The numbers of the frames that `poses` are of; empty where the times do not tell."""
+        """Frame numbers of `poses`, empty if unknown."""
         if self.times is None or "fuse" not in self.times.milliseconds:
             return ()
         numbers = self.times.frames[np.isfinite(self.times.milliseconds["fuse"])].tolist()
         return tuple(numbers) if len(numbers) == len(self.poses) else ()
 
     @property
+    def frame_numbers(self) -> tuple[int, ...]:
+        """Frame numbers of `poses`, counted from 0 if unknown."""
+        return self.tracked_frames or tuple(range(len(self.poses)))
+
+    @property
     def lost_frames(self) -> tuple[int, ...]:
-        """The numbers of the frames whose pose was not known."""
+        """Numbers of the frames without a pose."""
         if self.times is None or not self.tracked_frames:
             return ()
         return tuple(np.setdiff1d(self.times.frames, self.tracked_frames).tolist())
 
+    @property
+    def lost_after(self) -> list[int]:
+        """Indices of the poses after which frames were lost."""
+        before = np.searchsorted(self.tracked_frames, self.lost_frames) - 1
+        return sorted({max(0, int(k)) for k in before})
+
     def instance_ids(self, mesh: InstanceMesh) -> Int32:
-        """(V,) of the mesh's vertices, 0 = of no object that is listed."""
+        """Return the listed objects of the mesh's vertices (V,), 0 = none."""
         listed = np.isin(mesh.instance_ids, [one.id for one in self.objects])
         return np.where(listed, mesh.instance_ids, 0).astype(np.int32)
 
 
-_NO_TIMES = "frame,stage,milliseconds\n"
-
-
 def _map_of(record: Record) -> tuple[InstanceMesh | None, list[StoredInstance]]:
-    """mesh.ply and instances.json, of one run where both are there."""
+    """Read mesh.ply and instances.json, and check that they are of one run."""
     mesh, instances = record.directory / MESH, record.directory / INSTANCES
     if is_there(mesh) and is_there(instances):
         return read_objects(record)

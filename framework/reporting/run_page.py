@@ -1,4 +1,4 @@
-"""The page of one run."""
+"""Report page of one run."""
 
 from __future__ import annotations
 
@@ -31,12 +31,9 @@ from framework.reporting.map_scene import MapScene, colors_by_id, hex_color, lik
 from framework.reporting.markup import page
 from framework.reporting.object_table import object_data, object_rows
 from framework.reporting.pictures import Photographer, Picture, webp_url
-from framework.reporting.progress_pictures import growth_pictures
 from framework.reporting.run_contents import RunContents
-from framework.reporting.run_source import RunSource, TruePath
-from framework.reporting.source_frames import Footage
-from framework.reporting.truth_check import TruthCheck
-from framework.reporting.truth_section import TruthSection
+from framework.reporting.run_source import Footage, RunSource, TruePath
+from framework.reporting.truth_section import TruthCheck, truth_section
 from framework.reporting.visibility import NOT_CAMERA, spread_out
 from framework.runs.provenance import leaves
 from framework.runs.run_directory import LIKELY
@@ -58,33 +55,32 @@ TRUTH_HEADS = (("Truth", "text"), ("IoU", "number"))
 
 @dataclass(frozen=True)
 class RunReport:
-    """All that a run's page shows."""
+    """Everything that a run's page shows."""
 
     contents: RunContents
-    scene: MapScene | None  # None = nothing was mapped
-    recording: RunSource
+    scene: MapScene | None  # None = empty map
+    source: RunSource
     pictures: Mapping[int, Picture]
     true_path: TruePath | None
     check: TruthCheck | None
-    why_unchecked: str  # why there is no check although there were true instances once
+    why_unchecked: str  # why there is no check although the run was evaluated
 
     @classmethod
     def of(cls, contents: RunContents) -> RunReport:
-        """Looks at the recording again, where it can be read."""
-        recording = RunSource.of(contents)
+        """Read the sequence again, if possible."""
+        source = RunSource.of(contents)
         chosen = spread_out(len(contents.poses))
-        footage = Footage.of(recording, chosen, recording.camera or NOT_CAMERA)
+        footage = Footage.of(source, chosen, source.camera or NOT_CAMERA)
         scene = MapScene.of(contents, footage)
         photographer, pictures = None, {}
         if scene is not None:
             photographer = Photographer(scene.mesh, scene.surface, contents.poses, footage)
             colors = colors_by_id(contents.objects)
             pictures = photographer.pictures(scene.mesh.instance_ids, scene.sightings.best, colors)
-        truth, why = recording.scene_truth()
+        truth, why = source.scene_truth()
         check = TruthCheck.of(contents, truth, scene, photographer, footage) if truth is not None else None
-        return cls(
-            contents, scene, recording, pictures, TruePath.of(contents.poses, footage.true_positions), check, why
-        )
+        true_path = TruePath.of(contents.poses, footage.true_positions)
+        return cls(contents, scene, source, pictures, true_path, check, why)
 
     def html(self) -> str:
         """Return the page, identical for the same run and sequence."""
@@ -98,7 +94,6 @@ class RunReport:
                 for one in contents.objects
             ],
         }
-        colors = {key: hex_color(color) for key, color in colors_by_id(contents.objects).items()}
         context = {
             "name": contents.name,
             "stages": [name for group in STAGES if (name := metrics.get(f"choice.{group}"))],
@@ -109,8 +104,8 @@ class RunReport:
             "still": overview_url(contents.record.directory / "overview.png") if self.scene is not None else "",
             "heads": TABLE_HEADS + (TRUTH_HEADS if self.check else ()),
             "checked": self.check is not None,
-            "objects": object_rows(contents, colors, self.pictures, judgements),
-            "truth": TruthSection.of(self.check, self.why_unchecked, contents, self.pictures),
+            "objects": object_rows(contents, self.pictures, judgements),
+            "truth": truth_section(self.check, self.why_unchecked, contents, self.pictures),
             "trajectory": self._trajectory(),
             "progress": self._progress(),
             "times": stage_rows(contents.times) if contents.times else [],
@@ -124,9 +119,9 @@ class RunReport:
         notices = []
         if self.contents.partial:
             notices.append(f"This run is partial: {self.contents.partial}. The page shows the map up to that point.")
-        if self.recording.why_not:
+        if self.source.why_not:
             notices.append(
-                f"The sequence could not be read ({self.recording.why_not}): object pictures are rendered from the "
+                f"The sequence could not be read ({self.source.why_not}): object pictures are rendered from the "
                 "map, and the true path is unknown."
             )
         return notices
@@ -157,7 +152,7 @@ class RunReport:
             for one in contents.objects
             if one.id in likely
         ]
-        path = PlottedPath(contents.poses[:, :3, 3], lost_after(contents))
+        path = PlottedPath(contents.poses[:, :3, 3], contents.lost_after)
         true_paths = [self.true_path.positions] if self.true_path is not None else []
         whole, share = top_view([path], true_paths, footprints, up)
         if share > SMALL_PATH:
@@ -190,7 +185,7 @@ class RunReport:
         likely = set(likely_ids(contents))
         first = [one.first_frame for one in contents.objects if one.id in likely]
         chart = growth(frames, scene.sightings.growth, first, contents.tracked_frames[-1])
-        return {"chart": chart, "pictures": growth_pictures(scene)}
+        return {"chart": chart, "pictures": scene.progress_pictures()}
 
 
 def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
@@ -222,17 +217,8 @@ def headline_numbers(contents: RunContents) -> list[tuple[str, str, str, str]]:
     return found
 
 
-def lost_after(contents: RunContents) -> list[int]:
-    """Return the poses after which frames were lost."""
-    numbers, lost = contents.tracked_frames, contents.lost_frames
-    if not numbers or not lost:
-        return []
-    before = np.searchsorted(numbers, lost) - 1
-    return sorted({max(0, int(k)) for k in before})
-
-
 def overview_url(path: Path) -> str:
-    """overview.png as a smaller picture, "" where there is none that can be read."""
+    """Return overview.png scaled down, "" if it cannot be read."""
     try:
         small = Image.fromarray(read_color(path))
     except FrameError:

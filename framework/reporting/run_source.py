@@ -1,14 +1,15 @@
-"""The recording that a run was made from, where it can still be read: its pictures and its true poses."""
+"""The sequence that a run was made from, if it is still available: its images and its true poses."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from omegaconf import OmegaConf
 
-from framework.data import Camera, Float64, Frame, SceneTruth
+from framework.data import Camera, Float64, Frame, SceneTruth, UInt8
 from framework.errors import DataError, FrameError, InstanceMapError
 from framework.evaluation.trajectory import umeyama
 from framework.interfaces import RGBDSequence, RGBDVideo
@@ -17,20 +18,22 @@ from framework.reporting.run_contents import RunContents
 from framework.runs.metrics import TRUTH, truth_sha256
 from framework.runs.provenance import leaves
 
-SAME_TIME_S = 1e-5  # trajectories are stored with nine digits of a second, of which doubles of today's dates keep six
+SAME_TIME_S = 1e-5  # tolerance of timestamps: a double of a Unix time has a precision of about 1e-6 s
+MAX_WIDTH = 640  # px, of stored images
+MIN_CLARITY = 0.3  # a blurred image of an object is better than a distant view
 
 
 @dataclass(frozen=True)
 class RunSource:
-    """A run's video, and which of its frames were tracked."""
+    """The sequence of a run, and which of its frames were tracked."""
 
     contents: RunContents
     video: RGBDSequence | None
-    why_not: str  # why there is no video, "" = there is one
+    why_not: str  # reason for a missing sequence
 
     @classmethod
     def of(cls, contents: RunContents) -> RunSource:
-        """Opened by the run's config. A video that cannot be read is none: a report is made without it."""
+        """Open the sequence from the run's config. A sequence that cannot be read is None."""
         config = contents.record.config
         if any("${" in str(value) for _, value in leaves({"dataset": config.get("dataset")})):
             return cls(contents, None, "its config is not resolved")
@@ -40,22 +43,22 @@ class RunSource:
             return cls(contents, None, str(error))
         if not isinstance(video, RGBDSequence):
             return cls(contents, None, "it was mapped as it came from a camera")
-        found = cls(contents, video, "")
-        if len(contents.poses) and found.frame(0) is None:
+        source = cls(contents, video, "")
+        if len(contents.poses) and source.frame(0) is None:
             return cls(contents, None, "the recording is not the one that was mapped: its first frame is another")
-        return found
+        return source
 
     @property
     def camera(self) -> Camera | None:
         return None if self.video is None else self.video.camera
 
     def frame(self, k: int) -> Frame | None:
-        """The frame that pose k of the trajectory is of; None where it cannot be read any more."""
+        """Return the frame of pose k of the trajectory, None if it cannot be read."""
         numbers = self.contents.tracked_frames
         if self.video is None or not numbers or self.contents.times is None:
             return None
         first = int(np.searchsorted(self.contents.times.frames, numbers[k]))
-        skipped = len(self.video) - len(self.contents.times.frames)  # frames without times may come before it
+        skipped = len(self.video) - len(self.contents.times.frames)  # frames without times may precede it
         for position in range(first, min(first + max(skipped, 0) + 1, len(self.video))):
             try:
                 frame = self.video[position]
@@ -68,7 +71,7 @@ class RunSource:
         return None
 
     def scene_truth(self) -> tuple[SceneTruth | None, str]:
-        """The true instances that the run was compared with; None where there are none, then why, "" = never were."""
+        """Return the true instances of the run's evaluation, or None and the reason ("" for a run without them)."""
         expected = self.contents.record.metrics.get(TRUTH)
         if self.video is None:
             return None, self.why_not if expected else ""
@@ -84,23 +87,52 @@ class RunSource:
 
 
 @dataclass(frozen=True)
+class Footage:
+    """Frames of the sequence, by the index of their pose in the trajectory. Unreadable frames are missing."""
+
+    camera: Camera  # of the images
+    images: Mapping[int, UInt8]  # (H, W, 3) RGB
+    frames: Mapping[int, int]  # frame numbers in the sequence
+    true_positions: Mapping[int, Float64]  # (3,) m, of frames with a true pose
+    clarity: Mapping[int, float]  # in [MIN_CLARITY, 1], 1 = at least as sharp as the median
+
+    @classmethod
+    def of(cls, source: RunSource, chosen: Sequence[int], camera: Camera) -> Footage:
+        """Read the frames of the chosen poses."""
+        small = camera.scaled(min(1.0, MAX_WIDTH / camera.width))
+        images, frames, positions, sharpness = {}, {}, {}, {}
+        for k in chosen:
+            frame = source.frame(k)
+            if frame is None:
+                continue
+            image = cv2.resize(frame.color, (small.width, small.height), interpolation=cv2.INTER_AREA)
+            images[k], frames[k] = np.asarray(image), frame.index
+            sharpness[k] = float(cv2.Laplacian(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), cv2.CV_32F).var())
+            if frame.T_world_camera is not None:
+                positions[k] = frame.T_world_camera[:3, 3]
+        median = max(float(np.median(list(sharpness.values()))), 1e-9) if sharpness else 1.0
+        clarity = {k: min(max(value / median, MIN_CLARITY), 1.0) for k, value in sharpness.items()}
+        return cls(small, images, frames, positions, clarity)
+
+
+@dataclass(frozen=True)
 class TruePath:
-    """Where the camera really was, in the map's world: moved rigidly so that it fits the trajectory, as for ATE."""
+    """The true camera path, aligned rigidly to the trajectory as for the ATE."""
 
     chosen: list[int]  # poses of the trajectory, n
     positions: Float64  # (n, 3) m
-    errors: Float64  # (n,) m, from there to the trajectory's positions
+    errors: Float64  # (n,) m, distance to the positions of the trajectory
 
     @classmethod
     def of(cls, poses: Float64, true_positions: Mapping[int, Float64]) -> TruePath | None:
-        """From true positions (3,) by number of the pose; None where there are too few to be moved."""
+        """Align true positions (3,) by pose index. Return None for fewer than three."""
         chosen = sorted(true_positions)
         if len(chosen) < 3:
             return None
-        true, mine = np.array([true_positions[k] for k in chosen]), poses[chosen, :3, 3]
+        true, estimated = np.array([true_positions[k] for k in chosen]), poses[chosen, :3, 3]
         try:
-            R, t = umeyama(true, mine)
+            R, t = umeyama(true, estimated)
         except np.linalg.LinAlgError as error:
             raise DataError(f"the true poses cannot be compared with the trajectory: {error}") from error
-        moved = true @ R.T + t
-        return cls(chosen, moved, np.linalg.norm(moved - mine, axis=1))
+        aligned = true @ R.T + t
+        return cls(chosen, aligned, np.linalg.norm(aligned - estimated, axis=1))

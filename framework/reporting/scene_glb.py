@@ -1,4 +1,4 @@
-"""A light map as a GLB file: one node for each object, one for what is around them."""
+"""A decimated map as a GLB file, with one node for each object and one for the background."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from framework.exporting.glb import T_GLTF_ROOM, Node, glb_of
 from framework.exporting.object_meshes import REST
 from framework.exporting.upright_room import plain_name, upright
 
-MOST_BYTES = 9_500_000  # of the file; browsers of phones still turn it
-BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # place, colour, first sight; three indices
-MOST_TRIANGLES = 300_000  # together with half as many vertices they come to 7 MB
+MOST_BYTES = 9_500_000  # of the file; browsers of phones can show it
+BYTES_OF_VERTEX, BYTES_OF_TRIANGLE = 24, 12  # position, color, first view; three indices
+MOST_TRIANGLES = 300_000  # 7 MB together with their vertices
 NOT_GEOMETRY = 200_000  # bytes for names and nodes
 FIRST_SEEN = "_FIRST_SEEN"
 
 
 def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str], up: Float64) -> bytes:
-    """The map as binary glTF 2.0, unlit, with the attribute `_FIRST_SEEN`.
+    """Return the map as binary glTF 2.0, unlit, with the attribute `_FIRST_SEEN`.
 
-    Vertices are where the map has them; a node's matrix turns them so that up is glTF's. Extras have the id and the
-    class. The file is at most MOST_BYTES long where the mesh is one of `light_enough`.
+    Vertices have the coordinates of the map; the matrix of each node rotates them upright. Extras contain the id and
+    the class. A mesh of `light_enough` results in at most MOST_BYTES.
 
     Args:
-        first_seen: (V,) in [0, 1], which share of the video had passed when each vertex was seen first.
-        names: class by id, of each object that gets a node; other labels count as none.
-        up: (3,) of length 1, world.
+        first_seen: (V,) in [0, 1], part of the sequence before the first view of each vertex.
+        names: class by id, of the objects with a node.
+        up: (3,) unit vector, world.
     """
     labels = np.where(np.isin(mesh.instance_ids, list(names)), mesh.instance_ids, 0).astype(np.int32)
     of_triangle = triangle_labels(mesh.triangles, labels)
@@ -46,5 +46,5 @@ def scene_glb(mesh: InstanceMesh, first_seen: Float32, names: Mapping[int, str],
 
 
 def light_enough(mesh: InstanceMesh, most_bytes: int = MOST_BYTES) -> InstanceMesh:
-    """The mesh itself, or, where a file of it would have more bytes, a coarser one."""
+    """Return the mesh, coarser if its file would have more bytes."""
     return clustered(mesh, most_bytes - NOT_GEOMETRY, BYTES_OF_VERTEX, BYTES_OF_TRIANGLE)

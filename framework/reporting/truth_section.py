@@ -1,4 +1,4 @@
-"""The section of a run's page that compares its objects with the ground truth."""
+"""Comparison of a run's objects with the ground truth: metrics, and galleries of missed, wrong and correct objects."""
 
 from __future__ import annotations
 
@@ -6,14 +6,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from framework.evaluation.instances import Judgement, Outcome
-from framework.reporting.pictures import Picture
+import numpy as np
+
+from framework.data import SceneTruth, UInt8
+from framework.evaluation.instances import (
+    MAX_DISTANCE,
+    Judgement,
+    Outcome,
+    PredictedInstances,
+    judge,
+    transfer_labels,
+)
+from framework.reporting.map_scene import MapScene
+from framework.reporting.pictures import Photographer, Picture
 from framework.reporting.run_contents import RunContents
-from framework.reporting.truth_check import Missed, TruthCheck
+from framework.reporting.run_source import Footage
+from framework.reporting.visibility import sightings
 from framework.runs.instances_file import StoredInstance
 from framework.runs.stored_runs import is_number
 
-MAIN = {
+TRUE_COLOR = (255, 196, 0)  # RGB, outline of missed objects
+METRICS = {
     "instances.ap50": "AP50",
     "instances.ap25": "AP25",
     "instances.ap": "AP",
@@ -33,7 +46,7 @@ GROUPS = {
 
 @dataclass(frozen=True)
 class Card:
-    """One picture of a gallery."""
+    """One object of a gallery."""
 
     class_name: str
     confidence: str
@@ -54,50 +67,84 @@ class Gallery:
 
 
 @dataclass(frozen=True)
-class TruthSection:
-    """The metrics, and the galleries of missed, wrong and correct objects."""
+class TruthCheck:
+    """The outcome of every object, and the missed true objects."""
 
-    metrics: list[tuple[str, str]]
-    classes: list[tuple[str, object, list[float | None]]]  # name, count of true objects, AP50 and AP25
-    unchecked: str  # the reason for missing galleries
-    galleries: list[Gallery]
+    judgements: Mapping[int, Judgement]  # by object
+    missed: list[Card]
 
     @classmethod
     def of(
-        cls, check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
-    ) -> TruthSection | None:
-        """Return None for a run without ground truth."""
-        metrics = contents.record.metrics
-        main = [(name, f"{metrics[key]:.2f}") for key, name in MAIN.items() if is_number(metrics.get(key))]
-        if check is None:
-            reason = why_unchecked or "the run has no mesh"
-            return cls(main, _classes(metrics), reason, []) if main else None
-        return cls(main, _classes(metrics), "", _galleries(check, contents, pictures))
+        cls,
+        contents: RunContents,
+        truth: SceneTruth,
+        scene: MapScene | None,
+        photographer: Photographer | None,
+        footage: Footage,
+    ) -> TruthCheck | None:
+        """Return None for a run without a mesh."""
+        if contents.mesh is None:
+            return None
+        objects = contents.objects
+        predictions = PredictedInstances.on_mesh(
+            contents.mesh,
+            [one.id for one in objects],
+            [one.confidence for one in objects],
+            [one.class_name for one in objects],
+        )
+        judged, missed = judge(predictions, truth)
+        pictures: Mapping[int, Picture] = {}
+        if scene is not None and photographer is not None and missed:
+            true_ids = transfer_labels(truth.points_world, truth.instance_ids, scene.mesh.vertices, MAX_DISTANCE)
+            labels = np.where(np.isin(true_ids, list(missed)), true_ids, 0).astype(np.int32)
+            best = sightings(scene.mesh, labels, contents.poses, footage.camera, footage.clarity).best
+            color: UInt8 = np.array(TRUE_COLOR, np.uint8)
+            pictures = photographer.pictures(labels, best, dict.fromkeys(best, color))
+        cards = []
+        for key, name in sorted(missed.items()):
+            overlapping = [one for one in judged if one.truth_id == key]
+            nearest = max(overlapping, key=lambda one: (one.iou, -one.id), default=None)
+            note = "not detected" if nearest is None else f"best overlap: IoU {nearest.iou:.2f}"
+            picture = pictures.get(key)
+            cards.append(Card(name, "", note if picture else "not mapped", picture, nearest.id if nearest else None))
+        return cls({one.id: one for one in judged}, cards)
+
+    def galleries(self, contents: RunContents, pictures: Mapping[int, Picture]) -> list[Gallery]:
+        cards = {outcome: list[Card]() for outcome in GROUPS}
+        for one in contents.objects:
+            if judgement := self.judgements.get(one.id):
+                cards[judgement.outcome].append(_card(one, judgement, pictures.get(one.id)))
+        note = "true objects without a match of their class"
+        galleries = [Gallery("missed", "Missed", note, self.missed, bool(self.missed))]
+        for outcome, (name, note) in GROUPS.items():
+            is_open = outcome in (Outcome.WRONG_CLASS, Outcome.FALSE) and bool(cards[outcome])
+            galleries.append(Gallery(css_class(outcome), name, note, cards[outcome], is_open))
+        return galleries
 
 
-def _classes(metrics: Mapping[str, Any]) -> list[tuple[str, object, list[float | None]]]:
+def truth_section(
+    check: TruthCheck | None, why_unchecked: str, contents: RunContents, pictures: Mapping[int, Picture]
+) -> dict[str, Any] | None:
+    """Return the context of the section's template, None for a run without ground truth."""
+    metrics = contents.record.metrics
+    main = [(name, f"{metrics[key]:.2f}") for key, name in METRICS.items() if is_number(metrics.get(key))]
+    if not main and check is None:
+        return None
     prefix = "instances.true_count."
-    rows = []
-    for key in metrics:
-        if key.startswith(prefix):
-            name = key.removeprefix(prefix)
-            values = [metrics.get(f"instances.{figure}.{name}") for figure in ("ap50", "ap25")]
-            rows.append((name, metrics[key], [value if is_number(value) else None for value in values]))
-    return rows
+    classes = []
+    for name in (key.removeprefix(prefix) for key in metrics if key.startswith(prefix)):
+        scores = [metrics.get(f"instances.{metric}.{name}") for metric in ("ap50", "ap25")]
+        classes.append((name, metrics[prefix + name], [score if is_number(score) else None for score in scores]))
+    return {
+        "metrics": main,
+        "classes": classes,
+        "unchecked": "" if check else why_unchecked or "the run has no mesh",
+        "galleries": check.galleries(contents, pictures) if check else [],
+    }
 
 
-def _galleries(check: TruthCheck, contents: RunContents, pictures: Mapping[int, Picture]) -> list[Gallery]:
-    by_id = {one.id: one for one in contents.objects}
-    cards = {outcome: list[Card]() for outcome in GROUPS}
-    for key, judgement in check.judgements.items():
-        cards[judgement.outcome].append(_card(by_id[key], judgement, pictures.get(key)))
-    missed = [_missed_card(one, check) for one in check.missed]
-    galleries = [Gallery("missed", "Missed", "true objects without a match of their class", missed, bool(missed))]
-    for outcome, (name, note) in GROUPS.items():
-        open_first = outcome in (Outcome.WRONG_CLASS, Outcome.FALSE) and bool(cards[outcome])
-        css = outcome.name.lower().replace("_", "-")
-        galleries.append(Gallery(css, name, note, cards[outcome], open_first))
-    return galleries
+def css_class(outcome: Outcome) -> str:
+    return outcome.name.lower().replace("_", "-")
 
 
 def _card(one: StoredInstance, judgement: Judgement, picture: Picture | None) -> Card:
@@ -109,13 +156,3 @@ def _card(one: StoredInstance, judgement: Judgement, picture: Picture | None) ->
         Outcome.IGNORED: f"on {near}",
     }
     return Card(one.class_name, f"{one.confidence:.2f}", notes[judgement.outcome], picture, one.id)
-
-
-def _missed_card(one: Missed, check: TruthCheck) -> Card:
-    near = max(
-        (j for j in check.judgements.values() if j.truth_id == one.id), key=lambda j: (j.iou, -j.id), default=None
-    )
-    note = "not detected" if near is None else f"best overlap: IoU {near.iou:.2f}"
-    return Card(
-        one.class_name, "", "not mapped" if one.picture is None else note, one.picture, near.id if near else None
-    )

@@ -13,8 +13,7 @@ from omegaconf import OmegaConf
 
 from framework.geometry import inverse
 from framework.reporting.run_contents import RunContents
-from framework.reporting.run_source import RunSource, TruePath
-from framework.reporting.source_frames import BLURRED, Footage
+from framework.reporting.run_source import MIN_CLARITY, Footage, RunSource, TruePath
 from framework.runs.provenance import config_hash
 from tests.support.reported_run import write_run
 from tests.support.scenes.corner_room import pose_at
@@ -101,7 +100,7 @@ def test_footage_has_pictures_true_places_and_how_sharp_they_are(mapped: Path) -
     footage = Footage.of(recording, [0, 3], recording.camera)
     assert footage.frames == {0: 0, 3: 3}
     np.testing.assert_array_equal(footage.true_positions[3], pose_at(3)[:3, 3])
-    assert all(BLURRED <= value <= 1 for value in footage.clarity.values())
+    assert all(MIN_CLARITY <= value <= 1 for value in footage.clarity.values())
     assert max(footage.clarity.values()) == 1
     assert footage.images[0].shape == (*footage.camera.shape, 3)
 

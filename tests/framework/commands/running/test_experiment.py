@@ -73,7 +73,7 @@ def test_an_experiment_runs_what_is_missing_and_writes_its_table(tmp_path: Path)
     assert "half: refiner=identity dataset.frames=4" in text
     assert (out / "table.tex").read_text().count("\\begin{tabular}") == 2
     assert {path.name for path in out.glob("figure.*")} == {"figure.png", "figure.pdf"}
-    assert "not in the picture: row=broken,seed=1: failed: " in first.stdout
+    assert "not in the figure: row=broken,seed=1: failed: " in first.stdout
     config = OmegaConf.load(out / "row=half,seed=3" / "config.yaml")
     assert (config.row, config.seed, config.dataset.frames) == ("half", 3, 4)
     assert config.refiner._target_ == "plugins.refiners.identity.Identity"
