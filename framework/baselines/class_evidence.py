@@ -1,17 +1,16 @@
-"""Class evidence alone in the voxels: what a semantic map keeps, background included, and how a frame changes it.
+"""Class evidence of the voxels of a semantic map, background included, and its update by a frame.
 
-After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] of the paper with one distribution a pixel:
+After SemanticFusion (McCormac et al. 2017), eq. 2, which is eq. [7] of the paper with one distribution per pixel:
 
     P(c | I_1..t) = (1/Z) P(c | I_1..t-1) P(O_u = c | I_t),   c = background or a class
 
-In log space it is a sum, from a uniform start. Only ratios matter, so a voxel stores each class's sum relative to the
-background's: the background wins where no class is above 0. A pixel under a mask has the mask's distribution. A pixel
-under none is evidence for the background, the same at each such pixel, so that there a count of frames says all. It is
-kept for every block; what the masks said takes rows of 512 voxels in the blocks that were under one, 5 bytes a class
-slot and 14 beside, so at most 94 a voxel.
+In log space it is a sum, from a uniform start. Only ratios matter, so a voxel stores the log ratio of each class to the
+background, which wins if no class is above 0. A pixel under a mask has the distribution of the mask. Every pixel under
+no mask is the same evidence for the background, so a count of frames suffices; every block has it. Evidence of masks is
+in rows of 512 voxels, only for blocks that were under a mask: 5 bytes a class slot and 14 more, so at most 94 a voxel.
 
-A voxel tells the CLASS_SLOTS best of its classes apart and drops the least likely one when another is named (an
-eviction, counted). The other classes share one sum, `rest`, with which a class enters that is named for the first time.
+A voxel stores the CLASS_SLOTS most likely classes and evicts the least likely one when another is named. The unnamed
+classes share one sum, `rest`, with which a class starts when it is named first.
 """
 
 from __future__ import annotations
@@ -32,16 +31,16 @@ from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.voxel_grid import VoxelGrid, grown
 from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS
 
-MOST_EXPONENT = 700.0  # of a ratio that float64 can hold
+MAX_EXPONENT = 700.0  # of a ratio that float64 can represent
 
 
 class ClassEvidence(NamedTuple):
-    """What speaks for each class. The best class of a voxel is always in slot 0."""
+    """The class evidence of all voxels. The best class of a voxel is in slot 0."""
 
     unmasked: UInt16  # (B, 512) frames that saw the voxel under no mask; B as in the grid
     class_ids: UInt8  # (R, 512, T), NO_CLASS = free slot
     log_ratio: Float32  # (R, 512, T) sum of log P(class) / P(background) over the frames that saw it under a mask
-    rest: Float32  # (R, 512) the same of each class without a slot
+    rest: Float32  # (R, 512) the same sum of each unnamed class
     masked: UInt16  # (R, 512) the number of these frames
     first_frame: Int32  # (R, 512) the first and the last one of them, -1 = none
     last_frame: Int32  # (R, 512)
@@ -51,24 +50,24 @@ ROW_ARRAYS = ClassEvidence._fields[1:]
 
 
 class MaskClasses(NamedTuple):
-    """What one frame's N masks say of C classes."""
+    """The evidence of one frame's N masks for C classes."""
 
-    cluster: Int32  # (H * W,) the cluster with the best score of those over each pixel, -1 = none
+    cluster: Int32  # (H * W,) the cluster with the best score over each pixel, -1 = none
     log_ratio: Float32  # (N, C) log P(class) / P(background)
-    rest: Float32  # (N,) the same of the mean of the classes that a cluster does not name
+    unnamed: Float32  # (N,) the same of the mean of the classes that a cluster does not name
     named_classes: UInt8  # (N, NEW_CLASSES) each cluster's best classes
-    named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 of the classes that it does not name
+    named_bit: UInt8  # (N, NO_CLASS + 1) bit m of a cluster's m-th named class, 0 = unnamed
     frame: int  # its index
 
 
 def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists, frame: int) -> MaskClasses:
-    """What the clusters of a frame say, log P(class) / P(background) (N, C), as the voxels take it."""
-    above_rest, named, bits = named_classes(log_ratio, logarithmic=True)
-    best = best_clusters(points.first, points.cluster, clusters.scores)
+    """Return the evidence of the clusters of a frame with log P(class) / P(background) (N, C)."""
+    relative, named, bits = named_classes(log_ratio, logarithmic=True)
+    best = best_clusters(points.offsets, points.clusters, clusters.scores)
     return MaskClasses(
-        best[points.of_pixel.ravel()],
+        best[points.list_ids.ravel()],
         log_ratio.astype(np.float32),
-        (log_ratio - above_rest)[:, :1].sum(axis=1).astype(np.float32),
+        (log_ratio - relative)[:, :1].sum(axis=1).astype(np.float32),
         named,
         bits,
         frame,
@@ -76,7 +75,7 @@ def mask_classes(log_ratio: Float64, clusters: PointClusters, points: PixelLists
 
 
 class ClassRows:
-    """Owns the class evidence of a grid's blocks and makes it grow. The kernels work on `self.evidence`."""
+    """Owns the class evidence of a grid and grows it. The kernels work on `self.evidence`."""
 
     def __init__(self, voxels: VoxelGrid) -> None:
         self.voxels = voxels
@@ -85,23 +84,23 @@ class ClassRows:
         self.evidence = _free_rows(0)
 
     def __getstate__(self) -> dict[str, Any]:
-        """For pickling: without what is only reserved."""
+        """Return the state without unused capacity."""
         unmasked = self.evidence.unmasked[: self.voxels.block_count]
         return {**vars(self), "evidence": self.evidence._replace(unmasked=unmasked)}
 
     @property
     def byte_count(self) -> int:
-        """Of what is in use."""
+        """Bytes in use."""
         return sum(array.nbytes for array in self.saved().values())
 
     def begin(self, classes: int) -> None:
-        """Says how many classes there are, before the first update. Raises DataError when they are too many."""
+        """Set the number of classes before the first update. Raises DataError if there are too many."""
         if classes > NO_CLASS:
             raise DataError(f"a map tells {NO_CLASS} classes apart, and the detector has {classes}")
         self.evidence = _free_rows(min(classes, CLASS_SLOTS))
 
     def update(self, seen: SeenBlocks, masks: MaskClasses) -> None:
-        """Updates the voxels near the measured surface of the blocks that a frame has seen."""
+        """Update the voxels near the measured surface of the blocks that a frame has seen."""
         capacity = len(self.voxels.grid.block_coords)
         if len(self.evidence.unmasked) < capacity:
             self.evidence = self.evidence._replace(unmasked=grown(self.evidence.unmasked, capacity, zeros=True))
@@ -113,12 +112,12 @@ class ClassRows:
         self.evicted += int(evicted.sum())
 
     def saved(self) -> dict[str, npt.NDArray[Any]]:
-        """The arrays in use, by name."""
+        """Return the arrays in use, by name."""
         rows = {name: getattr(self.evidence, name)[: self.row_count] for name in ROW_ARRAYS}
         return {"unmasked": self.evidence.unmasked[: self.voxels.block_count], **rows}
 
     def fill(self, arrays: dict[str, npt.NDArray[Any]], classes: int) -> None:
-        """Takes the arrays that `saved` gave, of a map with so many classes. Raises DataError where they do not fit."""
+        """Take over the arrays of a saved map with so many classes. Raises DataError if they are invalid."""
         free = self.evidence._asdict()
         check_like(arrays, {"unmasked": free.pop("unmasked")}, self.voxels.block_count)
         check_like(arrays, free, len(arrays["rest"]))
@@ -130,7 +129,7 @@ class ClassRows:
         self.row_count = len(self.evidence.rest)
 
     def _add_rows(self, blocks: Int32) -> None:
-        """Gives each of these blocks a row, in the order given."""
+        """Give each of these blocks a row, in the order given."""
         needed = self.row_count + len(blocks)
         if needed > len(self.evidence.rest):
             capacity = max(needed, 2 * len(self.evidence.rest))
@@ -148,18 +147,18 @@ class ClassRows:
 
 
 def _check_order(class_ids: UInt8, log_ratio: Float32, rest: Float32, classes: int) -> None:
-    """Raises DataError unless the best class is in slot 0, and `rest` far from above all where it stands for none."""
+    """Raise DataError unless the best class is in slot 0, and `rest` is not too large if no class is unnamed."""
     named = class_ids != NO_CLASS
     ratios = np.where(named, log_ratio, np.float32(-np.inf))
     best = ratios.max(axis=-1, initial=-np.inf)
     if (ratios[..., :1] < best[..., None]).any():
         raise DataError("log_ratio must have the best class of each voxel in slot 0")
-    if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MOST_EXPONENT)).any():
+    if ((named.sum(axis=-1) == classes) & (rest - np.maximum(best, 0) > MAX_EXPONENT)).any():
         raise DataError("rest is too large in a voxel that names all classes")
 
 
 def _free_rows(class_slots: int) -> ClassEvidence:
-    """No evidence for any block yet."""
+    """Return evidence for no blocks."""
     voxels = (0, BLOCK_VOXELS)
     return ClassEvidence(
         unmasked=np.empty(voxels, np.uint16),

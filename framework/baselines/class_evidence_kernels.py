@@ -9,16 +9,16 @@ from framework.mapping.labels.class_slots import ALL_NAMED, NEW_CLASSES, NO_CLAS
 from framework.mapping.labels.label_evidence_kernels import best_first
 from framework.mapping.voxels.voxel_grid_kernels import device
 
-MOST_FRAMES = np.uint16(65535)  # that a voxel counts
+MAX_FRAMES = np.uint16(65535)  # that a voxel counts
 
 
 @njit(cache=True, nogil=True)
-def best_clusters(first, cluster, scores):
-    """(L,) the cluster of each list with the best score, of equal ones the first, -1 = there is none."""
-    best = np.full(first.shape[0] - 1, -1, np.int32)
+def best_clusters(offsets, clusters, scores):
+    """Return the cluster of each list (L,) with the best score, the first one of equals; -1 = there is none."""
+    best = np.full(offsets.shape[0] - 1, -1, np.int32)
     for i in range(best.shape[0]):
-        for place in range(first[i], first[i + 1]):
-            k, found = cluster[place], best[i]
+        for entry in range(offsets[i], offsets[i + 1]):
+            k, found = clusters[entry], best[i]
             if found < 0 or scores[k] > scores[found] or (scores[k] == scores[found] and k < found):
                 best[i] = k
     return best
@@ -26,9 +26,9 @@ def best_clusters(first, cluster, scores):
 
 @device
 def best_class(grid, evidence, log_missed, block, n):
-    """The likeliest class of a voxel, -1 when that is the background; a tie is the background's.
+    """Return the most likely class of a voxel, -1 = the background, which wins ties.
 
-    `log_missed` is what each frame that saw the voxel under no mask says for every class over the background.
+    `log_missed` is the evidence, for every class over the background, of a frame that saw the voxel under no mask.
     """
     row = grid.label_row[block]
     if row < 0 or evidence.class_ids[row, n, 0] == NO_CLASS:
@@ -39,7 +39,7 @@ def best_class(grid, evidence, log_missed, block, n):
 
 @device
 def _add_class(labels, sums, label, total):
-    """Gives a class its slot, the least likely one's if none is free. Returns 1 when a class was dropped."""
+    """Give a class a free slot or that of the least likely class. Returns 1 if a class was evicted."""
     least = 0
     for s in range(len(labels)):
         if labels[s] == NO_CLASS:
@@ -56,7 +56,7 @@ def _add_class(labels, sums, label, total):
 
 @device
 def observe_mask(evidence, row, n, masks, k):
-    """One step of the recursion for a voxel that a frame sees under cluster k. Returns the number of evictions."""
+    """Apply the recursion to a voxel that a frame sees under cluster k. Returns the number of evictions."""
     labels, sums = evidence.class_ids[row, n], evidence.log_ratio[row, n]
     known = 0  # bits of the named classes that have a slot
     for s in range(len(labels)):
@@ -71,9 +71,9 @@ def observe_mask(evidence, row, n, masks, k):
             break
         if not (known >> m) & 1:
             evicted += _add_class(labels, sums, label, evidence.rest[row, n] + masks.log_ratio[k, label])
-    evidence.rest[row, n] += masks.rest[k]
+    evidence.rest[row, n] += masks.unnamed[k]
     best_first(labels, sums, NO_CLASS)
-    if evidence.masked[row, n] < MOST_FRAMES:
+    if evidence.masked[row, n] < MAX_FRAMES:
         evidence.masked[row, n] += 1
     if evidence.first_frame[row, n] < 0:
         evidence.first_frame[row, n] = masks.frame
@@ -83,12 +83,12 @@ def observe_mask(evidence, row, n, masks, k):
 
 @njit(cache=True, nogil=True, parallel=True)
 def find_blocks_under_masks(grid, seen, cluster, wants_row):
-    """Notes in wants_row (A,) the blocks without a row that have a voxel under some mask."""
+    """Fill wants_row (A,) with whether a block has no row, and a voxel under a mask."""
     for a in prange(seen.blocks.shape[0]):
         wants_row[a] = False
-        first = seen.near_first[a]
+        start = seen.near_first[a]
         if grid.label_row[seen.blocks[a]] < 0:
-            for i in range(first, first + seen.near_count[a]):
+            for i in range(start, start + seen.near_count[a]):
                 if cluster[seen.near_pixel[i]] >= 0:
                     wants_row[a] = True
                     break
@@ -96,17 +96,17 @@ def find_blocks_under_masks(grid, seen, cluster, wants_row):
 
 @njit(cache=True, nogil=True, parallel=True)
 def update_classes(grid, seen, evidence, masks, evicted):
-    """Updates the near voxels of the seen blocks; evicted (A,) counts slots given away."""
-    unmasked = evidence.unmasked  # numba 0.68 loses what is assigned to an element of a tuple's array within prange
+    """Update the near voxels of the seen blocks; evicted (A,) gets the evictions of each block."""
+    unmasked = evidence.unmasked  # numba 0.68 loses assignments to an element of a tuple's array within prange
     for a in prange(seen.blocks.shape[0]):
         evicted[a] = 0
         block = seen.blocks[a]
         row = grid.label_row[block]
-        first = seen.near_first[a]
-        for i in range(first, first + seen.near_count[a]):
+        start = seen.near_first[a]
+        for i in range(start, start + seen.near_count[a]):
             n = seen.near_voxel[i]
             k = masks.cluster[seen.near_pixel[i]]
             if k >= 0:
                 evicted[a] += observe_mask(evidence, row, n, masks, k)
-            elif unmasked[block, n] < MOST_FRAMES:
+            elif unmasked[block, n] < MAX_FRAMES:
                 unmasked[block, n] += 1

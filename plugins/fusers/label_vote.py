@@ -25,9 +25,9 @@ class Vote(Enum):
 
 
 RULES = {
-    Vote.COUNT: LabelRule(Combine.SUM, logarithmic=False, units=1),
+    Vote.COUNT: LabelRule(Combine.SUM, logarithmic=False, score_scale=1),
     Vote.LAST: LabelRule(Combine.LATEST, logarithmic=False),
-    Vote.MAX_SCORE: LabelRule(Combine.LARGEST, logarithmic=False, units=1 << 14),  # scores are at most 1
+    Vote.MAX_SCORE: LabelRule(Combine.LARGEST, logarithmic=False, score_scale=1 << 14),  # scores are at most 1
 }
 
 

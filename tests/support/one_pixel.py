@@ -4,11 +4,11 @@ import numpy as np
 
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NO_CLASS
 from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
-from framework.mapping.labels.label_evidence import Evidence, Measurement, class_said, named_classes
+from framework.mapping.labels.label_evidence import Evidence, Measurement, named_classes, pack_class_scores
 from framework.mapping.labels.label_evidence_kernels import Combine
 
 FLOOR = 0.05
-UNITS = 1 << 16  # as fine as in exact storage
+SCORE_SCALE = 1 << 16  # as fine as in exact storage
 BARE, COVERED = np.int32(0), np.int32(1)  # numbers of the lists of clusters over the pixel: none, all of a measurement
 
 
@@ -34,7 +34,7 @@ def measured(
     said = np.flatnonzero(ids).astype(np.int32)
     matched = np.zeros(last_id + 1, np.bool_)
     matched[ids] = True
-    gains, named, bits = named_classes(np.log(distributions), logarithmic=True)
+    relative, named, bits = named_classes(np.log(distributions), logarithmic=True)
     return Measurement(
         np.full((1, 1), COVERED),
         np.array([0, 0, len(said)], np.int32),
@@ -43,7 +43,7 @@ def measured(
         np.log(np.array(scores) / FLOOR).astype(np.float32),
         np.float32(np.log(absence)),
         matched,
-        class_said(gains, UNITS, bits, np.int64),
+        pack_class_scores(relative, SCORE_SCALE, bits, np.int64),
         named,
         int(Combine.SUM),
         1 << 62,
@@ -54,11 +54,11 @@ def voted(ids: list[int], weights: list[float], classes: list[int], combine: Com
     """Clusters over the one pixel, each for an instance and one class, by a rule that is not Bayes'."""
     evidence = np.zeros((len(ids), number))
     evidence[np.arange(len(ids)), classes] = weights
-    gains, named, bits = named_classes(evidence, logarithmic=False)
+    relative, named, bits = named_classes(evidence, logarithmic=False)
     every = measured(ids, weights, np.full((len(ids), 1), 1.0), 1.0, max(ids))
     return every._replace(
-        instance_gain=np.array(weights, np.float32),
-        class_said=class_said(gains, 100, bits, np.int64),
+        instance_log_odds=np.array(weights, np.float32),
+        class_scores=pack_class_scores(relative, 100, bits, np.int64),
         named_classes=named,
         combine=int(combine),
     )

@@ -1,9 +1,9 @@
-"""Data association: which instance of the map is each cluster of the frame?
+"""Data association of a frame's clusters with the instances of the map.
 
-A cluster's pixels vote for the instances that the map holds at the surface measured there. Which pairs may match is
-said by their overlap, by default over the smaller of the two, so that a part of an object still finds the whole; among
-those, one cluster gets at most one instance and the reverse, best IoU first, so that a table does not get the book that
-lies on it. A cluster that finds none there looks for one among the next likeliest ones, before it makes another.
+The pixels of a cluster vote for the instances of the map at the measured surface. Pairs may match if their overlap is
+large enough, by default over the smaller of the two, so that a part of an object matches the whole. Matching is one to
+one, best IoU first, so that a table does not match the book on it. An unmatched cluster is compared with the second
+most likely instances of the voxels before it creates a new one.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from framework.errors import DataError
 from framework.mapping.instances.association_kernels import count_votes, find_seen
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.instances.object_embedding import ObjectEmbedding, agreed_space
-from framework.mapping.labels.pixel_lists import PixelLists, cover_another
+from framework.mapping.labels.pixel_lists import PixelLists, find_duplicates
 from framework.mapping.labels.pixel_lists_kernels import CHUNKS
 
-VOTES_ACROSS = 320  # pixels of an image row that vote: more cost time and tell the same
+VOTES_ACROSS = 320  # pixels of an image row that vote; more take time without a benefit
 
 
 class OverlapRule(Enum):
-    """What shared pixels are compared with."""
+    """The denominator of an overlap."""
 
     SMALLER = "the smaller of cluster and instance: a part of an object still finds the whole"
     IOU = "all pixels of either"
@@ -40,7 +40,7 @@ class OverlapRule(Enum):
 
 @dataclass(frozen=True)
 class Overlaps:
-    """How N clusters lie on the M instances that the frame sees."""
+    """The overlap of N clusters with the M instances that the frame sees."""
 
     instance_ids: Int32  # (M,) ascending
     visible: Int32  # (M,) pixels that see each instance
@@ -48,40 +48,37 @@ class Overlaps:
     votes: Int32  # (N, M) pixels of both
     seen: Int32  # (h, w) the instance at every `stride`-th pixel of every `stride`-th row, 0 = none
     stride: int
-    hidden: Int32 | None = None  # (h, w) likewise the next likeliest ones; None = the map does not tell
+    hidden: Int32 | None = None  # (h, w) the second most likely instances; None = the map does not know them
 
-    def by(self, rule: OverlapRule, least: int) -> npt.NDArray[np.float64]:
-        """(N, M) overlaps in [0, 1] by one of the rules, with `least` as in `over_smaller`."""
+    def by(self, rule: OverlapRule, min_pixels: int) -> npt.NDArray[np.float64]:
+        """Return the overlaps (N, M) in [0, 1] by a rule; `min_pixels` as in `over_smaller`."""
         if rule is OverlapRule.CLUSTER:
-            return np.asarray(self.votes / np.maximum(self.sizes[:, None], least))
-        return self.over_smaller(least) if rule is OverlapRule.SMALLER else self.over_union(least)
+            return np.asarray(self.votes / np.maximum(self.sizes[:, None], min_pixels))
+        return self.over_smaller(min_pixels) if rule is OverlapRule.SMALLER else self.over_union(min_pixels)
 
-    def over_union(self, least: int) -> npt.NDArray[np.float64]:
-        """(N, M) shared pixels over those of cluster or visible instance, counted as at least `least`, in [0, 1]."""
+    def over_union(self, min_pixels: int) -> npt.NDArray[np.float64]:
+        """Return IoUs (N, M) in [0, 1] of clusters and visible instances; unions count at least `min_pixels`."""
         union = self.sizes[:, None] + self.visible[None, :] - self.votes
-        return np.asarray(self.votes / np.maximum(union, least))
+        return np.asarray(self.votes / np.maximum(union, min_pixels))
 
-    def over_smaller(self, least: int) -> npt.NDArray[np.float64]:
-        """(N, M) shared pixels over the smaller of cluster and visible instance, in [0, 1].
+    def over_smaller(self, min_pixels: int) -> npt.NDArray[np.float64]:
+        """Return shared pixels (N, M) over the smaller of cluster and visible instance, in [0, 1].
 
-        The smaller one counts for at least `least` pixels: a few stray voxels of an instance under a cluster would
-        otherwise overlap it completely, and win it from the instance that it belongs to.
+        The smaller one counts at least `min_pixels`: otherwise a few stray voxels under a cluster would overlap it
+        completely, and match it instead of its own instance.
         """
-        return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), least)
+        return self.votes / np.maximum(np.minimum(self.sizes[:, None], self.visible[None, :]), min_pixels)
 
 
 def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> Overlaps:
-    """Votes of the clusters' pixels on `instance_ids` (h, w), the instances seen at every stride-th pixel.
-
-    Each sample counts for the stride^2 pixels that it stands for.
-    """
+    """Return the overlaps with `instance_ids` (h, w) at every stride-th pixel, each counted stride^2 times."""
     is_seen = np.zeros(instance_ids.max() + 1, np.bool_)
     find_seen(instance_ids, is_seen)
     seen = np.flatnonzero(is_seen)
-    column = np.full(len(is_seen), len(seen), np.int32)  # of each id in votes; the last one stands for no instance
+    column = np.full(len(is_seen), len(seen), np.int32)  # of each id in `votes`; the last one = no instance
     column[seen] = np.arange(len(seen), dtype=np.int32)
     by_chunk = np.zeros((CHUNKS, points.cluster_count + 1, len(seen) + 1), np.int32)
-    count_votes(points.of_pixel, points.first, points.cluster, instance_ids, stride, column, by_chunk)
+    count_votes(points, instance_ids, stride, column, by_chunk)
     votes = by_chunk.sum(axis=0, dtype=np.int32) * np.int32(stride**2)
     return Overlaps(
         instance_ids=seen.astype(np.int32),
@@ -94,14 +91,14 @@ def count_overlaps(points: PixelLists, instance_ids: Int32, stride: int = 1) -> 
 
 
 def class_agreement(clusters: Float32, instances: Float32) -> npt.NDArray[np.float64]:
-    """(N, M) how alike distributions (N, C) and (M, C) are: their Bhattacharyya coefficient, in [0, 1], 1 = equal."""
+    """Return the Bhattacharyya coefficients (N, M) of distributions (N, C) and (M, C), in [0, 1], 1 = equal."""
     return np.asarray(np.sqrt(clusters.astype(np.float64)) @ np.sqrt(instances.astype(np.float64)).T)
 
 
 def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int32:
-    """(N,) the column that each row is matched with, -1 = none: of the `allowed` pairs (N, M) the most preferred first.
+    """Return the column (N,) of each row in a greedy matching of the `allowed` pairs (N, M), most preferred first.
 
-    Ties go to the smaller column, then to the smaller row.
+    -1 = unmatched. Ties go to the smaller column, then to the smaller row.
     """
     match = np.full(len(allowed), -1, np.int32)
     rows, columns = np.nonzero(allowed)
@@ -115,40 +112,40 @@ def match_one_to_one(allowed: Bool, preference: npt.NDArray[np.float64]) -> Int3
 
 
 def vote_stride(camera: Camera) -> int:
-    """Every so many pixels of every so many rows vote."""
+    """Return the distance of the pixels and rows that vote."""
     return max(1, camera.width // VOTES_ACROSS)
 
 
 class LabeledMap(Protocol):
-    """What association needs of a map: a table of its instances, and voxels that know to which of them they belong."""
+    """A map with an instance table and instance labels in its voxels, as association needs it."""
 
     table: InstanceTable
 
     def instances_seen(self, frame: Frame, T_world_camera: Float64, stride: int) -> Int32:
-        """(L, ceil(H / stride), ceil(W / stride)) the L likeliest instances at the measured surface, 0 = none.
+        """Return the L most likely instances (L, ceil(H / stride), ceil(W / stride)) at the measured surface, 0 = none.
 
-        Looked up at every stride-th reading of every stride-th row of `frame.depth`. Unlike a ray-cast, this cannot see
-        an instance behind an object that is new.
+        Samples every stride-th reading of every stride-th row of `frame.depth`. Unlike a ray-cast, this cannot see an
+        instance behind a new object.
         """
 
     def merge(self, kept: int, dropped: int) -> None:
-        """Makes instance `dropped` a part of `kept`, in the table and in every voxel."""
+        """Merge instance `dropped` into `kept`, in the table and in every voxel."""
 
 
 @dataclass(frozen=True)
 class Matches:
-    """Which instances a frame's N clusters are."""
+    """The instances of a frame's N clusters."""
 
     frame_index: int
     clusters: PointClusters
-    overlaps: Overlaps  # with the instances that the map had before
+    overlaps: Overlaps  # with the instances of the map before this frame
     instance_ids: Int32  # (N,) an old or a new one, 0 = none
 
 
-def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, least: int) -> None:
-    """Brings the table up to date: `class_evidence` (N, C) is what the clusters say, combined as the table does it.
+def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, min_pixels: int) -> None:
+    """Update the table with the `class_evidence` (N, C) of the clusters.
 
-    An instance is in view where at least `least` pixels see it, or where it was detected.
+    An instance is in view if at least `min_pixels` see it, or if it was detected.
     """
     instance_ids, scores = matches.instance_ids, matches.clusters.scores
     embeddings = weighted_embeddings(matches.clusters)
@@ -157,22 +154,22 @@ def observe(table: InstanceTable, matches: Matches, class_evidence: Float64, lea
     for k in np.flatnonzero(instance_ids):
         score, embedding = float(scores[k]), embeddings.get(int(k))
         table.observe(int(instance_ids[k]), class_evidence[k], score, matches.frame_index, embedding)
-    in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= least].tolist())
+    in_view = set(matches.overlaps.instance_ids[matches.overlaps.visible >= min_pixels].tolist())
     for instance_id in in_view | set(instance_ids[instance_ids > 0].tolist()):
         table.records[instance_id].in_view.add(matches.frame_index)
 
 
 def weighted_embeddings(clusters: PointClusters) -> Mapping[int, ObjectEmbedding]:
-    """The clusters' embeddings by cluster, each with the detection's score for a weight, as far as they have any."""
+    """Return the embeddings by cluster, weighted with the scores, of the clusters that have one."""
     if clusters.embeddings is None:
         return {}
-    there = np.flatnonzero(clusters.embeddings.any(axis=1) & (clusters.scores > 0))
-    return {int(k): ObjectEmbedding.of(clusters.embeddings[k], float(clusters.scores[k])) for k in there}
+    embedded = np.flatnonzero(clusters.embeddings.any(axis=1) & (clusters.scores > 0))
+    return {int(k): ObjectEmbedding.of(clusters.embeddings[k], float(clusters.scores[k])) for k in embedded}
 
 
 @dataclass
 class Association:
-    """A frame's clusters update the instances that the map has, or make new ones; instances seen as one are merged."""
+    """Clusters update matched instances or create new ones; instances that are detected as one are merged."""
 
     min_overlap: float = 0.35  # in [0, 1]: a cluster updates an instance above this overlap
     overlap_rule: OverlapRule = OverlapRule.SMALLER  # what an overlap is counted over
@@ -202,10 +199,10 @@ class Association:
             merge_frames=(1, 2**31),
             merge_agreement=(0.0, 1.0),
         )
-        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that see two as one, less those that do not
+        self._merge_votes: Counter[tuple[int, int]] = Counter()  # frames that detect two as one, minus other frames
 
     def look_up(self, scene: LabeledMap, frame: Frame, pose: Pose, points: PixelLists) -> Overlaps:
-        """How the clusters over each pixel lie on the instances that the map has at the measured surface."""
+        """Return the overlaps of the clusters with the instances of the map at the measured surface."""
         stride = vote_stride(frame.camera)
         seen, *hidden = scene.instances_seen(frame, pose.T_world_camera, stride)
         overlaps = count_overlaps(points, seen, stride)
@@ -214,7 +211,7 @@ class Association:
     def associate(
         self, table: InstanceTable, overlaps: Overlaps, clusters: PointClusters, points: PixelLists, frame_index: int
     ) -> Matches:
-        """Matches each cluster with an instance that overlaps enough, or creates one where it is good enough."""
+        """Match each cluster with an instance that overlaps enough, or create one if its score and size suffice."""
         frame_index = table.number_of(frame_index)
         allowed = overlaps.by(self.overlap_rule, self.create_points) > self.min_overlap
         allowed &= self._agree(table, clusters, overlaps.instance_ids)
@@ -226,7 +223,7 @@ class Association:
         if not self.split_instances:
             may_create &= ~allowed.any(axis=1)
         if may_create.any():
-            may_create &= ~cover_another(points, clusters.scores, self.duplicate_overlap)
+            may_create &= ~find_duplicates(points, clusters.scores, self.duplicate_overlap)
         if overlaps.hidden is not None and may_create.any():
             hidden = count_overlaps(points, overlaps.hidden, overlaps.stride)
             self._find_hidden(table, hidden, clusters, may_create, instance_ids)
@@ -237,10 +234,10 @@ class Association:
     def _find_hidden(
         self, table: InstanceTable, hidden: Overlaps, clusters: PointClusters, may_create: Bool, instance_ids: Int32
     ) -> None:
-        """Fills in instance_ids (N,) the instances of clusters that may create one, and have one under another already.
+        """Fill instance_ids (N,) with second most likely instances of clusters that would create a new one.
 
-        A keyboard on a desk that was known before it is such an instance, until enough has been said for it. A new one
-        in every frame would never get enough to be seen.
+        A keyboard on a desk that was mapped earlier is such an instance, until it has enough evidence. If each frame
+        created a new instance, none would ever get enough.
         """
         free = ~np.isin(hidden.instance_ids, instance_ids)
         allowed = may_create[:, None] & free & (hidden.by(self.overlap_rule, self.create_points) > self.min_overlap)
@@ -254,18 +251,18 @@ class Association:
         instance_ids[match >= 0] = hidden.instance_ids[match[match >= 0]]
 
     def _agree(self, table: InstanceTable, clusters: PointClusters, instance_ids: Int32) -> Bool:
-        """(N, M) whether a cluster may be the same thing as an instance, by their classes."""
+        """Return (N, M) whether the classes of a cluster and an instance allow a match."""
         if self.min_class_agreement == 0 or not len(instance_ids):
             return np.ones((len(clusters), len(instance_ids)), np.bool_)
         known = np.stack([table.class_probabilities(table.records[int(k)]) for k in instance_ids])
         return class_agreement(clusters.class_probabilities, known) >= self.min_class_agreement
 
     def observe(self, table: InstanceTable, matches: Matches, class_evidence: Float64) -> None:
-        """Brings the table of instances up to date with what this frame saw."""
+        """Update the instance table with the matches of this frame."""
         observe(table, matches, class_evidence, self.create_points)
 
     def merge(self, scene: LabeledMap, matches: Matches) -> None:
-        """Merges two instances that keep lying under one cluster and are hardly ever seen as two (after Voxblox++)."""
+        """Merge two instances that are often under one cluster, and rarely detected as two (after Voxblox++)."""
         matched = sorted(set(matches.instance_ids[matches.instance_ids > 0].tolist()))
         self._merge_votes.subtract(combinations(matched, 2))
         for k, row in enumerate(matches.overlaps.over_smaller(self.create_points)):
@@ -277,14 +274,10 @@ class Association:
                 if self._merge_votes[pair] >= self.merge_frames and self._same_class(scene.table, *pair):
                     scene.merge(*pair)
                     self._forget(pair[1])
-                    return  # overlaps are out of date now; what else is to be merged will be seen again
+                    return  # the overlaps are outdated now; other pairs will be detected again
 
     def _same_class(self, table: InstanceTable, a: int, b: int) -> bool:
-        """Whether two instances may be one thing, by their classes: a book is not the table that it lies on.
-
-        The default was chosen on replica_floor2 and ScanNet's scene0000_00, with maskrcnn2go and YOLO11n-seg: 0.1 and
-        0.5 gave the same figures there, and AP50 was lower than without in none of 18 pairs.
-        """
+        """Return whether the classes of two instances allow a merge: a book is not the table that it lies on."""
         known = [table.class_probabilities(table.records[k])[None] for k in (a, b)]
         return bool(class_agreement(*known)[0, 0] >= self.merge_agreement)
 
@@ -293,9 +286,9 @@ class Association:
 
 
 def agreed_classes(known: tuple[str, ...], found: tuple[str, ...]) -> tuple[str, ...]:
-    """The map's label space, which is that of its first frame: `known` is () before.
+    """Return the label space of a map, that of its first frame; `known` is () before.
 
-    Raises DataError unless a frame's clusters have that of the map.
+    Raises DataError if a later frame has another one.
     """
     if known and known != found:
         raise DataError(

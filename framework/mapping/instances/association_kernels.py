@@ -20,11 +20,8 @@ from framework.mapping.voxels.voxel_walk import prefetch_element
 def look_up_instances(
     grid: Grid, evidence: Evidence, depth: Float32, view: Pinhole, stride: int, instance_ids: Int32
 ) -> None:
-    """Fills instance_ids (2, ceil(H / stride), ceil(W / stride)) with the likeliest instance of the voxel nearest to
-    every stride-th reading of every stride-th row of `depth` (H, W), and with the next likeliest one; 0 = none.
-
-    This is the view of the map at the measured surface: unlike a ray-cast it cannot see an instance behind an object
-    that is new, and it costs one look-up a pixel. `view` holds T_world_camera.
+    """Fill instance_ids (2, ceil(H / stride), ceil(W / stride)) with the two most likely instances of the voxel nearest
+    to every stride-th reading of every stride-th row of `depth` (H, W), 0 = none. `view` holds T_world_camera.
     """
     columns = instance_ids.shape[2]
     for row in prange(instance_ids.shape[1]):
@@ -39,7 +36,7 @@ def look_up_instances(
                 rows[column], voxels[column] = label_row(grid, block), n
                 if rows[column] >= 0:
                     prefetch_element(evidence.labeled, rows[column], n)
-        # in passes of their own, each of which has the memory asked for that the next one needs
+        # separate passes, each of which prefetches the memory of the next one
         for column in range(columns):
             voxel = evidence.labeled[rows[column], voxels[column]] if rows[column] >= 0 else np.int32(-1)
             voxels[column] = voxel
@@ -53,35 +50,36 @@ def look_up_instances(
 
 @njit(cache=True, nogil=True)
 def find_seen(instance_ids, seen):
-    """Marks in seen (ids + 1,) the instances that occur in instance_ids (h, w)."""
+    """Mark the instances in instance_ids (h, w) in seen (ids + 1,)."""
     for instance in instance_ids.flat:
         if instance > 0:
             seen[instance] = True
 
 
 @device
-def _add_run(count, number, label, first, cluster, column, votes):
-    """Adds `count` pixels with a list's number and an instance to the votes (N + 1, M + 1) of its clusters, and of all
-    pixels, in the last row.
-    """
+def _add_run(count, list_id, label, offsets, clusters, column, votes):
+    """Add `count` pixels of a list and an instance to the votes (N + 1, M + 1) of its clusters, and of the last row."""
     votes[votes.shape[0] - 1, column[label]] += count
-    for place in range(first[number], first[number + 1]):
-        votes[cluster[place], column[label]] += count
+    for entry in range(offsets[list_id], offsets[list_id + 1]):
+        votes[clusters[entry], column[label]] += count
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def count_votes(of_pixel, first, cluster, instance_ids, stride, column, votes):
-    """Adds to votes (CHUNKS, N + 1, M + 1) the pixels of each cluster, and of any or none, that fall on the instance of
-    each column, by runs: a counter raised by one waits for itself.
+def count_votes(points, instance_ids, stride, column, votes):
+    """Add the pixels of each cluster, and in the last row all pixels, on the instance of each column to votes
+    (CHUNKS, N + 1, M + 1).
+
+    Counts runs of pixels, because a counter raised for each pixel would wait for its own memory.
     """
+    list_ids, offsets, clusters = points.list_ids, points.offsets, points.clusters
     rows = instance_ids.shape[0]
     for chunk in prange(CHUNKS):
-        number, label, count = np.int32(0), np.int32(0), np.int32(0)
+        list_id, label, count = np.int32(0), np.int32(0), np.int32(0)
         for row in range(chunk * rows // CHUNKS, (chunk + 1) * rows // CHUNKS):
-            for place in range(instance_ids.shape[1]):
-                i, found = of_pixel[row * stride, place * stride], instance_ids[row, place]
-                if i != number or found != label:
-                    _add_run(count, number, label, first, cluster, column, votes[chunk])
-                    number, label, count = i, found, np.int32(0)
+            for sample in range(instance_ids.shape[1]):
+                i, found = list_ids[row * stride, sample * stride], instance_ids[row, sample]
+                if i != list_id or found != label:
+                    _add_run(count, list_id, label, offsets, clusters, column, votes[chunk])
+                    list_id, label, count = i, found, np.int32(0)
                 count += np.int32(1)
-        _add_run(count, number, label, first, cluster, column, votes[chunk])
+        _add_run(count, list_id, label, offsets, clusters, column, votes[chunk])

@@ -1,8 +1,12 @@
-"""What is done to all class slots of a voxel at once.
+"""Operations on all class slots of a voxel.
 
-The sixteen of compact storage are one vector. LLVM unrolls so short a loop before it could make vectors of it, so the
-vectors are written out, in LLVM's own terms, which are the same for any little-endian processor. Exact storage has
-other types and more slots, and is done by loops, which say the same.
+The sixteen slots of compact storage are one SIMD vector. LLVM unrolls such a short loop before it can vectorize it, so
+these intrinsics emit vector instructions, which LLVM maps to any little-endian processor. Exact storage has other types
+and more slots, and uses loops with the same results.
+
+A quantized score is a log-odds (or a vote) times the scale of the label rule, rounded. `cluster_scores` (NO_CLASS + 1,)
+of a cluster hold it for each class in the upper bits, and in the lowest NEW_CLASSES bits which of the named classes it
+is.
 """
 
 from __future__ import annotations
@@ -18,61 +22,60 @@ from framework.mapping.voxels.voxel_grid_kernels import device
 
 CLASS_SLOTS = 16  # of a voxel in compact storage
 NO_CLASS = 255  # in a free slot; slots are filled from the front
-NEW_CLASSES = 8  # a detection can bring its best so many classes into a voxel's slots
+NEW_CLASSES = 8  # classes that a cluster names: those that it can bring into the slots of a voxel
 ALL_NAMED = (1 << NEW_CLASSES) - 1
 
 _OPTIONS = {"forceinline": True, "error_model": "numpy", "_nrt": False}  # as those of `device`
 
 
 @device
-def add_said(classes, units, said_by, most):
-    """Adds to the `units` (T,) of a voxel's `classes` (T,) what is said of each, said_by (NO_CLASS + 1,) as by
-    class_said(); they stay at -most or above.
+def add_scores(classes, scores, cluster_scores, limit):
+    """Add the scores of a cluster to the scores (T,) of a voxel's classes (T,), which stay at -limit or above.
 
-    Returns (the bits of what is said of all of them, how many slots are filled, by how much the most units are above
-    `most`).
+    Returns the bits of the named classes that have a slot, the number of filled slots, and the excess of the largest
+    score over `limit`.
     """
-    return _add_said(classes, units, said_by, most)
+    return _add_scores(classes, scores, cluster_scores, limit)
 
 
 @device
-def likeliest_slot(classes, units):
-    """The slot of the class with the most units; a tie goes to the smaller class."""
-    return _likeliest_slot(classes, units)
+def most_likely_slot(classes, scores):
+    """Return the slot with the highest score; the smaller class wins a tie."""
+    return _most_likely_slot(classes, scores)
 
 
 @device
-def least_likely_slot(units):
-    """The first of the slots with the fewest units."""
-    return _least_likely_slot(units)
+def least_likely_slot(scores):
+    """Return the first of the slots with the lowest score."""
+    return _least_likely_slot(scores)
 
 
-def _add_said(classes, units, said_by, most):
+def _add_scores(classes, scores, cluster_scores, limit):
     known = filled = 0
-    largest = -most
+    largest = -limit
     for s in range(len(classes)):
-        said = said_by[classes[s]]
-        units[s] = max(units[s] + (said >> NEW_CLASSES), -most)
-        largest = max(largest, units[s])
-        known |= said & ALL_NAMED
+        packed = cluster_scores[classes[s]]
+        scores[s] = max(scores[s] + (packed >> NEW_CLASSES), -limit)
+        largest = max(largest, scores[s])
+        known |= packed & ALL_NAMED
         filled += classes[s] != NO_CLASS
-    return known, filled, largest - most
+    return known, filled, largest - limit
 
 
-def _likeliest_slot(classes, units):
+def _most_likely_slot(classes, scores):
     best = 0
     for s in range(1, len(classes)):
         if classes[s] == NO_CLASS:
             break
-        if units[s] > units[best] or (units[s] == units[best] and classes[s] < classes[best]):
+        if scores[s] > scores[best] or (scores[s] == scores[best] and classes[s] < classes[best]):
             best = s
     return best
 
 
-def _least_likely_slot(units):
+def _least_likely_slot(scores):
     least = 0
-    for s in range(1, len(units)):
-        least = s if units[s] < units[least] else least
+    for s in range(1, len(scores)):
+        least = s if scores[s] < scores[least] else least
     return least
 
 
@@ -88,19 +91,18 @@ def _all(value: int, number: Any) -> Any:
 
 
 class _Slots:
-    """Writes LLVM's instructions for vectors of CLASS_SLOTS numbers: `context` and `builder` are an intrinsic's."""
+    """Emits LLVM instructions for vectors of CLASS_SLOTS numbers, with the `context` and `builder` of an intrinsic."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self.context = context
         self.builder = builder
 
     def address(self, array_type: Any, array: Any) -> Any:
-        """Where the numbers of an array lie, one behind the other."""
+        """Return the data pointer of a contiguous array."""
         return self.context.make_array(array_type)(self.context, self.builder, array).data
 
     def load(self, address: Any) -> Any:
-        number = address.type.pointee
-        loaded = self.builder.load(self.builder.bitcast(address, _vector(number).as_pointer()))
+        loaded = self.builder.load(self.builder.bitcast(address, _vector(address.type.pointee).as_pointer()))
         loaded.align = 1
         return loaded
 
@@ -108,28 +110,25 @@ class _Slots:
         stored = self.builder.store(vector, self.builder.bitcast(address, vector.type.as_pointer()))
         stored.align = 1
 
-    def look_up(self, table: Any, places: Any) -> Any:
-        """The numbers at the bytes `places` of a table."""
+    def gather(self, table: Any, indices: Any) -> Any:
+        """Return the entries of a table at the bytes `indices`."""
         found = ir.Constant(_vector(table.type.pointee), ir.Undefined)
         for s in range(CLASS_SLOTS):
-            place = self.builder.zext(self.builder.load(self.builder.gep(places, [_INT32(s)])), _INT32)
-            found = self.builder.insert_element(found, self.builder.load(self.builder.gep(table, [place])), _INT32(s))
+            index = self.builder.zext(self.builder.load(self.builder.gep(indices, [_INT32(s)])), _INT32)
+            found = self.builder.insert_element(found, self.builder.load(self.builder.gep(table, [index])), _INT32(s))
         return found
 
     def repeat(self, number: Any) -> Any:
-        nothing = ir.Constant(_vector(number.type), ir.Undefined)
-        first = self.builder.insert_element(nothing, number, _INT32(0))
-        return self.builder.shuffle_vector(first, nothing, _all(0, _INT32))
-
-    def larger(self, a: Any, b: Any) -> Any:
-        return self.builder.select(self.builder.icmp_signed(">", a, b), a, b)
+        undefined = ir.Constant(_vector(number.type), ir.Undefined)
+        single = self.builder.insert_element(undefined, number, _INT32(0))
+        return self.builder.shuffle_vector(single, undefined, _all(0, _INT32))
 
     def bits(self, conditions: Any) -> Any:
-        """A bit for each slot."""
+        """Return one bit per slot."""
         return self.builder.bitcast(conditions, ir.IntType(CLASS_SLOTS))
 
     def call(self, name: str, *arguments: Any, of: str = "i16") -> Any:
-        """One of LLVM's functions."""
+        """Call an LLVM intrinsic."""
         result = _INT32 if of.endswith("i32") else _INT16
         kind = ir.FunctionType(result, [argument.type for argument in arguments])
         function = cgutils.get_or_insert_function(self.builder.module, kind, f"llvm.{name}.{of}")
@@ -140,26 +139,27 @@ class _Slots:
 
 
 @intrinsic
-def _add_said_to_vector(_context: Any, classes: Any, units: Any, said_by: Any, most: Any) -> Any:
+def _add_scores_to_vector(_context: Any, classes: Any, scores: Any, cluster_scores: Any, limit: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         slots = _Slots(context, builder)
         ids, old, table = map(slots.address, signature.args[:3], arguments[:3])
-        least = builder.neg(builder.trunc(arguments[3], _INT32))
-        said = slots.look_up(table, ids)
-        gain = builder.ashr(said, _all(NEW_CLASSES, _INT32))
-        new = slots.larger(builder.add(builder.sext(slots.load(old), _vector(_INT32)), gain), slots.repeat(least))
+        lowest = builder.neg(builder.trunc(arguments[3], _INT32))
+        packed = slots.gather(table, ids)
+        added = builder.ashr(packed, _all(NEW_CLASSES, _INT32))
+        total, floor = builder.add(builder.sext(slots.load(old), _vector(_INT32)), added), slots.repeat(lowest)
+        new = builder.select(builder.icmp_signed(">", total, floor), total, floor)
         slots.store(builder.trunc(new, _vector(_INT16)), old)
-        known = builder.and_(slots.reduce("or", said), _INT32(ALL_NAMED))
+        known = builder.and_(slots.reduce("or", packed), _INT32(ALL_NAMED))
         named = slots.bits(builder.icmp_unsigned("!=", slots.load(ids), _all(NO_CLASS, _BYTE)))
         filled = builder.zext(slots.call("ctpop", named), _INT32)
-        too_much = builder.add(slots.reduce("smax", new), least)
-        return context.make_tuple(builder, signature.return_type, [known, filled, too_much])
+        excess = builder.add(slots.reduce("smax", new), lowest)
+        return context.make_tuple(builder, signature.return_type, [known, filled, excess])
 
-    return types.UniTuple(types.int32, 3)(classes, units, said_by, types.int64), generate
+    return types.UniTuple(types.int32, 3)(classes, scores, cluster_scores, types.int64), generate
 
 
 @intrinsic
-def _likeliest_of_vector(_context: Any, classes: Any, units: Any) -> Any:
+def _most_likely_of_vector(_context: Any, classes: Any, scores: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         slots = _Slots(context, builder)
         ids, values = (slots.load(slots.address(*pair)) for pair in zip(signature.args, arguments, strict=True))
@@ -170,46 +170,45 @@ def _likeliest_of_vector(_context: Any, classes: Any, units: Any) -> Any:
         best = builder.icmp_signed("==", rank, slots.repeat(slots.reduce("smax", rank)))
         return builder.zext(slots.call("cttz", slots.bits(best), _BIT(1)), _INT32)
 
-    return types.int32(classes, units), generate
+    return types.int32(classes, scores), generate
 
 
 @intrinsic
-def _least_likely_of_vector(_context: Any, units: Any) -> Any:
+def _least_likely_of_vector(_context: Any, scores: Any) -> Any:
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
         slots = _Slots(context, builder)
         values = builder.sext(slots.load(slots.address(signature.args[0], arguments[0])), _vector(_INT32))
-        place = ir.Constant(_vector(_INT32), list(range(CLASS_SLOTS)))
-        rank = builder.add(builder.mul(values, _all(CLASS_SLOTS, _INT32)), place)
+        index = ir.Constant(_vector(_INT32), list(range(CLASS_SLOTS)))
+        rank = builder.add(builder.mul(values, _all(CLASS_SLOTS, _INT32)), index)
         return builder.and_(slots.reduce("smin", rank), _INT32(CLASS_SLOTS - 1))
 
-    return types.int32(units), generate
+    return types.int32(scores), generate
 
 
 def _are_compact(*arrays: Any) -> bool:
-    """Whether class ids, units and what is said have the types of compact storage, which has CLASS_SLOTS of a voxel,
-    one behind the other.
-    """
-    return all(
-        array.dtype == kind for array, kind in zip(arrays, (types.uint8, types.int16, types.int32), strict=False)
-    )
+    """Return whether class ids, scores and cluster scores have the types of compact storage, with CLASS_SLOTS slots."""
+    kinds = (types.uint8, types.int16, types.int32)
+    return all(array.dtype == kind for array, kind in zip(arrays, kinds, strict=False))
 
 
-@overload(_add_said, jit_options=_OPTIONS)
-def _typed_add_said(classes, units, said_by, most):
-    if _are_compact(classes, units, said_by):
-        return lambda classes, units, said_by, most: _add_said_to_vector(classes, units, said_by, most)
-    return _add_said
+@overload(_add_scores, jit_options=_OPTIONS)
+def _typed_add_scores(classes, scores, cluster_scores, limit):
+    if _are_compact(classes, scores, cluster_scores):
+        return lambda classes, scores, cluster_scores, limit: _add_scores_to_vector(
+            classes, scores, cluster_scores, limit
+        )
+    return _add_scores
 
 
-@overload(_likeliest_slot, jit_options=_OPTIONS)
-def _typed_likeliest_slot(classes, units):
-    if _are_compact(classes, units):
-        return lambda classes, units: _likeliest_of_vector(classes, units)
-    return _likeliest_slot
+@overload(_most_likely_slot, jit_options=_OPTIONS)
+def _typed_most_likely_slot(classes, scores):
+    if _are_compact(classes, scores):
+        return lambda classes, scores: _most_likely_of_vector(classes, scores)
+    return _most_likely_slot
 
 
 @overload(_least_likely_slot, jit_options=_OPTIONS)
-def _typed_least_likely_slot(units):
-    if units.dtype == types.int16:
-        return lambda units: _least_likely_of_vector(units)
+def _typed_least_likely_slot(scores):
+    if scores.dtype == types.int16:
+        return lambda scores: _least_likely_of_vector(scores)
     return _least_likely_slot

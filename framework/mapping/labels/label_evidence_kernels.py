@@ -10,20 +10,20 @@ from framework.mapping.labels.class_slots import (
     ALL_NAMED,
     NEW_CLASSES,
     NO_CLASS,
-    add_said,
+    add_scores,
     least_likely_slot,
-    likeliest_slot,
+    most_likely_slot,
 )
 from framework.mapping.voxels.bit_slices import ONE, lowest_bit
 from framework.mapping.voxels.voxel_grid_kernels import device
 
 
 class Combine(IntEnum):
-    """How a label's new evidence meets the old one."""
+    """How new evidence for a label is combined with the old."""
 
     SUM = 0
     LARGEST = 1
-    LATEST = 2  # which also forgets what the other labels had
+    LATEST = 2  # removes the other labels
 
 
 UNBOUNDED = np.float32(np.inf)
@@ -32,26 +32,26 @@ SUM, LARGEST, LATEST = (int(combine) for combine in Combine)  # for the kernels
 
 @device
 def label_row(grid, block):
-    """The row of a block, -1 = of none, in Evidence.labeled; -1 if it has none."""
+    """Return the row of a block in Evidence.labeled, -1 if it has none; block -1 = no block."""
     return grid.label_row[block] if block >= 0 else np.int32(-1)
 
 
 @device
 def labeled_voxel(grid, evidence, block, n):
-    """The number of voxel n of a block, -1 = of none, among those that have slots; -1 if it has none."""
+    """Return the index of voxel n of a block among the labeled ones, -1 if it has no slots; block -1 = no block."""
     row = label_row(grid, block)
     return evidence.labeled[row, n] if row >= 0 else np.int32(-1)
 
 
 @device
 def best_instance(evidence, voxel):
-    """The most likely instance of a labelled voxel, 0 when none is more likely than the rest."""
+    """Return the most likely instance of a labeled voxel, 0 if the unnamed ones are more likely."""
     return evidence.instance_ids[voxel, 0] if evidence.instance_value[voxel, 0] > 0 else np.int32(0)
 
 
 @device
 def next_instance(evidence, voxel):
-    """The most likely instance of a labelled voxel after that in slot 0, 0 when none is more likely than the rest."""
+    """Return the second most likely instance of a labeled voxel, 0 if the unnamed ones are more likely."""
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(1, evidence.instance_ids.shape[1]):
@@ -64,9 +64,7 @@ def next_instance(evidence, voxel):
 
 @device
 def best_counted_instance(evidence, voxel, counts):
-    """The most likely instance of a labelled voxel among those that count, by id in counts; 0 when none is likelier
-    than the rest.
-    """
+    """Return the most likely instance of a labeled voxel with counts[id], 0 if the unnamed ones are more likely."""
     best = np.int32(0)
     best_value = np.float32(0.0)
     for s in range(evidence.instance_ids.shape[1]):
@@ -81,45 +79,43 @@ def best_counted_instance(evidence, voxel, counts):
 
 @device
 def best_class(evidence, voxel):
-    """The most likely class of a labelled voxel."""
+    """Return the most likely class of a labeled voxel."""
     return np.int32(evidence.class_ids[voxel, 0])
 
 
 @device
-def add_evidence(labels, values, free, label, gain, combine, most):
-    """Combines `gain` with a label's slot, to at most `most`, or gives it the free or least likely one.
+def add_evidence(labels, values, free, label, added, combine, limit):
+    """Combine evidence with the slot of a label, at most `limit`, or give the label the free or least likely slot.
 
-    Returns 1 when that evicted another.
+    Returns 1 if a label was evicted.
     """
     if combine == LATEST:
         for s in range(1, len(labels)):
             labels[s] = free
         labels[0] = label
-        values[0] = gain
+        values[0] = added
         return 0
     least = 0
     for s in range(len(labels)):
         if labels[s] == label:
-            values[s] = min(max(values[s] + gain, -most), most) if combine == SUM else max(values[s], gain)
+            values[s] = min(max(values[s] + added, -limit), limit) if combine == SUM else max(values[s], added)
             return 0
         if labels[s] == free:
             labels[s] = label
-            values[s] = gain
+            values[s] = added
             return 0
         if values[s] < values[least]:
             least = s
-    if values[least] >= gain:
-        return 1  # the newcomer is itself the least likely: it is the one that is dropped
+    if values[least] >= added:
+        return 1  # the new label is itself the least likely
     labels[least] = label
-    values[least] = gain
+    values[least] = added
     return 1
 
 
 @device
 def best_first(labels, values, free):
-    """Moves the most likely label to slot 0; ties go to the smaller label, so that the order of arrival does not
-    matter.
-    """
+    """Move the most likely label to slot 0; the smaller label wins a tie, so that order does not matter."""
     best = 0
     for s in range(1, len(labels)):
         if labels[s] == free:  # slots are filled from the front
@@ -132,24 +128,21 @@ def best_first(labels, values, free):
 
 
 @device
-def best_class_first(classes, units):
-    """best_first() of class slots."""
-    best = likeliest_slot(classes, units)
+def best_class_first(classes, scores):
+    """Move the most likely class to slot 0, as best_first()."""
+    best = most_likely_slot(classes, scores)
     if best > 0:
         classes[0], classes[best] = classes[best], classes[0]
-        units[0], units[best] = units[best], units[0]
+        scores[0], scores[best] = scores[best], scores[0]
 
 
 @device
-def sum_classes(classes, units, measurement, k):
-    """Adds what cluster k says to the class slots of a voxel.
-
-    Returns the number of evictions.
-    """
-    most, said_by = measurement.most_units, measurement.class_said[k]
-    known, filled, too_much = add_said(classes, units, said_by, most)
-    for s in range(filled if too_much > 0 else 0):  # the distances stay, and with them the likeliest class
-        units[s] = max(units[s] - too_much, -most)
+def sum_classes(classes, scores, measurement, k):
+    """Add the evidence of cluster k to the class slots of a voxel. Returns the number of evictions."""
+    limit, cluster_scores = measurement.max_score, measurement.class_scores[k]
+    known, filled, excess = add_scores(classes, scores, cluster_scores, limit)
+    for s in range(filled if excess > 0 else 0):  # keeps the differences, and so the most likely class
+        scores[s] = max(scores[s] - excess, -limit)
     evicted = 0
     rejected = False
     missing = np.uint64(ALL_NAMED & ~known)
@@ -161,28 +154,25 @@ def sum_classes(classes, units, measurement, k):
             break
         evicted += rejected
         if rejected:
-            continue  # so is each one after it, of which the cluster says less
-        gain = said_by[label] >> NEW_CLASSES
-        place = filled
+            continue  # the classes after it have lower scores
+        score = cluster_scores[label] >> NEW_CLASSES
+        slot = filled
         if filled < len(classes):
             filled += 1
         else:
             evicted += 1
-            place = least_likely_slot(units)
-            rejected = units[place] >= gain  # the newcomer is itself the least likely: it is the one that is dropped
+            slot = least_likely_slot(scores)
+            rejected = scores[slot] >= score  # the new class is itself the least likely
         if not rejected:
-            classes[place] = label
-            units[place] = gain
+            classes[slot] = label
+            scores[slot] = score
     return evicted
 
 
 @device
-def update_voxel(evidence, voxel, measurement, number):
-    """Both recursions for one labelled voxel, seen at a pixel with that `number` of a list of clusters.
-
-    Returns the number of evictions.
-    """
-    first, last = measurement.first[number], measurement.first[number + 1]
+def update_voxel(evidence, voxel, measurement, list_id):
+    """Apply both recursions to a labeled voxel whose pixel has the list `list_id`. Returns the number of evictions."""
+    start, end = measurement.offsets[list_id], measurement.offsets[list_id + 1]
     ids = evidence.instance_ids[voxel]
     id_values = evidence.instance_value[voxel]
     classes = evidence.class_ids[voxel]
@@ -190,22 +180,22 @@ def update_voxel(evidence, voxel, measurement, number):
     combine = measurement.combine
     evicted = 0
     absent = False
-    said = first < last
-    # evidence of absence: an instance that was found in this frame, but not here
+    named = start < end
+    # evidence of absence: an instance that was matched in this frame, but not at this pixel
     for s in range(len(ids) if measurement.absence < 0 else 0):
         if ids[s] == 0:  # slots are filled from the front
             break
         if measurement.matched[ids[s]]:
             covered = False
-            for place in range(first, last):
-                covered = covered or measurement.instance_id[measurement.cluster[place]] == ids[s]
+            for entry in range(start, end):
+                covered = covered or measurement.instance_id[measurement.clusters[entry]] == ids[s]
             if not covered:
                 id_values[s] += measurement.absence
                 absent = True
-    for place in range(first, last):
-        k = measurement.cluster[place]
+    for entry in range(start, end):
+        k = measurement.clusters[entry]
         evicted += add_evidence(
-            ids, id_values, 0, measurement.instance_id[k], measurement.instance_gain[k], combine, UNBOUNDED
+            ids, id_values, 0, measurement.instance_id[k], measurement.instance_log_odds[k], combine, UNBOUNDED
         )
         if combine == SUM:
             evicted += sum_classes(classes, class_values, measurement, k)
@@ -214,10 +204,10 @@ def update_voxel(evidence, voxel, measurement, number):
                 label = measurement.named_classes[k, m]
                 if m > 0 and label == measurement.named_classes[k, 0]:
                     break
-                gain = measurement.class_said[k, label] >> NEW_CLASSES
-                evicted += add_evidence(classes, class_values, NO_CLASS, label, gain, combine, measurement.most_units)
-    if (said or absent) and ids[1] != 0:
+                score = measurement.class_scores[k, label] >> NEW_CLASSES
+                evicted += add_evidence(classes, class_values, NO_CLASS, label, score, combine, measurement.max_score)
+    if (named or absent) and ids[1] != 0:
         best_first(ids, id_values, 0)
-    if said:
+    if named:
         best_class_first(classes, class_values)
     return evicted

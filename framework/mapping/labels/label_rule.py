@@ -1,4 +1,4 @@
-"""What detections say of instances and classes, and how a rule writes that into the voxels of a map."""
+"""Label rules: the evidence of detections for instances and classes, and its combination in the voxels."""
 
 from __future__ import annotations
 
@@ -16,59 +16,59 @@ from framework.mapping.instances.association import Matches, class_agreement
 from framework.mapping.instances.instance_list import Confirmation
 from framework.mapping.instances.instance_table import InstanceTable
 from framework.mapping.labels.evidence_rows import Storage
-from framework.mapping.labels.label_evidence import MOST_GAIN, MOST_UNITS, Measurement, class_said, named_classes
+from framework.mapping.labels.label_evidence import (
+    MAX_CLUSTER_SCORE,
+    MAX_SCORE,
+    Measurement,
+    named_classes,
+    pack_class_scores,
+)
 from framework.mapping.labels.label_evidence_kernels import Combine
-from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, leave_to_others
+from framework.mapping.labels.pixel_lists import PixelLists, keep_on_top, remove_supports
 from framework.mapping.voxels.integration_parameters import Sensor
 from framework.mapping.voxels.tsdf import VoxelHashing
 from framework.mapping.voxels.tsdf_volume import NO_BLOCKS
 
-OTHER_CLASS = 0.3  # Bhattacharyya coefficient of two distributions below which they are of different things
-EXACT_BITS = 16  # by which exact storage's units are finer
+OTHER_CLASS = 0.3  # Bhattacharyya coefficient below which two distributions are of different objects
+EXACT_BITS = 16  # by which class scores of exact storage are finer
 
 
 class LabelRule(NamedTuple):
-    """How what is said of a label is kept."""
+    """How the evidence for a label is stored."""
 
-    combine: Combine  # how new evidence for a label meets the old one
-    logarithmic: bool  # whether evidence is the logarithm of what it says, or proportional to it
-    units: int = 64  # that class evidence of 1 has in compact storage
+    combine: Combine  # how new evidence is combined with old
+    logarithmic: bool  # evidence is log-likelihoods; otherwise it is proportional, as votes are
+    score_scale: int = 64  # quantized class score of evidence 1 in compact storage
 
 
 class DetectionEvidence(NamedTuple):
-    """What a frame's N clusters say."""
+    """The evidence of a frame's N clusters."""
 
     instances: Float32  # (N,) for the instance that each is matched with, over any other
-    classes: Float64  # (N, C) of each class
-    absence: float = 0.0  # not above 0: for a matched instance, where it is not seen
+    classes: Float64  # (N, C) for each class
+    absence: float = 0.0  # <= 0, for a matched instance outside its mask
 
 
 def floored_log(class_probabilities: Float32, floor: float) -> Float64:
-    """(N, C) log P(O_u = c | I_t) of eq. [7], the uniform distribution mixed in by a share of `floor`.
+    """Return (N, C) log P(O_u = c | I_t) of eq. [7], mixed with a share `floor` of the uniform distribution.
 
-    No zero of a detector kills a class for good: sums of these are the product of the distributions.
+    So no class is ruled out by a zero of the detector.
     """
     p = class_probabilities.astype(np.float64)
     return np.asarray(np.log((1 - floor) * p + floor / max(p.shape[1], 1)))
 
 
 def vote_for_best(clusters: PointClusters, weights: Float32) -> DetectionEvidence:
-    """Each cluster counts with its weight (N,) for its instance and for its most likely class, and for nothing else."""
+    """Return votes with the weights (N,) of the clusters for their instances and their most likely classes."""
     classes = np.zeros(clusters.class_probabilities.shape)
     if len(clusters):
         classes[np.arange(len(clusters)), clusters.class_probabilities.argmax(axis=1)] = weights
     return DetectionEvidence(weights, classes)
 
 
-def check_same(name: str, was: object, now: object) -> None:
-    """Raises ConfigError unless a map from before was made with the parameter that it is to be gone on with."""
-    if was != now:
-        raise ConfigError(f"the map was made with {name} {was}, and cannot be gone on with by {now}")
-
-
 @dataclass
 class LabeledVoxels:
-    """Our own voxels, with labels as evidence."""
+    """Voxel blocks with label evidence."""
 
     hashing: VoxelHashing = field(default_factory=VoxelHashing)
     confirmation: Confirmation = field(default_factory=Confirmation)
@@ -84,20 +84,30 @@ class LabeledVoxels:
         check_bounds(self, occlusion_area_ratio=(0.0, 1.0), support_overlap=(0.0, 1.0))
 
     def new_map(self, rule: LabelRule) -> InstanceMap:
-        """An empty one for labels by this rule."""
+        """Return an empty map for this rule."""
         return InstanceMap(self.hashing.new_volume(), self.confirmation, rule.combine, rule.logarithmic, self.storage)
 
     def continued(self, scene: SceneMap, rule: LabelRule) -> InstanceMap:
-        """A map from before, to be written with these parameters. Raises ConfigError unless it was made with them."""
+        """Prepare a stored map for new frames. Raises ConfigError if it has other parameters or another rule."""
         if not isinstance(scene, InstanceMap):
-            raise ConfigError(f"a {type(scene).__name__} cannot be gone on with; the map is of another kind of fuser")
+            raise ConfigError(f"fuser: expected the kind of fuser that made the {type(scene).__name__}, got another")
         own = self.new_map(rule)
-        check_same("fuser.voxel_size", f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}")
+        parameters: dict[str, tuple[object, object]] = {
+            "fuser.voxel_size": (f"{scene.volume.voxel_size:g}", f"{own.volume.voxel_size:g}"),
+            "fuser.storage": (scene.labels.storage.name, self.storage.name),
+            "label rule of the fuser": (
+                (scene.table.combine.name, scene.table.logarithmic),
+                (rule.combine.name, rule.logarithmic),
+            ),
+        }
         for name, was, now in zip(Sensor._fields, scene.volume.sensor, own.volume.sensor, strict=True):
-            check_same(f"fuser.{name}", f"{was:g}", f"{now:g}")
-        check_same("fuser.storage", scene.labels.storage.name, self.storage.name)
-        kept = scene.table.combine.name, scene.table.logarithmic
-        check_same("a fuser that keeps labels as", kept, (rule.combine.name, rule.logarithmic))
+            parameters[f"fuser.{name}"] = f"{was:g}", f"{now:g}"
+        for name, (stored, given) in parameters.items():
+            if stored != given:
+                raise ConfigError(
+                    f"{name}: expected {stored} (as in the stored map), got {given}; set it to {stored}, or "
+                    "start a new map"
+                )
         scene.confirmation = self.confirmation
         scene.volume.voxels.max_blocks = self.hashing.max_blocks
         scene.volume.changed(NO_BLOCKS)
@@ -107,52 +117,52 @@ class LabeledVoxels:
     def measurement(
         self, table: InstanceTable, points: PixelLists, matches: Matches, evidence: DetectionEvidence, rule: LabelRule
     ) -> Measurement:
-        """What a frame's clusters, in the lists of each pixel, say of the voxels by this rule."""
+        """Return the evidence of a frame's clusters for the voxels, by this rule."""
         points = keep_on_top(points, matches.instance_ids, self.occlusion_area_ratio)
-        others = self.lying_on_clusters(table, matches)
-        if others.any():
-            points = leave_to_others(points, others, matches.overlaps.seen, matches.overlaps.stride)
+        supported = self.supported_instances(table, matches)
+        if supported.any():
+            points = remove_supports(points, supported, matches.overlaps.seen, matches.overlaps.stride)
         matched = np.zeros(table.last_id + 1, np.bool_)
         matched[matches.instance_ids] = True
-        class_gain, named, bits = named_classes(evidence.classes, rule.logarithmic)
+        relative, named, bits = named_classes(evidence.classes, rule.logarithmic)
         compact = self.storage is Storage.COMPACT
-        units = rule.units if compact else rule.units << EXACT_BITS
+        scale = rule.score_scale if compact else rule.score_scale << EXACT_BITS
         if compact and rule.combine is Combine.SUM:
-            class_gain = np.clip(class_gain, -MOST_GAIN / units, MOST_GAIN / units)
+            relative = np.clip(relative, -MAX_CLUSTER_SCORE / scale, MAX_CLUSTER_SCORE / scale)
         return Measurement(
-            of_pixel=points.of_pixel,
-            first=points.first,
-            cluster=points.cluster,
+            list_ids=points.list_ids,
+            offsets=points.offsets,
+            clusters=points.clusters,
             instance_id=matches.instance_ids,
-            instance_gain=evidence.instances,
+            instance_log_odds=evidence.instances,
             absence=np.float32(evidence.absence),
             matched=matched,
-            class_said=class_said(class_gain, units, bits, np.int32 if compact else np.int64),
+            class_scores=pack_class_scores(relative, scale, bits, np.int32 if compact else np.int64),
             named_classes=named,
             combine=int(rule.combine),
-            most_units=MOST_UNITS if compact else 1 << 62,
+            max_score=MAX_SCORE if compact else 1 << 62,
         )
 
-    def lying_on_clusters(self, table: InstanceTable, matches: Matches) -> Bool:
-        """(N, ids + 1) which instances lie on what each cluster is of, as a book does on a table.
+    def supported_instances(self, table: InstanceTable, matches: Matches) -> Bool:
+        """Return (N, ids + 1) whether an instance lies on the object of each cluster, as a book on a table.
 
-        Such an instance counts, is of another class, and most of what is seen of it is under the cluster, at most half
-        of the cluster's pixels. A network draws a large mask over the small things that lie on the object: that mask
-        says nothing about them.
+        Such an instance is confirmed, is of another class, and most of its visible part is under the cluster, in at
+        most half of the cluster's pixels. A detector's mask of the large object covers it, and is no evidence for its
+        voxels.
         """
         overlaps, clusters = matches.overlaps, matches.clusters
-        lying = np.zeros((len(clusters), table.last_id + 1), np.bool_)
+        supported = np.zeros((len(clusters), table.last_id + 1), np.bool_)
         if self.support_overlap >= 1 or not len(overlaps.instance_ids):
-            return lying
+            return supported
         covered = overlaps.votes >= self.support_overlap * np.maximum(overlaps.visible, 1)
         small = 2 * overlaps.visible <= overlaps.sizes[:, None]
         other = matches.instance_ids[:, None] != overlaps.instance_ids
         under = covered & small & other
-        if not under.any():  # as a rule
-            return lying
+        if not under.any():  # the usual case
+            return supported
         records = [table.records[int(k)] for k in overlaps.instance_ids]
         counts = np.array([self.confirmation.is_met(record) for record in records])
         known = np.stack([table.class_probabilities(record) for record in records])
         other_class = class_agreement(clusters.class_probabilities, known) < OTHER_CLASS
-        lying[:, overlaps.instance_ids] = counts & other_class & under
-        return lying
+        supported[:, overlaps.instance_ids] = counts & other_class & under
+        return supported

@@ -1,8 +1,15 @@
-"""The clusters over each pixel: masks overlap, and a pixel may lie under several.
+"""Pixel lists: the clusters over each pixel, as masks overlap.
 
-Pixels lie under few different combinations of clusters. Each combination is a list with a number, and an image has the
-number of each pixel's list, so that what concerns lists costs next to nothing. What clusters share decides which of two
-is the same object found twice, and which of two lies on top of the other.
+Pixels are under few different combinations of clusters. Each combination is one list, and each pixel stores the index
+of its list, so that operations on lists are cheap. For two overlapping masks, clusters 0 and 1:
+
+    masks        list_ids (H, W)      list   clusters    offsets     clusters array
+    0 0 .        1 1 0                0      none        0           [0, 0, 1, 1]
+    0 * 1        1 2 3                1      0           0
+    . 1 1        0 3 3                2      0, 1        1
+                                      3      1           3           offsets[4] = 4
+
+The pixels that two clusters share tell whether they are duplicates of one object, and which one is on top.
 """
 
 from __future__ import annotations
@@ -19,54 +26,59 @@ from framework.mapping.labels.pixel_lists_kernels import (
     keep_smallest,
     link_points,
     lists_without,
-    renumber,
+    relabel,
     write_lists,
 )
 
 
 class PixelLists(NamedTuple):
-    """The clusters over each pixel, of N, as L lists: those of list i are cluster[first[i] : first[i + 1]]."""
+    """L lists of N clusters; those of list i are clusters[offsets[i] : offsets[i + 1]]."""
 
-    of_pixel: Int32  # (H, W) the number of each pixel's list; list 0 is empty
-    pixels: Int32  # (L,) how many pixels have each list
-    first: Int32  # (L + 1,)
-    cluster: Int32  # (first[L],) in the order of the points
+    list_ids: Int32  # (H, W) the list of each pixel; list 0 is empty
+    pixel_counts: Int32  # (L,) pixels that have each list
+    offsets: Int32  # (L + 1,)
+    clusters: Int32  # (offsets[L],) in the order of the points
     cluster_count: int  # N
 
 
+class ListTree(NamedTuple):
+    """The lists as a tree while they are found: a list is a cluster, its head, before its parent list."""
+
+    head: Int32  # (capacity,)
+    parent: Int32  # (capacity,)
+    child: Int32  # (capacity,) the latest list with this parent, 0 = none
+    sibling: Int32  # (capacity,) the previous list with the same parent, 0 = none
+    pixel_count: Int32  # (capacity,)
+    length: Int32  # (capacity,) clusters
+
+
 def list_points_by_pixel(clusters: PointClusters, shape: tuple[int, int]) -> PixelLists:
-    """The clusters over each pixel of the (height, width) image, by the points that were seen there.
+    """Return the clusters over each pixel of the (height, width) image, from the pixels of their points.
 
-    Lists that no pixel has are empty.
-
-    Raises DataError when a pixel lies outside the image.
+    Lists without pixels are empty. Raises DataError if a pixel is outside the image.
     """
-    of_pixel = np.empty(shape, np.int32)
-    room = len(clusters.cluster) + 1
-    head, rest, child, sibling, count, length = (np.empty(room, np.int32) for _ in range(6))
-    lists = link_points(clusters.pixels.ravel(), clusters.cluster, of_pixel, head, rest, child, sibling, count, length)
+    list_ids = np.empty(shape, np.int32)
+    capacity = len(clusters.cluster) + 1
+    tree = ListTree(*(np.empty(capacity, np.int32) for _ in ListTree._fields))
+    lists = link_points(clusters.pixels.ravel(), clusters.cluster, list_ids, tree)
     if lists == 0:
         require_pixels_inside(clusters, shape)
-    count = count[:lists].copy()
-    first = _begins(np.where(count > 0, length[:lists], 0))
-    cluster = np.empty(first[-1], np.int32)
-    write_lists(head, rest, first, cluster)
-    return PixelLists(of_pixel, count, first, cluster, len(clusters))
+    pixel_counts = tree.pixel_count[:lists].copy()
+    lengths = np.where(pixel_counts > 0, tree.length[:lists], 0)
+    offsets = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+    listed = np.empty(offsets[-1], np.int32)
+    write_lists(tree.head, tree.parent, offsets, listed)
+    return PixelLists(list_ids, pixel_counts, offsets, listed, len(clusters))
 
 
-def _begins(lengths: Int32) -> Int32:
-    """(L + 1,) where lists of so many clusters begin, one behind the other, and where the last one ends."""
-    return np.concatenate([[0], np.cumsum(lengths)]).astype(np.int32)
+def find_duplicates(points: PixelLists, scores: Float32, threshold: float) -> Bool:
+    """Return (N,) whether a cluster shares more than `threshold` of the smaller one's pixels with one of better score.
 
-
-def cover_another(points: PixelLists, scores: Float32, threshold: float) -> Bool:
-    """(N,) clusters that share more than `threshold` of the smaller one's pixels with a cluster of a better score.
-
-    Such a cluster is most likely the same object found twice and must not become an instance of its own.
+    It is most likely the same object detected twice, and must not create an instance.
     """
     n = points.cluster_count
     shared = np.zeros((n, n), np.int32)
-    count_shared(points.pixels, points.first, points.cluster, shared)
+    count_shared(points.pixel_counts, points.offsets, points.clusters, shared)
     sizes = shared.diagonal()
     over_smaller = shared / np.maximum(np.minimum(sizes[:, None], sizes[None, :]), 1)
     rank = np.lexsort((np.arange(n), -scores)).argsort()
@@ -74,36 +86,37 @@ def cover_another(points: PixelLists, scores: Float32, threshold: float) -> Bool
     return np.asarray((better & (over_smaller > threshold)).any(axis=1))
 
 
-def keep_on_top(points: PixelLists, instance_ids: Int32, share: float) -> PixelLists:
-    """Only the clusters with an instance (`instance_ids` (N,), 0 = none), of which small ones have for themselves what
-    large ones claim as well.
+def keep_on_top(points: PixelLists, instance_ids: Int32, area_ratio: float) -> PixelLists:
+    """Return the lists of the clusters with an instance, (N,), 0 = none, without clusters below much smaller ones.
 
-    A network draws a large mask coarsely, over the small thing that lies on the object: a book on a couch. Under
-    overlapping clusters a pixel is left to those that are not more than 1 / `share` times as large as the smallest
-    there; with share 0 to all.
+    Large masks are coarse, and cover small objects on the object: a book on a couch. So a pixel keeps only the clusters
+    that are at most 1 / `area_ratio` times as large as the smallest one there; all, if `area_ratio` is 0.
     """
-    first, kept = np.empty_like(points.first), np.empty_like(points.cluster)
-    keep_smallest(points.pixels, points.first, points.cluster, instance_ids, share, first, kept)
-    return points._replace(first=first, cluster=kept[: first[-1]])
+    offsets, kept = np.empty_like(points.offsets), np.empty_like(points.clusters)
+    keep_smallest(points.pixel_counts, points.offsets, points.clusters, instance_ids, area_ratio, offsets, kept)
+    return points._replace(offsets=offsets, clusters=kept[: offsets[-1]])
 
 
-def leave_to_others(points: PixelLists, lying: Bool, seen: Int32, stride: int) -> PixelLists:
-    """`points` without the clusters that the instance which the map has there is `lying` (N, ids + 1) on.
+def remove_supports(points: PixelLists, supported: Bool, seen: Int32, stride: int) -> PixelLists:
+    """Return the lists without clusters at pixels where the map has an instance that lies on the cluster's object.
 
-    `seen` holds the map's instance at every stride-th pixel of every stride-th row.
+    Args:
+        supported: (N, ids + 1) whether an instance lies on what a cluster is of.
+        seen: The map's instance at every stride-th pixel of every stride-th row.
     """
-    instances = np.flatnonzero(lying.any(axis=0))
-    column = np.zeros(lying.shape[1], np.int32)
+    instances = np.flatnonzero(supported.any(axis=0))
+    column = np.zeros(supported.shape[1], np.int32)
     column[instances] = np.arange(1, len(instances) + 1)
-    lists = len(points.pixels)
-    number = np.empty((lists, 1 + len(instances)), np.int32)
+    lists = len(points.pixel_counts)
+    replacement = np.empty((lists, 1 + len(instances)), np.int32)
     origin, ends = np.empty((2, lists * len(instances)), np.int32)
-    kept = np.empty(len(points.cluster) * len(instances), np.int32)
-    new, length = lists_without(points.first, points.cluster, lying, instances, number, origin, ends, kept)
-    of_pixel, moved = np.empty_like(points.of_pixel), np.zeros((CHUNKS, lists + new), np.int32)
-    renumber(points.of_pixel, seen, stride, column, number, of_pixel, moved)
-    pixels = moved.sum(axis=0, dtype=np.int32)
-    pixels[:lists] = points.pixels
-    np.subtract.at(pixels, origin[:new], pixels[lists:])
-    first = np.concatenate([points.first, points.first[-1] + ends[:new]])
-    return PixelLists(of_pixel, pixels, first, np.concatenate([points.cluster, kept[:length]]), points.cluster_count)
+    kept = np.empty(len(points.clusters) * len(instances), np.int32)
+    new, length = lists_without(points.offsets, points.clusters, supported, instances, replacement, origin, ends, kept)
+    list_ids, moved = np.empty_like(points.list_ids), np.zeros((CHUNKS, lists + new), np.int32)
+    relabel(points.list_ids, seen, stride, column, replacement, list_ids, moved)
+    pixel_counts = moved.sum(axis=0, dtype=np.int32)
+    pixel_counts[:lists] = points.pixel_counts
+    np.subtract.at(pixel_counts, origin[:new], pixel_counts[lists:])
+    offsets = np.concatenate([points.offsets, points.offsets[-1] + ends[:new]])
+    clusters = np.concatenate([points.clusters, kept[:length]])
+    return PixelLists(list_ids, pixel_counts, offsets, clusters, points.cluster_count)

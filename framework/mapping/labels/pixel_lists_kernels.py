@@ -12,7 +12,7 @@ CHUNKS = 16  # of image rows
 
 @device
 def _are_inside(coordinates, width, height):
-    """Whether all pixels (2 P,), u and v in turns, lie in the image. Unsigned, negative coordinates are large."""
+    """Return whether all pixels (2 P,), u and v in turns, are in the image. As unsigned, negative numbers are large."""
     right = bottom = np.uint32(0)
     for p in range(coordinates.shape[0] // 2):
         right = max(right, np.uint32(coordinates[2 * p]))
@@ -21,19 +21,18 @@ def _are_inside(coordinates, width, height):
 
 
 @njit(cache=True, nogil=True)
-def link_points(coordinates, cluster, of_pixel, head, rest, child, sibling, count, length):
-    """Gives each pixel the number of its list; returns how many lists there are, or 0 where a point lies outside.
+def link_points(coordinates, cluster, list_ids, tree):
+    """Fill list_ids (H, W) and the ListTree, with room for a list more than there are points.
 
-    A list is its `head` before another one, the `rest`; child is the latest list with a list as its rest, and sibling
-    the one before with the same rest. count is how many pixels have each list, length how many clusters it has. There
-    must be room for a list more than there are points; their coordinates (2 P,) are u and v in turns.
+    The coordinates (2 P,) of the points are u and v in turns. Returns the number of lists, 0 if a point is outside.
     """
-    width = of_pixel.shape[1]
-    if not _are_inside(coordinates, width, of_pixel.shape[0]):
+    head, parent, child, sibling, pixel_count, length = tree
+    width = list_ids.shape[1]
+    if not _are_inside(coordinates, width, list_ids.shape[0]):
         return np.int32(0)
-    of_pixel[:] = 0
-    number = of_pixel.ravel()
-    count[0], child[0], length[0] = of_pixel.size, 0, 0
+    list_ids[:] = 0
+    flat_ids = list_ids.ravel()
+    pixel_count[0], child[0], length[0] = list_ids.size, 0, 0
     lists = np.int32(1)
     p = cluster.shape[0] - 1
     while p >= 0:  # a run of points of one cluster, at pixels that have had one list
@@ -42,112 +41,112 @@ def link_points(coordinates, cluster, of_pixel, head, rest, child, sibling, coun
             p -= 1
             continue
         pixel = np.uint32(coordinates[2 * p + 1] * width + coordinates[2 * p])
-        old = number[pixel]
+        old = flat_ids[pixel]
         new = child[old]
         while new > 0 and head[new] != k:
             new = sibling[new]
         if new == 0:
             new = lists
             lists += np.int32(1)
-            head[new], rest[new], length[new] = k, old, length[old] + 1
-            count[new], child[new] = 0, 0
+            head[new], parent[new], length[new] = k, old, length[old] + 1
+            pixel_count[new], child[new] = 0, 0
             child[old], sibling[new] = new, child[old]
         while True:
-            number[pixel] = new
+            flat_ids[pixel] = new
             p -= 1
             if p < 0 or cluster[p] != k:
                 break
             pixel = np.uint32(coordinates[2 * p + 1] * width + coordinates[2 * p])
-            if number[pixel] != old:
+            if flat_ids[pixel] != old:
                 break
-        count[old] -= last - p
-        count[new] += last - p
+        pixel_count[old] -= last - p
+        pixel_count[new] += last - p
     return lists
 
 
 @njit(cache=True, nogil=True)
-def write_lists(head, rest, first, cluster):
-    for i in range(first.shape[0] - 1):
-        number = i
-        for place in range(first[i], first[i + 1]):
-            cluster[place] = head[number]
-            number = rest[number]
+def write_lists(head, parent, offsets, clusters):
+    for i in range(offsets.shape[0] - 1):
+        list_id = i
+        for entry in range(offsets[i], offsets[i + 1]):
+            clusters[entry] = head[list_id]
+            list_id = parent[list_id]
 
 
 @njit(cache=True, nogil=True)
-def count_shared(pixels, first, cluster, shared):
-    """Adds to shared (N, N) the pixels that each two clusters have in common, itself on the diagonal."""
-    for i in range(pixels.shape[0]):
-        for a in range(first[i], first[i + 1]):
-            for b in range(first[i], first[i + 1]):
-                shared[cluster[a], cluster[b]] += pixels[i]
+def count_shared(pixel_counts, offsets, clusters, shared):
+    """Add to shared (N, N) the pixels that each two clusters have in common, with their sizes on the diagonal."""
+    for i in range(pixel_counts.shape[0]):
+        for a in range(offsets[i], offsets[i + 1]):
+            for b in range(offsets[i], offsets[i + 1]):
+                shared[clusters[a], clusters[b]] += pixel_counts[i]
 
 
 @njit(cache=True, nogil=True)
-def keep_smallest(pixels, first, cluster, instance_ids, share, kept_first, kept):
-    """Fills kept_first (L + 1,) and kept, as long as cluster, of which the first kept_first[L] are set."""
+def keep_smallest(pixel_counts, offsets, clusters, instance_ids, area_ratio, kept_offsets, kept):
+    """Fill kept_offsets (L + 1,) and the first kept_offsets[L] entries of `kept`, which has the length of clusters."""
     sizes = np.zeros(instance_ids.shape[0], np.float64)
-    for i in range(pixels.shape[0]):
-        for place in range(first[i], first[i + 1]):
-            sizes[cluster[place]] += pixels[i]
+    for i in range(pixel_counts.shape[0]):
+        for entry in range(offsets[i], offsets[i + 1]):
+            sizes[clusters[entry]] += pixel_counts[i]
     n = 0
-    for i in range(pixels.shape[0]):
-        kept_first[i] = n
+    for i in range(pixel_counts.shape[0]):
+        kept_offsets[i] = n
         smallest = np.float64(np.inf)
-        for place in range(first[i], first[i + 1]):
-            if instance_ids[cluster[place]] > 0:
-                smallest = min(smallest, sizes[cluster[place]])
-        for place in range(first[i], first[i + 1]):
-            k = cluster[place]
-            if instance_ids[k] > 0 and smallest >= share * sizes[k]:
+        for entry in range(offsets[i], offsets[i + 1]):
+            if instance_ids[clusters[entry]] > 0:
+                smallest = min(smallest, sizes[clusters[entry]])
+        for entry in range(offsets[i], offsets[i + 1]):
+            k = clusters[entry]
+            if instance_ids[k] > 0 and smallest >= area_ratio * sizes[k]:
                 kept[n] = k
                 n += 1
-    kept_first[pixels.shape[0]] = n
+    kept_offsets[pixel_counts.shape[0]] = n
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def renumber(of_pixel, seen, stride, column, number, renumbered, moved):
-    """Fills renumbered (H, W) with number[i, column[k]] for a pixel with list i where the map has instance k.
+def relabel(list_ids, seen, stride, column, replacement, new_ids, moved):
+    """Fill new_ids (H, W) with replacement[i, column[k]] for pixels of list i where the map has instance k.
 
-    Counts in moved (CHUNKS, lists), of zeros before, the pixels that get another number.
+    Counts the pixels that get another list in moved (CHUNKS, lists), which is 0 before.
     """
-    height, width = of_pixel.shape
+    height, width = list_ids.shape
     for chunk in prange(CHUNKS):
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
-            row, old_row, new_row = seen[v // stride], of_pixel[v], renumbered[v]
+            row, old_row, new_row = seen[v // stride], list_ids[v], new_ids[v]
             new_row[:] = old_row
-            for place in range(row.shape[0]):
-                k = column[row[place]]
-                for u in range(place * stride, min((place + 1) * stride, width) if k > 0 else 0):
+            for sample in range(row.shape[0]):
+                k = column[row[sample]]
+                for u in range(sample * stride, min((sample + 1) * stride, width) if k > 0 else 0):
                     old = old_row[u]
-                    new = number[old, k]
+                    new = replacement[old, k]
                     new_row[u] = new
                     if new != old:
                         moved[chunk, new] += 1
 
 
 @njit(cache=True, nogil=True)
-def lists_without(first, cluster, lying, instances, number, origin, ends, kept):
-    """Fills number (L, 1 + J) with the list that each becomes where none and where each of `instances` (J,) is seen.
+def lists_without(offsets, clusters, supported, instances, replacement, origin, ends, kept):
+    """Fill replacement (L, 1 + J) with the list that replaces each one without an instance and at `instances` (J,).
 
-    New lists are numbered on: origin gets what each was made of, ends where its clusters end in kept. Returns how many
-    lists these are, and of how many clusters in all.
+    `origin` gets the list that each new list replaces, `ends` the end of its clusters in `kept`. Returns the number of
+    new lists, and of their clusters.
     """
-    lists = first.shape[0] - 1
+    lists = offsets.shape[0] - 1
     new = length = 0
     for i in range(lists):
-        number[i, 0] = i
+        replacement[i, 0] = i
     for j in range(instances.shape[0]):
         for i in range(lists):
             before = length
-            for place in range(first[i], first[i + 1]):
-                if not lying[cluster[place], instances[j]]:
-                    kept[length] = cluster[place]
+            for entry in range(offsets[i], offsets[i + 1]):
+                if not supported[clusters[entry], instances[j]]:
+                    kept[length] = clusters[entry]
                     length += 1
-            if length - before == first[i + 1] - first[i]:
-                number[i, 1 + j], length = i, before
+            if length - before == offsets[i + 1] - offsets[i]:
+                replacement[i, 1 + j], length = i, before
             else:
-                number[i, 1 + j] = lists + new
+                replacement[i, 1 + j] = lists + new
                 origin[new], ends[new] = i, length
                 new += 1
     return new, length

@@ -10,15 +10,14 @@ from framework.mapping.voxels.voxel_grid_kernels import BLOCK_VOXELS, UNSEEN, de
 from framework.mapping.voxels.voxel_walk import voxel_number
 
 CORNERS = 8  # voxels around a vertex
-REACH = 2.0  # voxels; those farther from the surface saw other pixels than it, and have no vote
-CHUNK = 1024  # vertices that share their scratch arrays
+REACH = 2.0  # voxels; those farther from the surface saw other pixels, and do not vote
+CHUNK = 1024  # vertices that share scratch arrays
 
 
 @device
-def corner_voxels(grid, vertex, blocks, numbers, shares):
-    """The voxels around a vertex (3,) m: block, -1 = absent, number within it and trilinear share, into (8,) arrays.
-
-    Returns whether any of them has label evidence.
+def corner_voxels(grid, vertex, blocks, voxels, weights):
+    """Fill the block, -1 = absent, the index in it and the trilinear weight, (8,) each, of the voxels around a vertex
+    (3,) m. Returns whether any of them has label evidence.
     """
     scale = np.float32(1.0) / grid.voxel_size
     x, y, z = vertex[0] * scale, vertex[1] * scale, vertex[2] * scale
@@ -26,43 +25,42 @@ def corner_voxels(grid, vertex, blocks, numbers, shares):
     x, y, z = x - i, y - j, z - k
     key = np.int64(-2)
     region = np.int32(-1)
-    labelled = False
+    labeled = False
     for c in range(CORNERS):
         dx, dy, dz = c & 1, (c >> 1) & 1, c >> 2
         block, key, region = find_block(grid, (i + dx) >> 3, (j + dy) >> 3, (k + dz) >> 3, key, region)
         blocks[c] = block
-        numbers[c] = voxel_number(i + dx, j + dy, k + dz)
-        shares[c] = (x if dx else 1 - x) * (y if dy else 1 - y) * (z if dz else 1 - z)
-        labelled = labelled or (block >= 0 and grid.label_row[block] >= 0)
-    return labelled
+        voxels[c] = voxel_number(i + dx, j + dy, k + dz)
+        weights[c] = (x if dx else 1 - x) * (y if dy else 1 - y) * (z if dz else 1 - z)
+        labeled = labeled or (block >= 0 and grid.label_row[block] >= 0)
+    return labeled
 
 
 @device
-def keep_near(grid, blocks, numbers, shares):
-    """Takes the shares (8,) from those of the voxels around a vertex that were not seen or are far from the surface."""
+def keep_near(grid, blocks, voxels, weights):
+    """Set the weights (8,) of voxels that are unobserved or far from the surface to 0."""
     near = np.float32(REACH) * grid.voxel_size
     for c in range(CORNERS):
-        stored = grid.tsdf[blocks[c], numbers[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
+        stored = grid.tsdf[blocks[c], voxels[c]] if blocks[c] >= 0 else np.int16(UNSEEN)
         if stored == UNSEEN or abs(stored) * grid.tsdf_unit > near:
-            shares[c] = 0
+            weights[c] = 0
 
 
 @device
-def majority(labels, shares):
-    """The voxel with the largest share of those whose label, above 0, has more than half of all shares; -1 if none has.
-
-    `labels` and `shares` (8,) are those of the voxels around a vertex.
+def majority(labels, weights):
+    """Return the voxel with the largest weight among those of the label (8,) > 0 that has more than half of the total
+    weight; -1 if there is no such label.
     """
     total = np.float32(0.0)
     for c in range(CORNERS):
-        total += shares[c]
+        total += weights[c]
     for c in range(CORNERS):
         votes = np.float32(0.0)
         largest = c
         for d in range(CORNERS):
             if labels[d] == labels[c]:
-                votes += shares[d]
-                if shares[d] > shares[largest]:
+                votes += weights[d]
+                if weights[d] > weights[largest]:
                     largest = d
         if labels[c] > 0 and votes > np.float32(0.5) * total:
             return largest
@@ -70,24 +68,21 @@ def majority(labels, shares):
 
 
 @device
-def _elect(grid, evidence, counts, blocks, numbers, shares, ids):
-    """(instance, class) of a vertex: the instance that has more than half of its corners' votes, 0 and -1 if none has.
-
-    A voxel near the surface votes with its share for its likeliest instance that counts, or for none.
-    """
-    keep_near(grid, blocks, numbers, shares)
+def _elect(grid, evidence, counts, blocks, voxels, weights, ids):
+    """Return the instance and class of a vertex by the majority of its corners, 0 and -1 if there is none."""
+    keep_near(grid, blocks, voxels, weights)
     for c in range(CORNERS):
-        voxel = labeled_voxel(grid, evidence, blocks[c], numbers[c]) if shares[c] > 0 else np.int32(-1)
+        voxel = labeled_voxel(grid, evidence, blocks[c], voxels[c]) if weights[c] > 0 else np.int32(-1)
         ids[c] = best_counted_instance(evidence, voxel, counts) if voxel >= 0 else np.int32(0)
-    elected = majority(ids, shares)
+    elected = majority(ids, weights)
     if elected < 0:
         return np.int32(0), np.int32(-1)
-    return ids[elected], best_class(evidence, labeled_voxel(grid, evidence, blocks[elected], numbers[elected]))
+    return ids[elected], best_class(evidence, labeled_voxel(grid, evidence, blocks[elected], voxels[elected]))
 
 
 @device
 def color_of(color, voxel, out):
-    """The colour of a voxel, numbered as in an UnlabeledMesh, into `out` (3,)."""
+    """Write the color of a voxel, numbered as in an UnlabeledMesh, into `out` (3,)."""
     red, green, blue = unpack_color(color[voxel // BLOCK_VOXELS, voxel % BLOCK_VOXELS])
     out[0], out[1], out[2] = red / 4, green / 4, blue / 4
 
@@ -99,14 +94,15 @@ def color_vertices(color, voxels, colors):
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def label_vertices(grid, evidence, counts, vertices, voxels, colors, instance_ids, class_ids):
-    for chunk in prange(-(-len(voxels) // CHUNK)):
-        blocks, numbers = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
-        ids, shares = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
-        for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(voxels))):
-            color_of(grid.color, voxels[v], colors[v])
+def label_vertices(grid, evidence, counts, surface, colors, instance_ids, class_ids):
+    vertices = surface.vertices
+    for chunk in prange(-(-len(vertices) // CHUNK)):
+        blocks, voxels = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.int32)
+        ids, weights = np.empty(CORNERS, np.int32), np.empty(CORNERS, np.float32)
+        for v in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(vertices))):
+            color_of(grid.color, surface.voxels[v], colors[v])
             instance, label = np.int32(0), np.int32(-1)
-            if corner_voxels(grid, vertices[v], blocks, numbers, shares):
-                instance, label = _elect(grid, evidence, counts, blocks, numbers, shares, ids)
+            if corner_voxels(grid, vertices[v], blocks, voxels, weights):
+                instance, label = _elect(grid, evidence, counts, blocks, voxels, weights, ids)
             instance_ids[v] = instance
             class_ids[v] = label

@@ -113,9 +113,9 @@ def test_a_lost_camera_enters_the_map_when_it_sees_what_is_there(tmp_path: Path)
 @pytest.mark.parametrize(
     ("overrides", "said"),
     [
-        (("fuser.voxel_size=0.05",), "made with fuser.voxel_size 0.04, and cannot be gone on with by 0.05"),
+        (("fuser.voxel_size=0.05",), r"fuser.voxel_size: expected 0.04 \(as in the stored map\), got 0.05"),
         (("fuser.max_depth=4",), "fuser.max_depth"),
-        (("fuser=label_count",), "keeps labels as"),
+        (("fuser=label_count",), "label rule of the fuser: expected"),
         (("fuser=object_volumes",), "ObjectVolumes cannot resume"),
         (("tracker=voxel_hashing_icp",), "has left no keyframes"),
         (("tracker=open3d_odometry",), "Open3dOdometry cannot relocalize"),

@@ -19,10 +19,10 @@ from framework.mapping.instances.association import (
 )
 from framework.mapping.labels.pixel_lists import (
     PixelLists,
-    cover_another,
+    find_duplicates,
     keep_on_top,
-    leave_to_others,
     list_points_by_pixel,
+    remove_supports,
 )
 
 SHAPE = (4, 5)
@@ -62,12 +62,12 @@ def test_votes_are_pixels_shared() -> None:
     assert overlaps.visible.tolist() == [4, 8]
     assert overlaps.sizes.tolist() == [12, 8, 4]
     assert overlaps.votes.tolist() == [[0, 8], [4, 0], [0, 0]]
-    assert overlaps.over_smaller(least=1).tolist() == [[0, 1], [1, 0], [0, 0]]
-    assert overlaps.over_union(least=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
-    assert overlaps.over_union(least=16).tolist() == [[0, 8 / 16], [4 / 16, 0], [0, 0]]
-    assert overlaps.over_smaller(least=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
-    assert overlaps.by(OverlapRule.CLUSTER, least=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
-    assert overlaps.by(OverlapRule.CLUSTER, least=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
+    assert overlaps.over_smaller(min_pixels=1).tolist() == [[0, 1], [1, 0], [0, 0]]
+    assert overlaps.over_union(min_pixels=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
+    assert overlaps.over_union(min_pixels=16).tolist() == [[0, 8 / 16], [4 / 16, 0], [0, 0]]
+    assert overlaps.over_smaller(min_pixels=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
+    assert overlaps.by(OverlapRule.CLUSTER, min_pixels=1).tolist() == [[0, 8 / 12], [4 / 8, 0], [0, 0]]
+    assert overlaps.by(OverlapRule.CLUSTER, min_pixels=16).tolist() == [[0, 0.5], [0.25, 0], [0, 0]]
 
 
 def test_classes_agree_by_their_bhattacharyya_coefficient() -> None:
@@ -93,8 +93,8 @@ def test_nothing_seen_and_nothing_detected() -> None:
         ("a", "b"),
     )
     assert overlaps_of(empty, seen).votes.shape == (0, 0)
-    assert len(best_first(overlaps_of(empty, seen + 1).over_smaller(least=1), 0.3)) == 0
-    assert len(cover_another(list_points_by_pixel(empty, SHAPE), empty.scores, 0.5)) == 0
+    assert len(best_first(overlaps_of(empty, seen + 1).over_smaller(min_pixels=1), 0.3)) == 0
+    assert len(find_duplicates(list_points_by_pixel(empty, SHAPE), empty.scores, 0.5)) == 0
 
 
 def test_every_second_pixel_stands_for_four() -> None:
@@ -129,8 +129,8 @@ def test_stray_pixels_of_an_instance_do_not_win_a_cluster() -> None:
     seen[:, :3] = 1  # the object, of which the cluster sees most
     seen[0, 0] = 2  # a stray voxel of another one
     overlaps = overlaps_of(clusters_of([columns(0, 2)], [1]), seen)
-    assert best_first(overlaps.over_smaller(least=1), 0.35).tolist() == [1], "7/8 of 1 lose against 1/1 of 2"
-    assert best_first(overlaps.over_smaller(least=4), 0.35).tolist() == [0]
+    assert best_first(overlaps.over_smaller(min_pixels=1), 0.35).tolist() == [1], "7/8 of 1 lose against 1/1 of 2"
+    assert best_first(overlaps.over_smaller(min_pixels=4), 0.35).tolist() == [0]
 
 
 def test_a_table_does_not_get_the_book_that_lies_on_it() -> None:
@@ -138,9 +138,9 @@ def test_a_table_does_not_get_the_book_that_lies_on_it() -> None:
     seen = np.full(SHAPE, 1, np.int32)
     seen[:, 2] = 2  # the book
     overlaps = overlaps_of(clusters_of([columns(0, 4), columns(2, 3)], [1, 1]), seen)
-    smaller = overlaps.over_smaller(least=1)
+    smaller = overlaps.over_smaller(min_pixels=1)
     assert smaller[0].argmax() != 0, "counted over the smaller alone, the book is the table's best match"
-    assert match_one_to_one(smaller > 0.35, overlaps.over_union(least=1)).tolist() == [0, 1]
+    assert match_one_to_one(smaller > 0.35, overlaps.over_union(min_pixels=1)).tolist() == [0, 1]
 
 
 @settings(max_examples=100, deadline=None)
@@ -154,7 +154,7 @@ def test_the_order_of_detections_does_not_matter(seed: int) -> None:
 
 def test_a_second_detection_of_an_object_is_told_by_its_overlap() -> None:
     clusters = clusters_of([columns(0, 3), columns(0, 2), columns(3, 5)], [0.5, 0.9, 0.4])
-    assert cover_another(list_points_by_pixel(clusters, SHAPE), clusters.scores, 0.6).tolist() == [True, False, False]
+    assert find_duplicates(list_points_by_pixel(clusters, SHAPE), clusters.scores, 0.6).tolist() == [True, False, False]
 
 
 @pytest.mark.parametrize("pixel", [(-1, 0), (0, -1), (5, 0), (0, 4)])
@@ -173,17 +173,17 @@ def test_points_of_no_cluster_have_no_say() -> None:
     assert overlaps.sizes.tolist() == [8, 8]
     assert overlaps.votes.tolist() == [[8], [8]]
     points = list_points_by_pixel(clusters, SHAPE)
-    assert (points.of_pixel > 0).any(axis=0).tolist() == [True, False, True, True, False]
+    assert (points.list_ids > 0).any(axis=0).tolist() == [True, False, True, True, False]
     # 4 of the 8 pixels of each are shared: columns 0, 2 against 2, 3
-    assert cover_another(points, clusters.scores, 0.49).tolist() == [False, True]
-    assert cover_another(points, clusters.scores, 0.5).tolist() == [False, False]
+    assert find_duplicates(points, clusters.scores, 0.49).tolist() == [False, True]
+    assert find_duplicates(points, clusters.scores, 0.5).tolist() == [False, False]
 
 
 def clusters_at(points: PixelLists) -> list[list[int]]:
     """The clusters in each pixel's list, row by row."""
-    lists = [points.cluster[first:last].tolist() for first, last in pairwise(points.first.tolist())]
-    assert points.pixels.tolist() == np.bincount(points.of_pixel.ravel(), minlength=len(lists)).tolist()
-    return [lists[i] for i in points.of_pixel.ravel()]
+    lists = [points.clusters[first:last].tolist() for first, last in pairwise(points.offsets.tolist())]
+    assert points.pixel_counts.tolist() == np.bincount(points.list_ids.ravel(), minlength=len(lists)).tolist()
+    return [lists[i] for i in points.list_ids.ravel()]
 
 
 def test_a_book_on_a_table_has_its_pixels_for_itself() -> None:
@@ -219,7 +219,7 @@ def test_each_pixel_has_its_clusters_in_the_order_of_the_points(seed: int) -> No
     points = list_points_by_pixel(clusters, SHAPE)
     assert clusters_at(points) == expected
     used = [tuple(found) for found in expected]
-    assert (points.pixels > 0).sum() == len({*used, ()}) - (() not in used), "a list for each combination"
+    assert (points.pixel_counts > 0).sum() == len({*used, ()}) - (() not in used), "a list for each combination"
 
 
 @settings(max_examples=100, deadline=None)
@@ -251,9 +251,9 @@ def test_who_leaves_a_pixel_to_what_lies_there_agrees_with_a_slow_reference(seed
     for pixel, at_pixel in enumerate(clusters_at(points)):
         v, u = divmod(pixel, SHAPE[1])
         expected.append([k for k in at_pixel if not lying[k, seen[v // stride, u // stride]]])
-    assert clusters_at(leave_to_others(points, lying, seen, stride)) == expected
+    assert clusters_at(remove_supports(points, lying, seen, stride)) == expected
     on_top = keep_on_top(points, np.int32([3, 0, 1, 2]), 0.8)
     both = [[k for k in left if k in top] for left, top in zip(expected, clusters_at(on_top), strict=True)]
-    assert clusters_at(leave_to_others(on_top, lying, seen, stride)) == both
-    unchanged = leave_to_others(points, lying & False, seen, stride)
+    assert clusters_at(remove_supports(on_top, lying, seen, stride)) == both
+    unchanged = remove_supports(points, lying & False, seen, stride)
     assert clusters_at(unchanged) == clusters_at(points), "the lists given stay as they are"

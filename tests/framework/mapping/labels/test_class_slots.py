@@ -7,72 +7,73 @@ from numba import njit
 
 from framework.mapping.labels import class_slots
 from framework.mapping.labels.class_slots import CLASS_SLOTS, NEW_CLASSES, NO_CLASS
-from framework.mapping.labels.label_evidence import MOST_GAIN, MOST_UNITS
+from framework.mapping.labels.label_evidence import MAX_CLUSTER_SCORE, MAX_SCORE
 
 
 @njit
-def add_said(classes, units, said_by, most):
-    return class_slots.add_said(classes, units, said_by, most)
+def add_scores(classes, scores, cluster_scores, limit):
+    return class_slots.add_scores(classes, scores, cluster_scores, limit)
 
 
 @njit
-def likeliest_slot(classes, units):
-    return class_slots.likeliest_slot(classes, units)
+def most_likely_slot(classes, scores):
+    return class_slots.most_likely_slot(classes, scores)
 
 
 @njit
-def least_likely_slot(units):
-    return class_slots.least_likely_slot(units)
+def least_likely_slot(scores):
+    return class_slots.least_likely_slot(scores)
 
 
 def voxel(seed: int, largest: int) -> tuple[np.ndarray, np.ndarray]:
-    """Classes and units of a voxel, some of its slots filled; with few different units there are ties."""
+    """Classes and scores of a voxel, some of its slots filled; with few different scores there are ties."""
     rng = np.random.default_rng(seed)
     filled = rng.integers(0, CLASS_SLOTS + 1)
     classes = np.full(CLASS_SLOTS, NO_CLASS, np.uint8)
     classes[:filled] = rng.choice(NO_CLASS, filled, replace=False)
-    units = np.zeros(CLASS_SLOTS, np.int16)
-    units[:filled] = rng.integers(-largest, largest + 1, filled)
-    return classes, units
+    scores = np.zeros(CLASS_SLOTS, np.int16)
+    scores[:filled] = rng.integers(-largest, largest + 1, filled)
+    return classes, scores
 
 
 @settings(max_examples=300, deadline=None)
-@given(st.integers(0, 100_000), st.sampled_from([1, 5, MOST_UNITS]))
+@given(st.integers(0, 100_000), st.sampled_from([1, 5, MAX_SCORE]))
 def test_a_vector_says_what_the_loops_say(seed: int, largest: int) -> None:
-    classes, units = voxel(seed, largest)
+    classes, scores = voxel(seed, largest)
     rng = np.random.default_rng(seed)
-    said_by = rng.integers(-MOST_GAIN, MOST_GAIN + 1, NO_CLASS + 1).astype(np.int32) << NEW_CLASSES
-    said_by[:: rng.integers(2, 9)] |= 1 << rng.integers(0, NEW_CLASSES)
-    said_by[NO_CLASS] = 0
-    by_loop = units.astype(np.int64)
+    cluster_scores = rng.integers(-MAX_CLUSTER_SCORE, MAX_CLUSTER_SCORE + 1, NO_CLASS + 1).astype(np.int32)
+    cluster_scores <<= NEW_CLASSES
+    cluster_scores[:: rng.integers(2, 9)] |= 1 << rng.integers(0, NEW_CLASSES)
+    cluster_scores[NO_CLASS] = 0
+    by_loop = scores.astype(np.int64)
 
-    assert likeliest_slot(classes, units) == class_slots._likeliest_slot(classes, by_loop)
-    assert least_likely_slot(units) == class_slots._least_likely_slot(by_loop)
-    assert add_said(classes, units, said_by, MOST_UNITS) == class_slots._add_said(
-        classes, by_loop, said_by.astype(np.int64), MOST_UNITS
+    assert most_likely_slot(classes, scores) == class_slots._most_likely_slot(classes, by_loop)
+    assert least_likely_slot(scores) == class_slots._least_likely_slot(by_loop)
+    assert add_scores(classes, scores, cluster_scores, MAX_SCORE) == class_slots._add_scores(
+        classes, by_loop, cluster_scores.astype(np.int64), MAX_SCORE
     )
-    np.testing.assert_array_equal(units, by_loop)
+    np.testing.assert_array_equal(scores, by_loop)
 
 
 def test_exact_storage_has_more_slots_than_a_vector() -> None:
-    classes, units = np.arange(80, dtype=np.uint8), np.arange(80) ** 2
-    said_by = np.full(NO_CLASS + 1, 3 << NEW_CLASSES)
-    assert likeliest_slot(classes, units) == 79
-    assert least_likely_slot(units) == 0
-    assert add_said(classes, units, said_by, 1 << 62) == (0, 80, 79**2 + 3 - (1 << 62))
-    np.testing.assert_array_equal(units, np.arange(80) ** 2 + 3)
+    classes, scores = np.arange(80, dtype=np.uint8), np.arange(80) ** 2
+    cluster_scores = np.full(NO_CLASS + 1, 3 << NEW_CLASSES)
+    assert most_likely_slot(classes, scores) == 79
+    assert least_likely_slot(scores) == 0
+    assert add_scores(classes, scores, cluster_scores, 1 << 62) == (0, 80, 79**2 + 3 - (1 << 62))
+    np.testing.assert_array_equal(scores, np.arange(80) ** 2 + 3)
 
 
 def test_slots_need_not_be_aligned() -> None:
     """Those of all voxels lie in one array of records, between other fields."""
-    record = np.dtype([("flag", np.uint8), ("classes", np.uint8, (CLASS_SLOTS,)), ("units", np.int16, (CLASS_SLOTS,))])
+    record = np.dtype([("flag", np.uint8), ("classes", np.uint8, (CLASS_SLOTS,)), ("scores", np.int16, (CLASS_SLOTS,))])
     records = np.zeros(3, record)
     for i, seed in enumerate((3, 4, 5)):
-        records["classes"][i], records["units"][i] = voxel(seed, 5)
-    said_by = (np.arange(NO_CLASS + 1, dtype=np.int32) % 7) << NEW_CLASSES
+        records["classes"][i], records["scores"][i] = voxel(seed, 5)
+    cluster_scores = (np.arange(NO_CLASS + 1, dtype=np.int32) % 7) << NEW_CLASSES
     before = records.copy()
-    expected = records["units"][1].astype(np.int64)
-    answer = class_slots._add_said(records["classes"][1], expected, said_by.astype(np.int64), MOST_UNITS)
-    assert add_said(records["classes"][1], records["units"][1], said_by, MOST_UNITS) == answer
-    np.testing.assert_array_equal(records["units"][1], expected)
+    expected = records["scores"][1].astype(np.int64)
+    answer = class_slots._add_scores(records["classes"][1], expected, cluster_scores.astype(np.int64), MAX_SCORE)
+    assert add_scores(records["classes"][1], records["scores"][1], cluster_scores, MAX_SCORE) == answer
+    np.testing.assert_array_equal(records["scores"][1], expected)
     np.testing.assert_array_equal(records[[0, 2]], before[[0, 2]])

@@ -8,12 +8,12 @@ from framework.errors import DataError
 from framework.mapping.labels import evidence_rows
 from framework.mapping.labels.evidence_rows import SLOTS, EvidenceRows, Storage
 from framework.mapping.labels.evidence_rows_kernels import _merge_voxel
-from framework.mapping.labels.label_evidence import MOST_UNITS, Evidence
+from framework.mapping.labels.label_evidence import MAX_SCORE, Evidence
 from framework.mapping.labels.label_evidence_kernels import Combine, best_class, update_voxel
 from framework.mapping.voxels.integration import SeenBlocks
 from framework.mapping.voxels.integration_kernels import GROUP
 from framework.mapping.voxels.voxel_grid import VoxelGrid
-from tests.support.one_pixel import COVERED, FLOOR, UNITS, blank, distribution, measured, voted
+from tests.support.one_pixel import COVERED, FLOOR, SCORE_SCALE, blank, distribution, measured, voted
 from tests.support.thread_counts import by_one_thread_and_two
 
 pytestmark = pytest.mark.integration
@@ -137,12 +137,12 @@ def _updated(block_count: int, frames: int, max_blocks: int) -> Evidence:
         pixel_of = rng.integers(0, 8, points)  # of 10 pixels, so that two are under none
         lists = [[k for k in cluster[pixel_of == pixel] if instances[k]] for pixel in range(10)]
         said = said._replace(
-            of_pixel=np.arange(1, 11, dtype=np.int32)[None],
-            first=np.cumsum([0, 0, *map(len, lists)], dtype=np.int32),
-            cluster=np.array([k for clusters in lists for k in clusters], np.int32),
+            list_ids=np.arange(1, 11, dtype=np.int32)[None],
+            offsets=np.cumsum([0, 0, *map(len, lists)], dtype=np.int32),
+            clusters=np.array([k for clusters in lists for k in clusters], np.int32),
             absence=np.float32(-0.2),
         )
-        said = said._replace(class_said=said.class_said.astype(np.int32), most_units=MOST_UNITS)  # as compact storage
+        said = said._replace(class_scores=said.class_scores.astype(np.int32), max_score=MAX_SCORE)  # as compact storage
         blocks = rng.permutation(block_count)[1:].astype(np.int32)
         pixels = rng.integers(-1, 10, (len(blocks), 512)).astype(np.int32)
         pixels[rng.random(pixels.shape) > 4 / block_count] = -1
@@ -194,7 +194,7 @@ def test_exact_storage_never_forgets() -> None:
         assert rows.evicted == 0
         class_log += np.log(p).sum(axis=0)
         instance_log[ids] += np.log(0.9 / FLOOR)
-    labels, values = rows.evidence.class_ids[0], rows.evidence.class_value[0] / UNITS
+    labels, values = rows.evidence.class_ids[0], rows.evidence.class_value[0] / SCORE_SCALE
     assert sorted(labels.tolist()) == list(range(30))
     assert np.allclose(values - values[0], class_log[labels] - class_log[labels[0]], atol=1e-2)
     named = rows.evidence.instance_ids[0] > 0

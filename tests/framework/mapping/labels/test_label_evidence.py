@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from framework.mapping.labels.class_slots import ALL_NAMED, CLASS_SLOTS, NEW_CLASSES, NO_CLASS
 from framework.mapping.labels.evidence_rows import INSTANCE_SLOTS
-from framework.mapping.labels.label_evidence import MOST_GAIN, MOST_UNITS, class_said, named_classes
+from framework.mapping.labels.label_evidence import MAX_CLUSTER_SCORE, MAX_SCORE, named_classes, pack_class_scores
 from framework.mapping.labels.label_evidence_kernels import (
     Combine,
     add_evidence,
@@ -16,7 +16,7 @@ from framework.mapping.labels.label_evidence_kernels import (
     best_instance,
     update_voxel,
 )
-from tests.support.one_pixel import BARE, COVERED, FLOOR, UNITS, blank, distribution, measured, voted
+from tests.support.one_pixel import BARE, COVERED, FLOOR, SCORE_SCALE, blank, distribution, measured, voted
 
 
 @settings(max_examples=60, deadline=None)
@@ -43,7 +43,7 @@ def test_equals_the_full_recursion_while_the_labels_fit(seed: int, labels: int) 
         assert abs(log - (instance_log[i] - instance_log[0])) < 1e-3
     assert best_instance(evidence, 0) == 1 + np.argmax(instance_log[1:])
     order = evidence.class_ids[0][: min(classes, CLASS_SLOTS)]
-    ours = evidence.class_value[0][: len(order)] / UNITS
+    ours = evidence.class_value[0][: len(order)] / SCORE_SCALE
     exact = class_log[order]
     assert np.allclose(ours - ours[0], exact - exact[0], atol=2e-3)
     assert best_class(evidence, 0) == np.argmax(class_log)
@@ -103,12 +103,12 @@ def test_a_cluster_without_instance_says_nothing() -> None:
 
 def test_class_gains_are_relative_to_the_classes_not_named() -> None:
     p = np.array([[0.5, 0.2, 0.1, 0.06, 0.04, 0.03, 0.025, 0.02, 0.01, 0.009, 0.006]])
-    gains, named, bits = named_classes(np.log(p), logarithmic=True)
+    relative, named, bits = named_classes(np.log(p), logarithmic=True)
     assert named.tolist() == [list(range(NEW_CLASSES))]
     assert bits[0, :NEW_CLASSES].tolist() == [1, 2, 4, 8, 16, 32, 64, 128]
     assert not bits[0, NEW_CLASSES:].any()
     rest = p[0, NEW_CLASSES:].mean()
-    assert np.allclose(gains, np.log(p / rest), atol=1e-5)
+    assert np.allclose(relative, np.log(p / rest), atol=1e-5)
 
 
 def test_a_fifth_label_takes_the_place_of_the_least_likely_one_or_none() -> None:
@@ -169,13 +169,13 @@ def test_counts_are_counts() -> None:
 
 def test_small_numbers_saturate_and_do_not_wrap() -> None:
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
-    said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(most_units=MOST_UNITS)
-    gains = np.zeros((2, 6))
-    gains[:, 2], gains[:, 3] = MOST_GAIN, -MOST_GAIN
-    bits = (said.class_said & ALL_NAMED).astype(np.uint8)
+    said = voted([7, 7], [1.0, 1.0], [2, 3], Combine.SUM)._replace(max_score=MAX_SCORE)
+    relative = np.zeros((2, 6))
+    relative[:, 2], relative[:, 3] = MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE
+    bits = (said.class_scores & ALL_NAMED).astype(np.uint8)
     for _ in range(40):
-        update_voxel(evidence, 0, said._replace(class_said=class_said(gains, 1, bits, np.int32)), COVERED)
-    assert evidence.class_value[0, :2].tolist() == [MOST_UNITS, -MOST_UNITS]
+        update_voxel(evidence, 0, said._replace(class_scores=pack_class_scores(relative, 1, bits, np.int32)), COVERED)
+    assert evidence.class_value[0, :2].tolist() == [MAX_SCORE, -MAX_SCORE]
     assert best_class(evidence, 0) == 2
 
 
@@ -184,10 +184,10 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
     """The same distribution 1000 times, its best class the last one and most of the rest on the first."""
     p = np.full((1, classes), 0.1 * (1 - best) / max(classes - 2, 1))
     p[0, 0], p[0, -1] = 1 - best - p[0, 1:-1].sum(), best
-    gains, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
+    relative, named, bits = named_classes(np.log(0.9 * p + 0.1 / classes), logarithmic=True)
     evidence = blank()._replace(class_value=np.zeros((1, CLASS_SLOTS), np.int16))
     said = measured([1], [0.9], p, 1.0, 1)._replace(
-        class_said=class_said(gains, 64, bits, np.int32), named_classes=named, most_units=MOST_UNITS
+        class_scores=pack_class_scores(relative, 64, bits, np.int32), named_classes=named, max_score=MAX_SCORE
     )
     for _ in range(1000):
         update_voxel(evidence, 0, said, COVERED)
@@ -195,11 +195,11 @@ def test_the_likeliest_class_stays_the_likeliest_however_often_it_is_seen(classe
 
 
 def test_both_kinds_of_integers_say_the_same() -> None:
-    """The largest gains that compact storage allows."""
-    gains = np.array([[MOST_GAIN, -MOST_GAIN, 0.4, -0.6]])
+    """The largest relative that compact storage allows."""
+    relative = np.array([[MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE, 0.4, -0.6]])
     bits = np.zeros((1, NO_CLASS + 1), np.uint8)
     bits[0, :4] = 1 << np.arange(4)
-    narrow, wide = (class_said(gains, 1, bits, kind) for kind in (np.int32, np.int64))
+    narrow, wide = (pack_class_scores(relative, 1, bits, kind) for kind in (np.int32, np.int64))
     assert narrow.dtype == np.int32
     np.testing.assert_array_equal(narrow, wide)
-    assert (wide[0, :4] >> NEW_CLASSES).tolist() == [MOST_GAIN, -MOST_GAIN, 0, -1]
+    assert (wide[0, :4] >> NEW_CLASSES).tolist() == [MAX_CLUSTER_SCORE, -MAX_CLUSTER_SCORE, 0, -1]
