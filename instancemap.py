@@ -75,7 +75,7 @@ _SHARED_WITH_PLUGINS = {
     "exp_se3": "framework.geometry",
     "folder_of": "framework.files.search_paths",
     "inverse": "framework.geometry",
-    "keep_points": "framework.refinement.selection",
+    "keep_points": "framework.refinement.refine",
     "list_points_by_pixel": "framework.mapping.labels.pixel_lists",
     "project": "framework.geometry",
     "transform": "framework.geometry",
@@ -96,7 +96,7 @@ if TYPE_CHECKING:
     from framework.mapping.labels.label_evidence_kernels import Combine
     from framework.mapping.labels.label_rule import LabeledVoxels, LabelRule, vote_for_best
     from framework.mapping.labels.pixel_lists import list_points_by_pixel
-    from framework.refinement.selection import keep_points
+    from framework.refinement.refine import keep_points
     from framework.registry import assemble
 
 

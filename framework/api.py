@@ -50,7 +50,7 @@ from framework.runs.stored_runs import KEYFRAMES, MAP
 from framework.runtime.cpu_budget import limited_threads
 from framework.runtime.process_settings import Settings, configure_process
 from framework.runtime.run_log import Journal
-from framework.tracking.keyframes_file import read_keyframes
+from framework.tracking.keyframes import read_keyframes
 
 __all__ = [
     "Camera",

@@ -1,1 +1,1 @@
-"""The algorithms of the cluster refiners; `plugins.refiners` are their parameters."""
+"""Lifting of masks to point clusters, and the algorithms of the cluster refiners."""

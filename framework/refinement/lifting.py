@@ -12,17 +12,17 @@ from framework.refinement.lifting_kernels import count_readings, gather_readings
 
 
 def lift(detections: Detections, frame: Frame, pose: Pose) -> PointClusters:
-    """Each mask's pixels that have a depth reading, as points in the world: eq. [5] of the paper.
+    """Return each mask's pixels with a depth reading as points in the world.
 
-    Overlapping masks give overlapping clusters. A mask without any reading gives an empty cluster, so that cluster k
-    always is detection k. Raises DataError for masks of another size than the frame, and for what are no Detections.
+    Masks may overlap. A mask without readings gives an empty cluster, so that cluster k is detection k. Raises
+    DataError if the masks have another size than the frame or `detections` has another type.
     """
     if not isinstance(cast(object, detections), Detections):
         raise DataError(f"frame {frame.index}: a detector must return Detections, found {type(detections).__name__}")
     height, width = frame.depth.shape
     if detections.masks.shape[1:] != (height, width):
         raise DataError(f"frame {frame.index}: masks must be {(height, width)}, found {detections.masks.shape[1:]}")
-    starts = np.zeros(len(detections) * height + 1, np.int64)  # of each row of each mask among all points
+    starts = np.zeros(len(detections) * height + 1, np.int64)  # first point of each row of each mask
     count_readings(detections.masks, frame.depth, starts)
     np.cumsum(starts, out=starts)
     points_world = np.empty((starts[-1], 3), np.float32)

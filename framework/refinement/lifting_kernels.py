@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int32
+from framework.data import Bool, Float32, Float64, Int32, Int64
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def count_readings(masks: Bool, depth: Float32, counts: npt.NDArray[np.int64]) -> None:
-    """Sets counts (N * H + 1,) to how many pixels of each row of each mask have a reading, one place on."""
+def count_readings(masks: Bool, depth: Float32, counts: Int64) -> None:
+    """Set counts[1:] (N * H,) to the number of readings in each row of each mask."""
     height = depth.shape[0]
     for row in prange(masks.shape[0] * height):
         k, v = row // height, row % height
@@ -23,19 +21,12 @@ def count_readings(masks: Bool, depth: Float32, counts: npt.NDArray[np.int64]) -
 
 @njit(cache=True, nogil=True, parallel=True)
 def gather_readings(
-    masks: Bool,
-    depth: Float32,
-    camera: tuple[float, float, float, float],
-    T_world_camera: Float64,
-    starts: npt.NDArray[np.int64],
-    points_world: Float32,
-    pixels: Int32,
-    cluster: Int32,
-) -> None:
-    """Fills points_world (P, 3), pixels (P, 2) and cluster (P,) with the masks' readings, row by row."""
+    masks: Bool, depth: Float32, camera: tuple[float, float, float, float], T: Float64, starts: Int64,
+    points_world: Float32, pixels: Int32, cluster: Int32,
+) -> None:  # fmt: skip
+    """Set points_world (P, 3), pixels (P, 2) and cluster (P,) by row of each mask; T is T_world_camera."""
     height = depth.shape[0]
     fx, fy, cx, cy = camera
-    T = T_world_camera
     for row in prange(masks.shape[0] * height):
         if starts[row] == starts[row + 1]:
             continue

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit, prange
@@ -12,15 +14,31 @@ Int16 = npt.NDArray[np.int16]
 
 # 3-4 chamfer distance (Borgefors 1986) in thirds of a pixel, at most 8 % from the Euclidean one
 CHAMFER_STEP, CHAMFER_DIAGONAL = np.int16(3), np.int16(4)
-FAR = np.int16(30000)  # 10 000 px; two steps more still fit
+FAR = np.int16(30000)  # 10 000 px; leaves room for two more steps
 PX_PER_STEP = np.float32(1) / np.float32(CHAMFER_STEP)
+
+
+class Windows(NamedTuple):
+    """The pixels of N clusters, and the image windows that contain each cluster and its ring."""
+
+    pixels: Int32  # (M, 2) (u, v), cluster by cluster
+    firsts: Int64  # (N + 1,) where each cluster begins among them
+    bounds: Int64  # (N, 4) v0 u0 v1 u1 (half open)
+    cells: Int64  # (N + 1,) where each window begins in flat arrays of all windows
+
+
+class ThreadSchedule(NamedTuple):
+    """The clusters of each thread: thread t processes order[starts[t]:starts[t + 1]]."""
+
+    order: Int64  # (N,)
+    starts: Int64  # (threads + 1,)
 
 
 @njit(cache=True, nogil=True)
 def grouped(cluster: Int32, n: int) -> tuple[Int64, Int64]:
-    """The points in the order of their clusters: (members,) indices and (n + 1,) where each cluster begins.
+    """Return a stable sort of the points by cluster: (members,) indices and (n + 1,) where each cluster begins.
 
-    Within a cluster the points keep their order. Points of no cluster (-1) are left out.
+    Points of no cluster (-1) are omitted.
     """
     firsts = np.zeros(n + 1, np.int64)
     for k in cluster:
@@ -50,26 +68,26 @@ def share_among_threads(costs: Int64, longest_first: Int64, threads: int) -> tup
         starts[owners[k] + 1] += 1
     for thread in range(threads):
         starts[thread + 1] += starts[thread]
-    places, order = starts.copy(), np.empty(len(costs), np.int64)
+    free, order = starts.copy(), np.empty(len(costs), np.int64)
     for k in range(len(costs)):
-        order[places[owners[k]]] = k
-        places[owners[k]] += 1
+        order[free[owners[k]]] = k
+        free[owners[k]] += 1
     return order, starts
 
 
 @njit(cache=True, nogil=True)
-def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, windows: Int64) -> None:
-    """Sets (N, 4) v0 u0 v1 u1 (half open): each cluster's bounding box grown by its ring, within the image."""
+def bound(pixels: Int32, firsts: Int64, widths: Int64, height: int, width: int, bounds: Int64) -> None:
+    """Set bounds (N, 4) v0 u0 v1 u1 (half open) to each cluster's bounding box, grown by its ring, in the image."""
     for k in range(len(widths)):
         if firsts[k] < firsts[k + 1]:
             u0, v0, u1, v1 = bounding_box(pixels[firsts[k] : firsts[k + 1]])
-            windows[k, 0], windows[k, 1] = max(v0 - widths[k], 0), max(u0 - widths[k], 0)
-            windows[k, 2], windows[k, 3] = min(v1 + widths[k] + 1, height), min(u1 + widths[k] + 1, width)
+            bounds[k, 0], bounds[k, 1] = max(v0 - widths[k], 0), max(u0 - widths[k], 0)
+            bounds[k, 2], bounds[k, 3] = min(v1 + widths[k] + 1, height), min(u1 + widths[k] + 1, width)
 
 
 @njit(cache=True, nogil=True)
 def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
-    """Lowest u and v, highest u and v of at least one pixel."""
+    """Return lowest u and v, highest u and v of at least one pixel."""
     u0, v0 = pixels[0, 0], pixels[0, 1]
     u1, v1 = u0, v0
     for i in range(len(pixels)):
@@ -83,36 +101,37 @@ def bounding_box(pixels: Int32) -> tuple[int, int, int, int]:
 
 @njit(cache=True, nogil=True, parallel=True)
 def signed_distances(
-    pixels: Int32, firsts: Int64, widths: Int64, windows: Int64, cells: Int64, depth: Float32,
-    share_order: Int64, share_starts: Int64, steps: Int16, ring_counts: Int64, radii: Float32,
+    windows: Windows, widths: Int64, depth: Float32, schedule: ThreadSchedule, steps: Int16, ring_counts: Int64,
+    radii: Float32,
 ) -> None:  # fmt: skip
-    """In every window (cells,) how deep each of the mask's pixels lies in it; readings in the rings; the masks' radii.
+    """Set steps (cells,) to each pixel's signed distance, and the number of readings in each ring and the masks' radii.
 
     Distances are in thirds of a pixel: above 0 in the mask, to the next reading outside; below 0 in the ring, to the
-    mask; 0 elsewhere. A pixel without a reading is no border of the mask: holes in the depth are common inside of
-    objects.
+    mask; 0 elsewhere. Pixels without a reading are not a border of the mask, as objects often have holes in the depth.
     """
-    for share in prange(len(share_starts) - 1):
-        for k in share_order[share_starts[share] : share_starts[share + 1]]:
+    firsts, cells = windows.firsts, windows.cells
+    for thread in prange(len(schedule.starts) - 1):
+        for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
             if cells[k] < cells[k + 1]:
                 ring_counts[k], radii[k] = _signed_distances_of(
-                    pixels[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows[k], depth,
-                    steps[cells[k] : cells[k + 1]],
+                    windows.pixels[firsts[k] : firsts[k + 1]], np.int16(CHAMFER_STEP * widths[k]), windows.bounds[k],
+                    depth, steps[cells[k] : cells[k + 1]],
                 )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _signed_distances_of(
-    pixels: Int32, ring: np.int16, window: Int64, depth: Float32, steps: Int16
+    pixels: Int32, ring: np.int16, bounds: Int64, depth: Float32, steps: Int16
 ) -> tuple[int, np.float32]:
-    """Both distances lie side by side in one grid, with FAR cells around each, and spread over it together.
+    """Return the number of readings in the ring and the mask's radius.
 
-    A shortest way may make its level steps first, all in the row of its source. So the rows are filled by runs, and the
-    steps down and up, straight and diagonal, are left to two sweeps in vector code.
+    The distances to the mask and to the rest are side by side in one grid with FAR cells around each. A shortest path
+    may make its horizontal steps first, in the row of its source: rows are filled by runs, then two vectorized sweeps
+    add the steps down and up, straight and diagonal.
     """
-    v0, u0 = window[0], window[1]
-    rows, columns = window[2] - v0, window[3] - u0
-    middle = columns + 1  # the FAR cell between the distance to the mask and that to the rest
+    v0, u0 = bounds[0], bounds[1]
+    rows, columns = bounds[2] - v0, bounds[3] - u0
+    middle = columns + 1  # the FAR cell between the two distances
     in_mask, in_rest = np.zeros((rows, columns), np.bool_), np.empty(columns, np.bool_)
     for i in range(len(pixels)):
         in_mask[pixels[i, 1] - v0, pixels[i, 0] - u0] = True
@@ -147,7 +166,7 @@ def _mark_rest(in_mask: Bool, depth: Float32, in_rest: Bool) -> None:
 
 @njit(cache=True, nogil=True)
 def _sign(in_mask: Bool, to_mask: Int16, to_rest: Int16, depth: Float32, ring: np.int16, steps: Int16) -> int:
-    """Puts one row of the two distances together; the number of its readings in the ring."""
+    """Combine one row of the two distances; return the number of its readings in the ring."""
     count = np.int32(0)
     for c in range(len(steps)):
         in_ring = (not in_mask[c]) & (to_mask[c] <= ring) & (depth[c] > 0)
@@ -167,7 +186,7 @@ def _highest(steps: Int16) -> np.int16:
 
 @njit(cache=True, nogil=True)
 def _distances_along(sources: Bool, row: Int16) -> None:
-    """The distance of every cell to the nearest source of its row, FAR without one."""
+    """Set the distance of every cell to the nearest source of its row, FAR without one."""
     columns = len(row)
     row[:] = 0
     begin = 0
@@ -201,7 +220,7 @@ def _spread_across(neighbors: Int16, row: Int16, middle: int) -> None:
 
 @njit(cache=True, nogil=True)
 def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
-    """row = min(row, across + a step, before or behind + a diagonal); without min() and offsets, so it vectorizes."""
+    """Set row to min(row, across + step, before or behind + diagonal), without min() and offsets, to vectorize."""
     for i in range(len(row)):
         diagonal = np.int16((before[i] if before[i] < behind[i] else behind[i]) + CHAMFER_DIAGONAL)
         straight = np.int16(across[i] + CHAMFER_STEP)
@@ -211,32 +230,32 @@ def _lower(row: Int16, before: Int16, across: Int16, behind: Int16) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def gather(
-    pixels: Int32, firsts: Int64, windows: Int64, cells: Int64, steps: Int16, depth: Float32,
-    pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64, share_order: Int64, share_starts: Int64,
-    points: Float32, depth_in_mask: Float32,
+    windows: Windows, steps: Int16, depth: Float32, pinhole: Float32, starts: Int64, mask_counts: Int64, nth: Int64,
+    schedule: ThreadSchedule, points: Float32, depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    """Points, as geometry.back_project gives them (tested), and their depth in the mask."""
-    for share in prange(len(share_starts) - 1):
-        for k in share_order[share_starts[share] : share_starts[share + 1]]:
+    """Set points, as geometry.back_project does, and their depth in the mask."""
+    firsts, cells = windows.firsts, windows.cells
+    for thread in prange(len(schedule.starts) - 1):
+        for k in schedule.order[schedule.starts[thread] : schedule.starts[thread + 1]]:
             middle, end = starts[k] + mask_counts[k], starts[k + 1]
-            window, own_steps = windows[k], steps[cells[k] : cells[k + 1]]
+            bounds, own_steps = windows.bounds[k], steps[cells[k] : cells[k + 1]]
             _gather_mask(
-                pixels[firsts[k] : firsts[k + 1]], window, own_steps, depth, pinhole, nth[k],
+                windows.pixels[firsts[k] : firsts[k + 1]], bounds, own_steps, depth, pinhole, nth[k],
                 points[starts[k] : middle], depth_in_mask[starts[k] : middle],
             )  # fmt: skip
             if middle < end:
-                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # the ring goes on where the mask ended
+                skipped = mask_counts[k] * nth[k] - (firsts[k + 1] - firsts[k])  # every n-th point, over both
                 _gather_ring(
-                    window, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
+                    bounds, own_steps, depth, pinhole, skipped, nth[k], points[middle:end], depth_in_mask[middle:end]
                 )
 
 
 @njit(cache=True, nogil=True)
 def _gather_mask(
-    pixels: Int32, window: Int64, steps: Int16, depth: Float32, pinhole: Float32, nth: int, points: Float32,
+    pixels: Int32, bounds: Int64, steps: Int16, depth: Float32, pinhole: Float32, nth: int, points: Float32,
     depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    v0, u0, columns = window[0], window[1], window[3] - window[1]
+    v0, u0, columns = bounds[0], bounds[1], bounds[3] - bounds[1]
     for s in range(len(points)):
         u, v = pixels[s * nth, 0], pixels[s * nth, 1]
         _back_project(u, v, depth[v, u], pinhole, points, s)
@@ -245,10 +264,10 @@ def _gather_mask(
 
 @njit(cache=True, nogil=True)
 def _gather_ring(
-    window: Int64, steps: Int16, depth: Float32, pinhole: Float32, skipped: int, nth: int, points: Float32,
+    bounds: Int64, steps: Int16, depth: Float32, pinhole: Float32, skipped: int, nth: int, points: Float32,
     depth_in_mask: Float32,
 ) -> None:  # fmt: skip
-    v0, u0, columns = window[0], window[1], window[3] - window[1]
+    v0, u0, columns = bounds[0], bounds[1], bounds[3] - bounds[1]
     s, until_next = 0, skipped
     for cell in range(len(steps)):
         if steps[cell] < 0:
@@ -265,3 +284,23 @@ def _back_project(u: int, v: int, z: np.float32, pinhole: Float32, points: Float
     points[s, 0] = np.float32(u - pinhole[2]) * (z / pinhole[0])
     points[s, 1] = np.float32(v - pinhole[3]) * (z / pinhole[1])
     points[s, 2] = z
+
+
+@njit(cache=True, nogil=True)
+def ramps(
+    depth_in_mask: Float32, starts: Int64, widths: Float32, expected_bleed: float, largest: float, log_odds: Float32
+) -> None:
+    """Set log_odds (S,) to the ramp of each neighborhood, `widths` (N,) px wide, between -largest and largest."""
+    zero = np.float32(expected_bleed / (1 - expected_bleed))
+    for k in range(len(widths)):
+        own = slice(starts[k], starts[k + 1])
+        _ramp(depth_in_mask[own], np.float32(1) / widths[k], zero, np.float32(largest), log_odds[own])
+
+
+@njit(cache=True, nogil=True)
+def _ramp(depth_in_mask: Float32, scale: np.float32, zero: np.float32, largest: np.float32, log_odds: Float32) -> None:
+    one = np.float32(1)
+    for i in range(len(log_odds)):
+        ramp = depth_in_mask[i] * scale - zero
+        ramp = ramp if ramp < one else one
+        log_odds[i] = largest * (ramp if ramp > -one else -one)

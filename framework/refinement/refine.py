@@ -1,20 +1,24 @@
-"""One refiner on the clusters of one frame, with what holds for all refiners."""
+"""Refinement of the clusters of one frame: what all refiners share."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import cast
 
-from framework.data import Frame, PointClusters
+import numpy as np
+
+from framework.data import Bool, Frame, PointClusters
 from framework.errors import DataError
 from framework.geometry import require_pixels_inside
 from framework.interfaces import ClusterRefiner
+from framework.refinement.refine_kernels import compress, part_starts
 
 
 def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> PointClusters:
-    """What the refiner makes of the clusters. True masks pass as they are: cleaning the truth could only damage it.
+    """Return the refined clusters. Exact clusters, from true masks, stay unchanged.
 
-    Raises DataError when the refiner returns no clusters, or has made up pixels: whoever comes next indexes the frame
-    with them unchecked.
+    Raises DataError if the refiner does not return PointClusters or returns pixels outside of the image: later stages
+    index the frame with them unchecked.
     """
     if clusters.exact:
         return clusters
@@ -23,3 +27,15 @@ def refine(refiner: ClusterRefiner, clusters: PointClusters, frame: Frame) -> Po
         raise DataError(f"frame {frame.index}: a refiner must return PointClusters, found {type(refined).__name__}")
     require_pixels_inside(refined, frame.depth.shape)
     return refined
+
+
+def keep_points(clusters: PointClusters, kept: Bool) -> PointClusters:
+    """Return the clusters without the points where `kept` (P,) is False.
+
+    Clusters keep their index, scores and classes, so that cluster k is detection k even if it has no points left.
+    """
+    starts = part_starts(kept)
+    points_world = np.empty((starts[-1], 3), np.float32)
+    pixels, cluster = np.empty((starts[-1], 2), np.int32), np.empty(starts[-1], np.int32)
+    compress(clusters.points_world, clusters.pixels, clusters.cluster, kept, starts, points_world, pixels, cluster)
+    return replace(clusters, points_world=points_world, pixels=pixels, cluster=cluster)

@@ -49,7 +49,7 @@ from framework.runs.stored_runs import (
     TRAJECTORY,
 )
 from framework.runtime.run_log import RunResult
-from framework.tracking.keyframes_file import write_keyframes
+from framework.tracking.keyframes import write_keyframes
 
 log = logging.getLogger(__name__)
 

@@ -1,45 +1,42 @@
-"""The camera pose from pixels and the points of the world that they show: P3P in LO-RANSAC, refined, by pycolmap."""
+"""The camera pose from 2D-3D matches: P3P in LO-RANSAC with refinement, by pycolmap."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import pycolmap
 
 from framework.config.validation import check_bounds
 from framework.data import Bool, Camera, Float32, Float64
 from framework.geometry import inverse, nearest_rotation, transform
 
 COLMAP_PIXEL_CENTER = 0.5  # COLMAP's center of the first pixel; ours is at 0
-CONFIDENCE = 0.9999  # of having found the best pose when RANSAC stops
-MAX_DEPTH_ERROR = 0.05  # of the depth: an inlier's own reading must confirm the point to this
+CONFIDENCE = 0.9999  # of RANSAC
+MAX_DEPTH_ERROR = 0.05  # of the depth, of an inlier
 
 
 @dataclass(frozen=True)
 class AbsolutePose:
-    """A camera pose and what speaks for it."""
+    """A camera pose and its inliers."""
 
     T_world_camera: Float64  # (4, 4)
-    inliers: Bool  # (M,) of the matches: those that it explains
+    inliers: Bool  # (M,) of the matches
 
 
 @dataclass
 class AbsolutePoseEstimator:
-    """Estimates an `AbsolutePose`, or tells that the matches do not determine one."""
+    """Estimates an `AbsolutePose` from matches; equal matches give equal poses."""
 
-    max_error: float = 4.0  # px, > 0: of the reprojection of an inlier
-    min_inliers: int = 15  # >= 4: garbage reaches 4 to 8
+    max_error: float = 4.0  # px, > 0, of the reprojection of an inlier
+    min_inliers: int = 15  # >= 4; wrong matches reach 4 to 8
     min_inlier_ratio: float = 0.25  # of the matches, in (0, 1]
-    seed: int = 0  # >= 0; the same matches give the same pose
+    seed: int = 0  # >= 0
 
     def __post_init__(self) -> None:
+        import pycolmap
+
         check_bounds(
-            self,
-            max_error=(1e-3, 1e3),
-            min_inliers=(4, 100_000),
-            min_inlier_ratio=(1e-3, 1.0),
-            seed=(0, 2**31 - 1),
+            self, max_error=(1e-3, 1e3), min_inliers=(4, 100_000), min_inlier_ratio=(1e-3, 1.0), seed=(0, 2**31 - 1)
         )
         self._estimation = pycolmap.AbsolutePoseEstimationOptions()
         self._estimation.ransac.max_error = self.max_error
@@ -51,11 +48,13 @@ class AbsolutePoseEstimator:
     def estimate(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32 | None = None
     ) -> AbsolutePose | None:
-        """The pose of `camera`, whose `pixels` (M, 2) show `points_world` (M, 3) at `depth` (M,) m, 0 = not known.
+        """Return the pose of `camera`, whose `pixels` (M, 2) show `points_world` (M, 3) at `depth` (M,) m, 0 = unknown.
 
-        None when there are too few inliers: matches that are not finite, that reproject farther than `max_error`, that
-        lie behind the camera or whose depth the pose contradicts are none.
+        None if there are too few inliers. An inlier is finite, in front of the camera, reprojects within `max_error`
+        and agrees with its depth.
         """
+        import pycolmap
+
         finite = np.isfinite(pixels).all(axis=1) & np.isfinite(points_world).all(axis=1)
         needed = max(self.min_inliers, self.min_inlier_ratio * len(pixels))
         if np.count_nonzero(finite) < needed:
@@ -63,7 +62,12 @@ class AbsolutePoseEstimator:
         found = pycolmap.estimate_and_refine_absolute_pose(
             pixels[finite].astype(np.float64) + COLMAP_PIXEL_CENTER,
             points_world[finite].astype(np.float64),
-            _colmap_camera(camera),
+            pycolmap.Camera(
+                model="PINHOLE",
+                width=camera.width,
+                height=camera.height,
+                params=[camera.fx, camera.fy, camera.cx + COLMAP_PIXEL_CENTER, camera.cy + COLMAP_PIXEL_CENTER],
+            ),
             self._estimation,
             self._refinement,
         )
@@ -75,28 +79,18 @@ class AbsolutePoseEstimator:
             return None
         T_camera_world[:3, :3] = nearest_rotation(T_camera_world[:3, :3])
         readings = np.zeros(len(pixels), np.float32) if depth is None else depth
-        inliers = finite & self._explained(camera, pixels, points_world, readings, T_camera_world)
+        inliers = finite & self._inliers(camera, pixels, points_world, readings, T_camera_world)
         if np.count_nonzero(inliers) < needed:
             return None
         return AbsolutePose(inverse(T_camera_world), inliers)
 
-    def _explained(
+    def _inliers(
         self, camera: Camera, pixels: Float32, points_world: Float32, depth: Float32, T_camera_world: Float64
     ) -> Bool:
-        """Which matches (M,) the pose explains; comparisons with what is not finite are false."""
+        """Return (M,) which matches agree with the pose; matches that are not finite do not."""
         with np.errstate(invalid="ignore", divide="ignore", over="ignore"):
             x, y, z = transform(T_camera_world, points_world.astype(np.float64)).T
             u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
             near = np.hypot(u - pixels[:, 0], v - pixels[:, 1]) <= self.max_error
             confirmed = (depth == 0) | (np.abs(z - depth) <= MAX_DEPTH_ERROR * depth)
         return np.asarray(near & (z > 0) & confirmed, np.bool_)
-
-
-def _colmap_camera(camera: Camera) -> pycolmap.Camera:
-    """Our camera with the first pixel's center at (0.5, 0.5)."""
-    return pycolmap.Camera(
-        model="PINHOLE",
-        width=camera.width,
-        height=camera.height,
-        params=[camera.fx, camera.fy, camera.cx + COLMAP_PIXEL_CENTER, camera.cy + COLMAP_PIXEL_CENTER],
-    )

@@ -1,16 +1,16 @@
-"""Aligning a frame to a view of the map: point-to-plane and photometric terms, as ElasticFusion (Whelan et al. 2015).
+"""Alignment of a frame to a view of the map: point-to-plane and photometric terms, as in ElasticFusion (Whelan 2015).
 
     E(xi) = sum_i w_i (n_i . (T p_i - q_i))^2 + lambda sum_i v_i (I(pi(T p_i)) - I_frame,i)^2
 
-The frame's points p_i are moved by T = T_view_camera and projected into the view, which gives each its model point q_i
-with normal n_i, and its model intensity. Residuals are divided by their expected noise, so that both terms count
-standard deviations; w_i and v_i are Tukey's biweights. Beyond `FAR` a depth's standard deviation is its noise times
-depth / FAR: what a structured-light camera gets wrong there is wrong in whole regions of the image and does not average
-out. Gauss-Newton steps are twists of the view's frame: T <- exp(xi) T.
+T = T_view_camera moves the frame's points p_i into the view, which gives each its model point q_i with normal n_i, and
+its model intensity. Residuals are divided by their expected noise, so both terms count standard deviations; w_i and v_i
+are Tukey's biweights. Beyond `FAR` a depth's standard deviation is its noise times depth / FAR: errors of
+structured-light cameras at that range cover whole image regions and do not average out. Gauss-Newton steps are twists
+in the view's frame: T <- exp(xi) T.
 
-Points are done in batches of a fixed size, in passes that the compiler vectorises: loops without branches over fields
-of one array, and other loops that only fetch from images. A point that does not count has weight 0. Sums of points are
-kept in lanes: vectors then need no reordered additions (fast math), so that every compilation rounds alike.
+The kernels process points in batches of a fixed size: branch-free loops over fields of one array, which the compiler
+vectorizes, and separate loops that only fetch from images. Ignored points have weight 0. Sums are kept in lanes, so
+that vector code needs no reordered additions (fast math) and every compilation rounds alike.
 """
 
 from __future__ import annotations
@@ -21,27 +21,27 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from framework.data import Camera, Float32, Float64, SurfaceView
+from framework.data import Float32, Float64, SurfaceView
 from framework.tracking.alignment_kernels import CHUNKS, ROW, SUMS, TERMS, accumulate, smooth_normals, turn_normals
-from framework.tracking.pyramid import PyramidLevel
+from framework.tracking.pyramid import PyramidLevel, intrinsics
 
 
-def _places() -> npt.NDArray[np.int64]:
-    """(6, 6) where the numbers of the symmetric matrix stand among the sums."""
-    places = np.empty((6, 6), np.int64)
-    for i in range(6):
-        following = (i + np.arange(4)) % 6
-        places[i, following] = places[following, i] = i * ROW + np.arange(4)
-    return places
+def _matrix_sums() -> npt.NDArray[np.int64]:
+    """Return (6, 6) the index among the sums of each element of the symmetric matrix A."""
+    indices = np.empty((6, 6), np.int64)
+    for row in range(6):
+        columns = (row + np.arange(4)) % 6
+        indices[row, columns] = indices[columns, row] = row * ROW + np.arange(4)
+    return indices
 
 
-PLACES = _places()
+MATRIX_SUMS = _matrix_sums()
 
 
 class ModelView(NamedTuple):
     """The view of the map that frames are aligned to."""
 
-    depth: Float32  # (H, W) m, 0 = nothing there
+    depth: Float32  # (H, W) m, 0 = nothing mapped
     normals: Float32  # (3, H, W) in the view's camera frame
     fx: np.float32
     fy: np.float32
@@ -49,90 +49,84 @@ class ModelView(NamedTuple):
     cy: np.float32
 
 
+class FrameView(NamedTuple):
+    """One pyramid level of the frame. Flat, because parallel kernels take no nested tuples."""
+
+    depth: Float32  # (H, W) m, 0 = no reading
+    intensity: Float32  # (H, W) in [0, 1]
+    normals: Float32  # (3, H, W) in the camera frame
+    fx: np.float32
+    fy: np.float32
+    cx: np.float32
+    cy: np.float32
+
+
 def model_view(view: SurfaceView) -> ModelView:
-    """What alignment needs of a view of the map."""
+    """Return the model of a view of the map, with normals in its camera frame."""
     normals = np.empty((3, *view.depth.shape), np.float32)
     turn_normals(view.normals_world, np.ascontiguousarray(view.T_world_camera[:3, :3].T, np.float32), normals)
-    camera = view.camera
-    return ModelView(view.depth, normals, *(np.float32(k) for k in (camera.fx, camera.fy, camera.cx, camera.cy)))
+    return ModelView(view.depth, normals, *intrinsics(view.camera))
 
 
 def smoothed(model: ModelView, level: int) -> ModelView:
-    """The model for `level` halvings of its resolution: its normals are the means of squares about as large.
+    """Return the model for `level` halvings of its resolution: normals averaged over squares of about that size.
 
-    A young map is noisy, and a normal's noise looks like a surface that resists motions along the real one.
+    A young map is noisy, and noise of a normal acts like a surface that resists motions along the real one.
     """
     if level == 0:
         return model
-    across, normals = np.empty_like(model.normals), np.empty_like(model.normals)
-    smooth_normals(model.normals, 2**level - 1, across, normals)
+    row_sums, normals = np.empty_like(model.normals), np.empty_like(model.normals)
+    smooth_normals(model.normals, 2**level - 1, row_sums, normals)
     return model._replace(normals=normals)
 
 
 class Weights(NamedTuple):
-    """How residuals are weighed."""
+    """The weights of residuals and the gates of correspondences."""
 
     max_distance: np.float32  # m, of a point from its model point
-    close_distance: np.float32  # m, or 3 standard deviations: a reading this far from the model's depth agrees with it
+    close_distance: np.float32  # m; a reading agrees with the model's depth within this or 3 standard deviations
     min_normal_dot: np.float32  # cosine between the frame's and the model's normal
     geometric_scale: np.float32  # standard deviations at which Tukey's weight reaches 0
-    photometric_scale: np.float32  # likewise
+    photometric_scale: np.float32  # standard deviations at which Tukey's weight reaches 0
     intensity_noise: np.float32  # standard deviation of an intensity difference, of [0, 1]
     color_weight: np.float32  # lambda; 0 = geometry alone
-    depth_weight: np.float32  # 0 = colour alone
+    depth_weight: np.float32  # 0 = color alone
 
 
 class NormalEquations(NamedTuple):
-    """The linearized problem, and what it is made of."""
+    """The linearized problem and its point counts."""
 
     A: Float64  # (6, 6)
     b: Float64  # (6,)
     visible: int  # points that fall on a mapped part of the view
     matched: int  # of these, points with a weight
     close: int  # of the visible, points whose depth in the view agrees with the model's
-    behind: int  # of the visible, points so far behind the model that they could not be seen through it
+    behind: int  # of the visible, points so far behind the model that it should have hidden them
     brightness: float  # mean of frame - model intensity: the change of exposure
 
 
 def linearize(
-    level: PyramidLevel,
-    model: ModelView,
-    model_intensity: Float32,
-    T_view_camera: Float64,
-    weights: Weights,
+    level: PyramidLevel, model: ModelView, model_intensity: Float32, T_view_camera: Float64, weights: Weights,
     brightness: float,
-) -> NormalEquations:
-    """The normal equations of E at T_view_camera for one pyramid level of the frame.
+) -> NormalEquations:  # fmt: skip
+    """Return the normal equations of E at T_view_camera for one pyramid level of the frame.
 
     `model_intensity` (h, w) is the view's intensity at that level's resolution, negative where nothing is mapped.
     """
     sums = np.empty((CHUNKS, TERMS))
-    camera: Camera = level.camera
     scale = 1 << round(math.log2(model.depth.shape[1] / model_intensity.shape[1]))  # odd columns are dropped
     accumulate(
-        level.depth,
-        level.intensity,
-        level.normals,
-        np.float32(camera.fx),
-        np.float32(camera.fy),
-        np.float32(camera.cx),
-        np.float32(camera.cy),
-        model,
-        model_intensity,
-        np.float32(1 / scale),
-        np.ascontiguousarray(T_view_camera[:3, :3], np.float32),
-        np.ascontiguousarray(T_view_camera[:3, 3], np.float32),
-        weights,
-        np.float32(brightness),
-        sums,
-    )
+        FrameView(level.depth, level.intensity, level.normals, *intrinsics(level.camera)), model, model_intensity,
+        np.float32(1 / scale), np.ascontiguousarray(T_view_camera[:3, :3], np.float32),
+        np.ascontiguousarray(T_view_camera[:3, 3], np.float32), weights, np.float32(brightness), sums,
+    )  # fmt: skip
     total = sums.sum(axis=0)
-    visible, weighed, close, behind, weighed_colors, compared = (int(count) for count in total[SUMS:])
+    visible, matched, close, behind, matched_colors, compared = (int(count) for count in total[SUMS:])
     return NormalEquations(
-        A=total[PLACES],
+        A=total[MATRIX_SUMS],
         b=total[ROW - 1 : 6 * ROW : ROW].copy(),
         visible=visible,
-        matched=weighed if weights.depth_weight > 0 else weighed_colors,
+        matched=matched if weights.depth_weight > 0 else matched_colors,
         close=close,
         behind=behind,
         brightness=float(total[SUMS - 1] / max(compared, 1)),

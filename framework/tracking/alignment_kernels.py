@@ -8,42 +8,42 @@ from numba import njit, prange
 from framework.mapping.voxels.voxel_grid_kernels import device, one_more
 from framework.sensors.noise_models import axial_sigma_single
 
-CHUNKS = 16  # of image rows, summed in order: the same sums whatever the number of threads
+CHUNKS = 16  # of image rows, summed in order, so that sums do not depend on the number of threads
 BATCH = 160  # points; divides the usual widths
 LANES = 16  # of a sum: point n of a batch is added to lane n % LANES
-ROW = 5  # sums for each of the six errors' derivatives: its products with itself, the next three and the error
-SUMS = 6 * ROW + 1  # of points, in lanes: those of the normal equations, then that of the change of brightness
-TERMS = SUMS + 6  # of a chunk: its sums, then the counts below
-# where the fields of a batch begin: of its points in the frame, in the view, and in the model ...
+ROW = 5  # sums for each of the error's six derivatives: its products with itself, the next three and the error
+SUMS = 6 * ROW + 1  # over points, in lanes: the normal equations, then the change of brightness
+TERMS = SUMS + 6  # of a chunk: its sums, then its six counts
+# offsets of a batch's point fields: in the frame, in the view, and in the model ...
 DEPTH, INTENSITY, NX, NY, NZ, PX, PY, PZ, U, V, QZ, MX, MY, MZ, NEAR, A, B, I00, I10, I01, I11 = (
     field * BATCH for field in range(21)
 )
 POINT_FIELDS = 21
-# ... and of its terms
+# ... and of its residual terms
 J0, J1, J2, J3, J4, J5, W, ERROR, DARKER, ADDED = (field * BATCH for field in range(10))
-TERM_SIZE = ADDED + SUMS * LANES  # behind the fields, what the batch adds to the lanes
-FAR = 2.0  # m; ATE of freiburg1_rpy's first 300 frames 26.7 mm without, 24.7 mm with it; of redkitchen 21.2 mm both
-NEAREST = 0.05  # m in front of the view; points nearer than this are not projected
+TERM_SIZE = ADDED + SUMS * LANES  # after the fields, the batch's sums by lane
+FAR = 2.0  # m, beyond which errors of depth are correlated
+NEAREST = 0.05  # m in front of the view; nearer points are not projected
 
 
-# Not cv2.blur: how its running sums are split, and so rounded, depends on what other threads do in OpenCV meanwhile.
+# Not cv2.blur: the split, and so the rounding, of its running sums depends on other threads that use OpenCV.
 @njit(cache=True, nogil=True, parallel=True)
-def smooth_normals(normals, reach, across, smooth):
-    """Fills smooth (3, H, W) with the means of normals over squares of 2 reach + 1, of length 1, 0 where all are 0."""
+def smooth_normals(normals, reach, row_sums, smooth):
+    """Set smooth (3, H, W) to unit means of normals over squares of side 2 reach + 1, 0 where all are 0."""
     _, height, width = normals.shape
     for v in prange(height):
         for i in range(3):
-            across[i, v] = np.float32(0.0)
+            row_sums[i, v] = np.float32(0.0)
             for d in range(-reach, reach + 1):
-                first = max(-d, 0)
-                for n in range(width - abs(d)):  # unsigned, a place needs no look at whether it counts from the end
-                    across[i, v, np.uint64(first + n)] += normals[i, v, np.uint64(first + d + n)]
+                u0 = max(-d, 0)
+                for n in range(width - abs(d)):  # unsigned indices need no check for wraparound
+                    row_sums[i, v, np.uint64(u0 + n)] += normals[i, v, np.uint64(u0 + d + n)]
     for v in prange(height):
         smooth[:, v] = np.float32(0.0)
         for w in range(max(v - reach, 0), min(v + reach + 1, height)):
             for i in range(3):
                 for u in range(width):
-                    smooth[i, v, u] += across[i, w, u]
+                    smooth[i, v, u] += row_sums[i, w, u]
         for u in range(width):
             x, y, z = smooth[0, v, u], smooth[1, v, u], smooth[2, v, u]
             scale = np.float32(1.0) / max(np.sqrt(x * x + y * y + z * z), np.float32(1e-6))
@@ -52,7 +52,7 @@ def smooth_normals(normals, reach, across, smooth):
 
 @njit(cache=True, nogil=True, parallel=True)
 def turn_normals(normals_world, R, normals):
-    """Fills normals (3, H, W) with R n of the normals n of normals_world (H, W, 3)."""
+    """Set normals (3, H, W) to R n of the normals n in normals_world (H, W, 3)."""
     for v in prange(normals.shape[1]):
         for u in range(normals.shape[2]):
             x, y, z = normals_world[v, u, 0], normals_world[v, u, 1], normals_world[v, u, 2]
@@ -62,15 +62,16 @@ def turn_normals(normals_world, R, normals):
 
 @device
 def _tukey(r, scale):
-    """Tukey's biweight of a residual in standard deviations."""
+    """Return Tukey's biweight of a residual in standard deviations."""
     s = r / scale
     s = max(np.float32(1.0) - s * s, np.float32(0.0))
     return s * s
 
 
 @device
-def _load(depth, intensity, normals, v, u0, points):
-    """A batch of the frame from pixel (u0, v) on into `points`; beyond the end of the row there are no readings."""
+def _load(frame, v, u0, points):
+    """Copy the batch that begins at pixel (u0, v) into `points`; past the end of the row, depth is 0."""
+    depth, intensity, normals = frame.depth, frame.intensity, frame.normals
     for n in range(BATCH):
         u = u0 + n
         if u < depth.shape[1]:
@@ -81,8 +82,9 @@ def _load(depth, intensity, normals, v, u0, points):
 
 
 @device
-def _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel):
-    """Where a batch of points lies in the view, m and px, and the view's pixel numbers (BATCH,), -1 = none."""
+def _project(frame, v, u0, model, shape, R, t, points, pixel):
+    """Set a batch's points in the view, m and px, and the flat indices of their pixels (BATCH,), -1 = outside."""
+    fx, fy, cx, cy = frame.fx, frame.fy, frame.cx, frame.cy
     one, half, zero = np.float32(1.0), np.float32(0.5), np.float32(0.0)
     width = np.int32(shape[1])
     right, bottom = np.float32(shape[1]), np.float32(shape[0])
@@ -99,15 +101,15 @@ def _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel):
         inv_z = one / max(pz, np.float32(NEAREST))
         u, v_ = mfx * px * inv_z + mcx, mfy * py * inv_z + mcy
         inside = (d > zero) & (pz > np.float32(NEAREST)) & (u > zero) & (v_ > zero) & (u < right) & (v_ < bottom)
-        number = np.int32(v_) * width + np.int32(u)
-        pixel[n] = number if inside else np.int32(-1)
+        index = np.int32(v_) * width + np.int32(u)
+        pixel[n] = index if inside else np.int32(-1)
         points[PX + n], points[PY + n], points[PZ + n] = px, py, pz
         points[U + n], points[V + n] = u, v_
 
 
 @device
 def _gather_model(depth, normals, size, pixel, points):
-    """The model's depth and normal at each point's pixel; depth 0 = none."""
+    """Fetch the model's depth and normal at each point's pixel; depth 0 = none."""
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:
@@ -121,28 +123,27 @@ def _gather_model(depth, normals, size, pixel, points):
 
 @device
 def _write_term(J, n, weight, error, gx, gy, gz, px, py, pz):
-    """Point n's term into J: its weight, its error, and the error's derivative by a twist of the view's frame.
+    """Set point n's term in J: its weight, its error, and the error's derivative by a twist of the view's frame.
 
-    (gx, gy, gz) is the error's derivative by the point (px, py, pz). What has no weight may be anything, also NaN, from
-    a pixel that it does not have.
+    (gx, gy, gz) is the error's derivative by the point (px, py, pz). Values of points without a weight may be NaN.
     """
     zero = np.float32(0.0)
-    weighty = weight > zero
+    weighted = weight > zero
     J[W + n] = weight
-    J[ERROR + n] = error if weighty else zero
-    J[J0 + n] = gx if weighty else zero
-    J[J1 + n] = gy if weighty else zero
-    J[J2 + n] = gz if weighty else zero
-    J[J3 + n] = py * gz - pz * gy if weighty else zero
-    J[J4 + n] = pz * gx - px * gz if weighty else zero
-    J[J5 + n] = px * gy - py * gx if weighty else zero
+    J[ERROR + n] = error if weighted else zero
+    J[J0 + n] = gx if weighted else zero
+    J[J1 + n] = gy if weighted else zero
+    J[J2 + n] = gz if weighted else zero
+    J[J3 + n] = py * gz - pz * gy if weighted else zero
+    J[J4 + n] = pz * gx - px * gz if weighted else zero
+    J[J5 + n] = px * gy - py * gx if weighted else zero
 
 
 @device
 def _add_geometry(model, R, weights, points, J):
-    """The point-to-plane terms of a batch into J; returns (visible, weighed, close, behind).
+    """Set the point-to-plane terms of a batch in J; return the counts (visible, matched, close, behind).
 
-    points[NEAR] becomes 1 where a point is near enough to its model point, 0 elsewhere.
+    points[NEAR] is set to 1 where a point is within max_distance of its model point, 0 elsewhere.
     """
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     inv_fx, inv_fy = one / model.fx, one / model.fy
@@ -153,11 +154,11 @@ def _add_geometry(model, R, weights, points, J):
     max_distance2 = weights.max_distance * weights.max_distance
     close_distance = weights.close_distance
     min_dot, scale, strength = weights.min_normal_dot, weights.geometric_scale, weights.depth_weight
-    visible = weighed = close = behind = np.int32(0)
+    visible = matched = close = behind = np.int32(0)
     for n in range(BATCH):
         q = points[QZ + n]
         px, py, pz = points[PX + n], points[PY + n], points[PZ + n]
-        # the model point is the one that the pixel's centre sees
+        # the model point is on the ray of the pixel's center
         qx = (np.floor(points[U + n]) + half - cx) * inv_fx * q
         qy = (np.floor(points[V + n]) + half - cy) * inv_fy * q
         ex, ey, ez = px - qx, py - qy, pz - q
@@ -175,30 +176,29 @@ def _add_geometry(model, R, weights, points, J):
         distance = nx * ex + ny * ey + nz * ez
         weight = _tukey(distance / sigma, scale) * strength / (sigma * sigma)
         weight = weight if near & (dot > min_dot) else zero
-        weighty = weight > zero
         points[NEAR + n] = one if near else zero
         _write_term(J, n, weight, distance, nx, ny, nz, px, py, pz)
         apart = max(close_distance, np.float32(3.0) * noise)
         visible = one_more(visible, mapped)
-        weighed = one_more(weighed, weighty)
+        matched = one_more(matched, weight > zero)
         close = one_more(close, mapped & (abs(ez) < apart))
         behind = one_more(behind, mapped & (ez > apart + apart))
-    return visible, weighed, close, behind
+    return visible, matched, close, behind
 
 
 @device
 def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
-    """The four intensities of the model around each point, and its place between them; -1 = nothing mapped there."""
+    """Fetch the model's four intensities around each point and the bilinear weights; -1 = nothing mapped."""
     one, zero, half = np.float32(1.0), np.float32(0.0), np.float32(0.5)
     width = np.int32(shape[1])
     right, bottom = np.float32(shape[1] - 2), np.float32(shape[0] - 2)
     for n in range(BATCH):
-        # U and V have their origin at the corner of the image
+        # the origin of U and V is the corner of the image
         u, v = points[U + n] * inverse_scale - half, points[V + n] * inverse_scale - half
         inside = (points[NEAR + n] > zero) & (u >= one) & (v >= one) & (u < right) & (v < bottom)
-        column, line = np.int32(u), np.int32(v)
-        points[A + n], points[B + n] = u - np.float32(column), v - np.float32(line)
-        pixel[n] = line * width + column if inside else np.int32(-1)
+        column, row = np.int32(u), np.int32(v)
+        points[A + n], points[B + n] = u - np.float32(column), v - np.float32(row)
+        pixel[n] = row * width + column if inside else np.int32(-1)
     for n in range(BATCH):
         i = pixel[n]
         if i >= 0:
@@ -210,12 +210,12 @@ def _gather_intensities(intensity, shape, inverse_scale, points, pixel):
 
 @device
 def _add_photometry(model, inverse_scale, weights, brightness, points, J):
-    """The photometric terms of a batch into J, with frame - model intensity; returns (weighed, compared)."""
+    """Set the photometric terms of a batch in J, with frame - model intensity; return counts (matched, compared)."""
     one, zero = np.float32(1.0), np.float32(0.0)
     noise, scale = weights.intensity_noise, weights.photometric_scale
     strength = weights.color_weight / (noise * noise)
     fx, fy = model.fx * inverse_scale, model.fy * inverse_scale
-    compared = weighed = np.int32(0)
+    compared = matched = np.int32(0)
     for n in range(BATCH):
         a, b = points[A + n], points[B + n]
         i00, i10, i01, i11 = points[I00 + n], points[I10 + n], points[I01 + n], points[I11 + n]
@@ -231,28 +231,27 @@ def _add_photometry(model, inverse_scale, weights, brightness, points, J):
         error = change + brightness
         weight = _tukey(error / noise, scale) * strength
         weight = weight if seen else zero
-        weighty = weight > zero
         _write_term(J, n, weight, error, gx, gy, gz, px, py, pz)
         compared = one_more(compared, seen)
-        weighed = one_more(weighed, weighty)
+        matched = one_more(matched, weight > zero)
         J[DARKER + n] = -change if seen else zero
-    return weighed, compared
+    return matched, compared
 
 
 @device
-def _multiply(J, first, second, third, fourth, row):
-    """The products of a batch's derivatives `first`, weighed, with themselves, with the others and with the error."""
+def _multiply(J, a, b, c, d, row):
+    """Sum a batch's products of the derivatives at offset `a`, weighted, with those at a, b, c, d and the error."""
     zero = np.float32(0.0)
     added = ADDED + row * ROW * LANES
     for lane in range(LANES):
         product0 = product1 = product2 = product3 = product_error = zero
-        for step in range(BATCH // LANES):  # unrolled by the compiler, which then vectorises the loop over lanes
+        for step in range(BATCH // LANES):  # the compiler unrolls it and vectorizes the loop over lanes
             n = step * LANES + lane
-            weighted = J[W + n] * J[first + n]
-            product0 += weighted * J[first + n]
-            product1 += weighted * J[second + n]
-            product2 += weighted * J[third + n]
-            product3 += weighted * J[fourth + n]
+            weighted = J[W + n] * J[a + n]
+            product0 += weighted * J[a + n]
+            product1 += weighted * J[b + n]
+            product2 += weighted * J[c + n]
+            product3 += weighted * J[d + n]
             product_error += weighted * J[ERROR + n]
         J[added + lane] = product0
         J[added + LANES + lane] = product1
@@ -263,7 +262,7 @@ def _multiply(J, first, second, third, fourth, row):
 
 @device
 def _add_products(J, lanes):
-    """Adds w J^T J, its upper triangle and a little more, and w J^T r of a batch to their lanes."""
+    """Add a batch's w J^T r and w J^T J (its upper triangle and three more elements) to their lanes."""
     _multiply(J, J0, J1, J2, J3, 0)
     _multiply(J, J1, J2, J3, J4, 1)
     _multiply(J, J2, J3, J4, J5, 2)
@@ -276,7 +275,7 @@ def _add_products(J, lanes):
 
 @device
 def _add_brightness(J, lanes):
-    """Adds the change of brightness of a batch to its lanes."""
+    """Add a batch's change of brightness to its lanes."""
     for lane in range(LANES):
         change = np.float32(0.0)
         for step in range(BATCH // LANES):
@@ -286,14 +285,12 @@ def _add_brightness(J, lanes):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def accumulate(
-    depth, intensity, normals, fx, fy, cx, cy, model, model_intensity, inverse_scale, R, t, weights, brightness, sums
-):
-    """Sums the normal equations over one pyramid level of the frame, by chunks of rows, into sums (CHUNKS, TERMS).
+def accumulate(frame, model, model_intensity, inverse_scale, R, t, weights, brightness, sums):
+    """Sum the normal equations over a FrameView by chunks of rows into sums (CHUNKS, TERMS).
 
     `R`, `t` are T_view_camera. `inverse_scale` is the width of model_intensity over that of the view.
     """
-    height, width = depth.shape
+    height, width = frame.depth.shape
     shape, level_shape = model.depth.shape, model_intensity.shape
     size = np.int32(model.depth.size)
     flat_depth, flat_normals, flat_intensity = model.depth.ravel(), model.normals.ravel(), model_intensity.ravel()
@@ -305,21 +302,21 @@ def accumulate(
         pixel = np.empty(BATCH, np.int32)
         for v in range(chunk * height // CHUNKS, (chunk + 1) * height // CHUNKS):
             for u0 in range(0, width, BATCH):
-                _load(depth, intensity, normals, v, u0, points)
-                _project(v, u0, fx, fy, cx, cy, model, shape, R, t, points, pixel)
+                _load(frame, v, u0, points)
+                _project(frame, v, u0, model, shape, R, t, points, pixel)
                 _gather_model(flat_depth, flat_normals, size, pixel, points)
-                visible, weighed, close, behind = _add_geometry(model, R, weights, points, J)
+                visible, matched, close, behind = _add_geometry(model, R, weights, points, J)
                 _add_products(J, lanes)
                 total[SUMS] += visible
-                total[SUMS + 1] += weighed
+                total[SUMS + 1] += matched
                 total[SUMS + 2] += close
                 total[SUMS + 3] += behind
                 if weights.color_weight > np.float32(0.0):
                     _gather_intensities(flat_intensity, level_shape, inverse_scale, points, pixel)
-                    weighed, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
+                    matched, compared = _add_photometry(model, inverse_scale, weights, brightness, points, J)
                     _add_products(J, lanes)
                     _add_brightness(J, lanes)
-                    total[SUMS + 4] += weighed
+                    total[SUMS + 4] += matched
                     total[SUMS + 5] += compared
         for i in range(SUMS):
             for lane in range(LANES):

@@ -11,9 +11,14 @@ from framework.data import Camera, Float32, SurfaceView, UInt8
 from framework.sensors.noise_models import GROWTH, LEAST, NEAR
 from framework.tracking.pyramid_kernels import compute_normals, find_distinct, halve, halve_mapped
 
-SAMPLED = 4  # px: every so manieth reading tells in what steps depth comes
-FEWEST_VALUES = 16  # of depth, from which its steps are told
+SAMPLED = 4  # px between the readings whose quantization is examined
+FEWEST_VALUES = 16  # distinct depths for an estimate of the quantization
 COARSE = 2.5  # standard deviations of a structured-light camera's depth, between neighboring values
+
+
+def intrinsics(camera: Camera) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return fx, fy, cx, cy, px, in single precision, for kernels."""
+    return np.float32(camera.fx), np.float32(camera.fy), np.float32(camera.cx), np.float32(camera.cy)
 
 
 @dataclass(frozen=True)
@@ -23,21 +28,21 @@ class PyramidLevel:
     camera: Camera
     depth: Float32  # (H, W) m, 0 = no reading
     intensity: Float32  # (H, W) in [0, 1]
-    normals: Float32  # (3, H, W) of the surface, towards the camera, in its frame; 0 where neighbors are apart
+    normals: Float32  # (3, H, W) of the surface, towards the camera, in its frame; 0 at edges
 
 
 def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, levels: int) -> list[PyramidLevel]:
-    """The image at `finest` times its size and at levels - 1 halvings of that, finest first.
+    """Return the image at `finest` times its size and at levels - 1 halvings of that, finest first.
 
     `finest` is 1 or a power of 1/2. Intensities average all pixels, depths those of one surface.
     """
-    intensity = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+    intensity = _intensity(color)
     pyramid: list[PyramidLevel] = []
     least = camera.width * finest
     while True:
         if camera.width <= least:
             normals = np.empty((3, *camera.shape), np.float32)
-            compute_normals(depth, *(np.float32(k) for k in (camera.fx, camera.fy, camera.cx, camera.cy)), normals)
+            compute_normals(depth, intrinsics(camera), normals)
             pyramid.append(PyramidLevel(camera, depth, intensity, normals))
             if len(pyramid) == levels:
                 return pyramid
@@ -48,21 +53,20 @@ def build_pyramid(camera: Camera, depth: Float32, color: UInt8, finest: float, l
 
 
 def is_coarse(depth: Float32, otherwise: bool) -> bool:
-    """Whether depth (H, W) m comes in steps too coarse for normals from a pixel and its neighbors.
+    """Return whether depth (H, W) m is quantized too coarsely for normals from neighboring pixels, as with 8 bits.
 
-    Such is depth that was stored in 8 bits. Steps are gaps between the values that occur, of the nearer half, beside
-    the noise of a structured-light camera: a Kinect's are 1.5 to 1.9 standard deviations at any distance, millimetres
-    0.8 or less; those of 39 mm are 20 at 1 m and 3 at 3 m. `otherwise` is the answer where too few values occur.
+    Steps are gaps between the values in the nearer half, in standard deviations of a structured-light camera. A Kinect
+    has steps of 1.5 to 1.9 at any distance. `otherwise` is returned if too few values occur.
     """
     values = _distinct(depth[::SAMPLED, ::SAMPLED])
     if len(values) < FEWEST_VALUES:
         return otherwise
     steps = np.diff(values) / (LEAST + GROWTH * (values[:-1] - NEAR) ** 2)
-    return bool(np.percentile(steps[: len(steps) // 2], 25) > COARSE)  # a gap may be two steps, no step is missed
+    return bool(np.percentile(steps[: len(steps) // 2], 25) > COARSE)  # a gap may span several steps
 
 
 def _distinct(depth: Float32) -> Float32:
-    """The different readings in depth (H, W) m, ascending: few, as a rule, and they are found faster than sorted."""
+    """Return the distinct readings in ascending order; a hash table is faster than np.unique for few values."""
     bits = np.ascontiguousarray(depth).view(np.int32)
     table = np.zeros(1 << (2 * bits.size).bit_length(), np.int32)
     found = np.empty(bits.size, np.int32)
@@ -80,9 +84,13 @@ def _halved(camera: Camera) -> Camera:
     )
 
 
+def _intensity(color: UInt8) -> Float32:
+    return np.asarray(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255))
+
+
 def model_intensities(view: SurfaceView, levels: int) -> list[Float32]:
-    """The view's intensity in [0, 1] at its own resolution and halvings of it, -1 where nothing is mapped."""
-    intensity = cv2.cvtColor(view.color, cv2.COLOR_RGB2GRAY).astype(np.float32) * np.float32(1 / 255)
+    """Return the view's intensity in [0, 1] at its own resolution and halvings of it, -1 where nothing is mapped."""
+    intensity = _intensity(view.color)
     intensity[view.depth == 0] = -1
     pyramid = [intensity]
     for _ in range(levels - 1):

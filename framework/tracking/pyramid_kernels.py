@@ -5,23 +5,24 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-DEPTH_GAP = 0.05  # of the depth: readings farther apart than this do not belong to one surface and are not averaged
-MAPPED = np.float32(2.0)  # of the four pixels below one, so that it has the intensity of those
+DEPTH_GAP = 0.05  # of the depth: readings farther apart are of different surfaces and are not averaged
+MIN_MAPPED = np.float32(2.0)  # mapped pixels among four, for their mean to be mapped
 
 
 @njit(cache=True, nogil=True)
 def find_distinct(bits, table, found):
-    """Fills `found` with the different ones of the bits that are above 0, and returns how many; table (2^k,) is a hash
-    table of zeros, of more than twice as many.
+    """Write the distinct positive values of `bits` to `found` and return their count.
+
+    `table` (2^k,) is a hash table, filled with zeros, of more than twice the size of `bits`.
     """
     count = 0
-    last = np.uint64(table.shape[0] - 1)
+    mask = np.uint64(table.shape[0] - 1)
     for value in bits:
         if value <= 0:
             continue
-        slot = (np.uint64(value) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)) & last
+        slot = (np.uint64(value) * np.uint64(0x9E3779B97F4A7C15) >> np.uint64(32)) & mask
         while table[slot] != 0 and table[slot] != value:
-            slot = (slot + np.uint64(1)) & last
+            slot = (slot + np.uint64(1)) & mask
         if table[slot] == 0:
             table[slot] = value
             found[count] = value
@@ -31,6 +32,7 @@ def find_distinct(bits, table, found):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve(depth, intensity, half_depth, half_intensity):
+    """Average intensity over 2x2 pixels, and depth over those on the nearest surface."""
     for v in prange(half_depth.shape[0]):
         for u in range(half_depth.shape[1]):
             total = np.float32(0.0)
@@ -42,7 +44,6 @@ def halve(depth, intensity, half_depth, half_intensity):
                     if np.float32(0.0) < d < nearest:
                         nearest = d
             half_intensity[v, u] = total * np.float32(0.25)
-            # the mean of the readings on the nearest surface
             farthest = nearest * np.float32(1.0 + DEPTH_GAP)
             total = np.float32(0.0)
             count = np.float32(0.0)
@@ -56,11 +57,12 @@ def halve(depth, intensity, half_depth, half_intensity):
 
 
 @njit(cache=True, nogil=True, parallel=True, error_model="numpy")
-def compute_normals(depth, fx, fy, cx, cy, normals):
-    """Normals (3, H, W) from each pixel's four neighbors; 0 at the border, and where one of them is on another surface.
+def compute_normals(depth, intrinsics, normals):
+    """Set normals (3, H, W) from each pixel's four neighbors; 0 at the border and where a neighbor is off the surface.
 
-    A row in a pass that holds no branches, so that the compiler vectorises it.
+    The loop over a row has no branches, so that the compiler vectorizes it.
     """
+    fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     zero, one = np.float32(0.0), np.float32(1.0)
     inv_fx, inv_fy = one / fx, one / fy
@@ -89,7 +91,7 @@ def compute_normals(depth, fx, fy, cx, cy, normals):
 
 @njit(cache=True, nogil=True, parallel=True)
 def halve_mapped(intensity, half):
-    """The mean of those of four that are mapped: a young map is full of holes of one pixel."""
+    """Average the mapped ones of 2x2 intensities, -1 = too few: a young map has many holes of one pixel."""
     zero, one = np.float32(0.0), np.float32(1.0)
     for v in prange(half.shape[0]):
         for u in range(half.shape[1]):
@@ -100,4 +102,4 @@ def halve_mapped(intensity, half):
                     if i >= zero:
                         total += i
                         count += one
-            half[v, u] = total / count if count >= MAPPED else -one
+            half[v, u] = total / count if count >= MIN_MAPPED else -one

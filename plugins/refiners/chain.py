@@ -1,4 +1,4 @@
-"""Refiners in a row: each refines what the one before it has left."""
+"""A sequence of refiners."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from framework.refinement.refine import refine
 
 @dataclass
 class Chain(ClusterRefiner):
-    """Applies its links in their order. One that is null is left out, so that each link is an ablation of its own.
+    """Applies its links in their order.
 
-    `refiner.links.gmm_em=null` leaves one out, `refiner@refiner.links.gmm_em=kmeans` puts another in its place.
+    `refiner.links.gmm_em=null` removes a link, `refiner@refiner.links.gmm_em=kmeans` replaces it.
     """
 
     links: Mapping[str, ClusterRefiner]  # by name, at least one

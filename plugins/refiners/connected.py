@@ -1,4 +1,4 @@
-"""Cluster refinement by connectivity: what a step in depth parts from the rest of a cluster is another thing."""
+"""Cluster refinement by connectivity: a large step in depth separates objects."""
 
 from __future__ import annotations
 
@@ -10,49 +10,33 @@ from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.refinement.connected_pieces import in_near_pieces
-from framework.refinement.selection import keep_points
+from framework.refinement.connected_pieces_kernels import Connection
+from framework.refinement.refine import keep_points
 
 
 @dataclass
 class Connected(ClusterRefiner):
-    """Keeps of each cluster its largest piece that is connected in 3D, and those that may be parts of the same thing.
+    """Keeps of each cluster its largest piece that is connected in 3D, and pieces at a similar depth.
 
-    Pieces are those of `largest_component`. What a mask has caught beside its object begins at a step in depth: the
-    carpet between a chair's slats, the cupboard behind its back. A piece leaves when the step is larger than most of
-    its points are far from what stays, `max_depth_slope` times; so a wide piece stays at a step that a narrow one
-    would not, and walls are for `plane_removal`. A piece at a depth that the object's own surface may have at that
-    distance stays, whatever is between: a chair before a couch, readings that are missing, the air between the legs of
-    a table.
-
-    That all points vote was chosen: by the nearest quarter of them, which sees the step alone, AP50 was 0.20 lower
-    with maskrcnn2go on replica_floor2 (the leaves of a plant), and the same with YOLO11n-seg there, on ScanNet's
-    scene0000_00 and in a synthetic room.
+    Pieces are those of `largest_component`. A piece is similar if most of its points differ in depth from the nearest
+    kept point by at most the gap plus `max_depth_slope` times the distance across. This removes what is behind an
+    object, such as the carpet between a chair's slats, and keeps parts that occlusion or missing readings separate.
+    All points vote: with the nearest quarter alone, leaves of a plant get lost.
     """
 
-    max_gap: float = 0.1  # m, from 0
-    gap_per_depth: float = 0.02  # m per m, from 0
-    connection_radius: int = 2  # px, from 1; 2 bridges single missing readings
+    max_gap: float = 0.1  # m, from 0, depth step between connected pixels ...
+    gap_per_depth: float = 0.02  # m per m, from 0, ... plus this times the depth
+    connection_radius: int = 2  # px, from 1, between connected pixels; 2 bridges single missing readings
     min_piece_ratio: float = 0.05  # in [0, 1], of the largest piece's points; a smaller piece is dropped
-    max_depth_slope: float = 2.0  # m of depth a metre aside, from 0, by which two pieces of one object may be apart
+    max_depth_slope: float = 2.0  # m per m, from 0, depth over distance across between two pieces of one object
 
     def __post_init__(self) -> None:
         check_bounds(
-            self,
-            max_gap=(0.0, np.inf),
-            gap_per_depth=(0.0, np.inf),
-            connection_radius=(1, 16),
-            min_piece_ratio=(0.0, 1.0),
-            max_depth_slope=(0.0, np.inf),
-        )
+            self, max_gap=(0.0, np.inf), gap_per_depth=(0.0, np.inf), connection_radius=(1, 16),
+            min_piece_ratio=(0.0, 1.0), max_depth_slope=(0.0, np.inf),
+        )  # fmt: skip
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        kept = in_near_pieces(
-            clusters,
-            frame,
-            self.max_gap,
-            self.gap_per_depth,
-            self.connection_radius,
-            self.min_piece_ratio,
-            self.max_depth_slope,
-        )
+        connection = Connection(np.float32(self.max_gap), np.float32(self.gap_per_depth), self.connection_radius)
+        kept = in_near_pieces(clusters, frame, connection, self.min_piece_ratio, self.max_depth_slope)
         return keep_points(clusters, kept)

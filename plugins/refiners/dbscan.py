@@ -1,4 +1,4 @@
-"""Cluster refinement by density: an object is one dense piece, what a mask caught beside it is another or none."""
+"""Cluster refinement by density: an object is one dense piece."""
 
 from __future__ import annotations
 
@@ -7,53 +7,71 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.config.validation import check_bounds
-from framework.data import Frame, PointClusters
+from framework.data import Bool, Float32, Frame, Int32, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.refinement.density_clustering import in_densest_piece
-from framework.refinement.selection import keep_points
+from framework.refinement.neighborhood_kernels import grouped
+from framework.refinement.refine import keep_points
 
 
 @dataclass
 class Dbscan(ClusterRefiner):
-    """Keeps of each cluster its largest dense piece.
+    """Keeps of each cluster its largest dense piece, of equal ones the first in the image.
 
-    DBSCAN (Ester, Kriegel, Sander and Xu, "A Density-Based Algorithm for Discovering Clusters in Large Spatial
-    Databases with Noise", KDD 1996), as scikit-learn has it. A core point has at least `min_points` points, itself
-    among them, within eps = `eps` + `eps_per_depth` * the cluster's median depth. Core points within eps of each other
-    hang together; the piece with the most of them stays, of equally large ones the one seen first in the image, with
-    all points within eps of its core points. (Such border points may be near to other pieces too; DBSCAN gives them to
-    whichever comes first, here they stay.)
+    scikit-learn's DBSCAN (Ester, Kriegel, Sander and Xu, "A Density-Based Algorithm for Discovering Clusters in Large
+    Spatial Databases with Noise", KDD 1996) with eps = `eps` + `eps_per_depth` * the cluster's median depth. The piece
+    with the most core points stays, with all points within eps of its core points, also if these border other pieces.
+    A cluster without core points stays unchanged.
 
-    With a `stride` above 1 only the pixels of every `stride`-th row and column are searched for core points, and
-    `min_points` counts these; all points are judged by them. Where that leaves more than `max_points` of a cluster, the
-    stride is the next larger one that does not, and each point counts for as many as it stands for. A cluster without
-    any core point, too sparse to tell, is left as it is. A dropped point leaves the arrays, clusters keep their index.
+    With a `stride` above 1, only the pixels of every `stride`-th row and column are searched for core points, and
+    `min_points` counts these. If that leaves more than `max_points` of a cluster, the stride increases, and each point
+    has the weight of the points it stands for.
     """
 
     eps: float = 0.04  # m, from 0.001
     eps_per_depth: float = 0.01  # m per m, from 0; the spacing of readings grows with depth
-    min_points: int = 10  # from 1
-    stride: int = 2  # px, from 1; 1 = no thinning
-    max_points: int = 20000  # from 100, of a cluster that are searched: their pairs within eps are kept in memory
+    min_points: int = 10  # from 1, within eps of a core point, including itself
+    stride: int = 2  # px, from 1; 1 = all points
+    max_points: int = 20000  # from 100, of a cluster that are searched; limits memory for pairs within eps
 
     def __post_init__(self) -> None:
         check_bounds(
-            self,
-            eps=(1e-3, np.inf),
-            eps_per_depth=(0.0, np.inf),
-            min_points=(1, 10**9),
-            stride=(1, 64),
+            self, eps=(1e-3, np.inf), eps_per_depth=(0.0, np.inf), min_points=(1, 10**9), stride=(1, 64),
             max_points=(100, 10**9),
-        )
+        )  # fmt: skip
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        kept = in_densest_piece(
-            clusters,
-            frame,
-            eps=self.eps,
-            eps_per_depth=self.eps_per_depth,
-            min_points=self.min_points,
-            stride=self.stride,
-            max_points=self.max_points,
-        )
+        order, firsts = grouped(clusters.cluster, len(clusters))
+        kept = np.ones(len(clusters.cluster), np.bool_)
+        for k in range(len(clusters)):
+            own = order[firsts[k] : firsts[k + 1]]
+            pixels, points = clusters.pixels[own], clusters.points_world[own]
+            sampled, step = self._sampled(pixels)
+            if sampled.any():
+                u, v = pixels[sampled].T
+                eps = self.eps + self.eps_per_depth * float(np.median(frame.depth[v, u]))
+                kept[own] = self._near_largest_piece(points, points[sampled], eps, (step / self.stride) ** 2)
         return keep_points(clusters, kept)
+
+    def _sampled(self, pixels: Int32) -> tuple[Bool, int]:
+        """Return (P,) the pixels in every `step`-th row and column, and the smallest step that leaves few enough."""
+        for step in range(self.stride, 1 << 16):
+            sampled = (pixels[:, 0] % step == 0) & (pixels[:, 1] % step == 0)
+            if np.count_nonzero(sampled) <= self.max_points:
+                break
+        return sampled, step
+
+    def _near_largest_piece(self, points: Float32, sampled: Float32, eps: float, weight: float) -> Bool:
+        """Return (P,) which points are within eps of a core point of the largest piece of `sampled` (S, 3)."""
+        from scipy.spatial import KDTree
+        from sklearn.cluster import DBSCAN
+
+        # on surfaces, a ball tree is faster than a k-d tree
+        clustering = DBSCAN(eps=eps, min_samples=self.min_points, algorithm="ball_tree")
+        found = clustering.fit(sampled, sample_weight=np.full(len(sampled), weight))
+        core = found.core_sample_indices_
+        if len(core) == 0:
+            return np.ones(len(points), np.bool_)
+        pieces = found.labels_[core]  # in the order of their first points, so that argmax takes the first of equals
+        largest = sampled[core[pieces == np.bincount(pieces).argmax()]]
+        distances, _ = KDTree(largest).query(points, distance_upper_bound=np.nextafter(eps, np.inf))
+        return np.asarray(distances <= eps)

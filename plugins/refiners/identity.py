@@ -1,4 +1,4 @@
-"""Leaves the clusters as the masks made them: what "without refinement" means in an ablation."""
+"""No refinement, for ablations."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from framework.interfaces import ClusterRefiner
 
 @dataclass
 class Identity(ClusterRefiner):
-    """Passes the clusters on unchanged."""
+    """Returns the clusters unchanged."""
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         return clusters

@@ -1,4 +1,4 @@
-"""Cluster refinement by connectivity: an object hangs together in 3D, what a mask caught beside it does not."""
+"""Cluster refinement by connectivity: an object is one connected piece in 3D."""
 
 from __future__ import annotations
 
@@ -10,17 +10,16 @@ from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
 from framework.refinement.connected_pieces import in_largest_piece
-from framework.refinement.selection import keep_points
+from framework.refinement.connected_pieces_kernels import Connection
+from framework.refinement.refine import keep_points
 
 
 @dataclass
 class LargestComponent(ClusterRefiner):
-    """Keeps of each cluster its largest piece that is connected in 3D.
+    """Keeps of each cluster its largest piece that is connected in 3D, of equal ones the first in the image.
 
-    Two points of a cluster are connected when they are at most `connection_radius` pixels apart in the image and their
-    depths differ by less than `max_gap` + `gap_per_depth` * depth of the nearer one: the spacing of depth readings and
-    the noise of the sensor both grow with depth. Of equally large pieces the one seen first in the image stays. A
-    dropped point leaves the arrays, clusters keep their index.
+    Points are connected if they are at most `connection_radius` pixels apart and their depths differ by less than
+    `max_gap` + `gap_per_depth` * depth of the nearer one: spacing and noise of readings both grow with depth.
     """
 
     max_gap: float = 0.03  # m, from 0
@@ -28,14 +27,8 @@ class LargestComponent(ClusterRefiner):
     connection_radius: int = 2  # px, from 1; 2 bridges single missing readings
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self,
-            max_gap=(0.0, np.inf),
-            gap_per_depth=(0.0, np.inf),
-            connection_radius=(1, 16),
-        )
+        check_bounds(self, max_gap=(0.0, np.inf), gap_per_depth=(0.0, np.inf), connection_radius=(1, 16))
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        return keep_points(
-            clusters, in_largest_piece(clusters, frame, self.max_gap, self.gap_per_depth, self.connection_radius)
-        )
+        connection = Connection(np.float32(self.max_gap), np.float32(self.gap_per_depth), self.connection_radius)
+        return keep_points(clusters, in_largest_piece(clusters, frame, connection))

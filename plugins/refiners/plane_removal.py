@@ -1,4 +1,4 @@
-"""Cluster refinement by structure: floors and walls belong to no object."""
+"""Cluster refinement by structure: floors and walls are not part of an object."""
 
 from __future__ import annotations
 
@@ -9,49 +9,34 @@ import numpy as np
 from framework.config.validation import check_bounds
 from framework.data import Frame, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.refinement.segmentation.plane_points import off_planes
-from framework.refinement.segmentation.planes import Planes, find_planes, plane_image
-from framework.refinement.selection import keep_points
+from framework.refinement.refine import keep_points
+from framework.refinement.segmentation.planes import Planes, find_planes, off_planes, plane_image
 
 
 @dataclass
 class PlaneRemoval(ClusterRefiner):
     """Drops the points that lie on the floor, a wall or another plane that bounds the scene.
 
-    Planes are found in the depth of the whole frame (see `framework.refinement.segmentation.planes`); the gravity
-    direction is not needed. One counts as structure when it is large (`min_area`, `min_frame_fraction`) and the frame
-    shows nearly nothing behind it (`max_behind_ratio`): there is a room below a table top or behind a screen, but
-    nothing below a floor. A cluster loses such a plane only if it holds at most `max_cluster_fraction` of the plane's
-    points in the frame: the top of a table that fills the image is the table's. A dropped point leaves the arrays,
-    clusters keep their index. The refined clusters know the planes as `structure`, where a mask's border needs no
-    further doubt.
+    Planes are found in the depth of the whole frame, without the gravity direction. A plane is structure if it is large
+    (`min_area`, `min_frame_fraction`) and the frame shows nearly nothing behind it (`max_behind_ratio`), unlike a table
+    top or a screen. A cluster keeps a plane if it contains more than `max_cluster_fraction` of the plane's points, as a
+    table that fills the image does. The refined clusters pass the planes on as `structure`, for later refiners.
     """
 
-    plane_distance: float = (
-        0.01  # m, from 0, from the plane; three standard deviations of the plane's own noise come on top
-    )
-    inverse_depth_noise: float = (
-        0.003  # 1/m, from 0, of inverse depth, up to which a plane is one: 3 mm at 1 m, 27 mm at 3 m
-    )
-    min_area: float = 0.8  # m^2, from 0, seen of a plane
+    plane_distance: float = 0.01  # m, from 0, from the plane, in addition to 3 standard deviations of its noise
+    inverse_depth_noise: float = 0.003  # 1/m, from 0, of a plane's inverse depth: 3 mm at 1 m, 27 mm at 3 m
+    min_area: float = 0.8  # m^2, from 0, visible area of a plane
     min_frame_fraction: float = 0.04  # in [0, 1], of the frame's readings on a plane
-    max_behind_ratio: float = (
-        0.1  # from 0, readings behind a plane over those on it; a doorway shows some behind the wall
-    )
+    max_behind_ratio: float = 0.1  # from 0, readings behind a plane over those on it; a doorway shows some
     max_tilt: float = 180.0  # degrees, in [0, 180], from the camera's upward axis to the normal; 60 = floors only
     max_cluster_fraction: float = 0.5  # in [0, 1], of the plane's points in a cluster that loses it
 
     def __post_init__(self) -> None:
         check_bounds(
-            self,
-            plane_distance=(0.0, np.inf),
-            inverse_depth_noise=(0.0, np.inf),
-            min_area=(0.0, np.inf),
-            min_frame_fraction=(0.0, 1.0),
-            max_behind_ratio=(0.0, np.inf),
-            max_tilt=(0.0, 180.0),
+            self, plane_distance=(0.0, np.inf), inverse_depth_noise=(0.0, np.inf), min_area=(0.0, np.inf),
+            min_frame_fraction=(0.0, 1.0), max_behind_ratio=(0.0, np.inf), max_tilt=(0.0, 180.0),
             max_cluster_fraction=(0.0, 1.0),
-        )
+        )  # fmt: skip
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
         if len(clusters.cluster) == 0:
@@ -64,9 +49,8 @@ class PlaneRemoval(ClusterRefiner):
         return replace(keep_points(clusters, kept), structure=structure)
 
     def structure(self, frame: Frame) -> Planes:
-        """The frame's planes that bound the scene."""
+        """Return the frame's planes that bound the scene."""
         planes = find_planes(frame, self.plane_distance, self.inverse_depth_noise, self.min_area)
         upright = -planes.normals[:, 1] >= np.cos(np.deg2rad(self.max_tilt)) - 1e-9  # the camera's y axis points down
-        return planes.chosen(
-            (planes.shares >= self.min_frame_fraction) & (planes.behind <= self.max_behind_ratio) & upright
-        )
+        large = planes.shares >= self.min_frame_fraction
+        return planes.chosen(large & (planes.behind <= self.max_behind_ratio) & upright)

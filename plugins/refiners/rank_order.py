@@ -1,4 +1,4 @@
-"""Cluster refinement by rank-order clustering: our reading of the "ROC algorithm" that the paper names."""
+"""Cluster refinement by rank-order clustering: our reading of the paper's "ROC algorithm"."""
 
 from __future__ import annotations
 
@@ -7,31 +7,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from framework.config.validation import check_bounds
-from framework.data import Frame, PointClusters
+from framework.data import Float32, Frame, Int32, Int64, PointClusters
 from framework.interfaces import ClusterRefiner
-from framework.refinement.rank_order_clustering import in_largest_group
-from framework.refinement.selection import keep_points
+from framework.refinement.neighborhood_kernels import grouped
+from framework.refinement.refine import keep_points
 
 
 @dataclass
 class RankOrder(ClusterRefiner):
-    """Keeps of each cluster its largest group under the rank-order distance.
+    """Keeps of each cluster its largest group under the rank-order distance, of equal ones the first in the image.
 
-    The paper names an "ROC algorithm" as an alternative to its mixture and cites nothing for it. We read it as
-    rank-order clustering (Zhu, Wen and Sun, "A Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR
-    2011): two points belong together when they have the same neighbors, however far apart these are. The distance is
-    the approximate one of Otto, Wang and Jain ("Clustering Millions of Faces by Identity", PAMI 2018), eqs. 4 and 5:
-    with O_a(b) the place of b among the neighbors of a, nearest first, and f_a(i) the i-th of them,
+    The paper names an "ROC algorithm" without a citation. We read it as rank-order clustering (Zhu, Wen and Sun, "A
+    Rank-Order Distance Based Clustering Algorithm for Face Tagging", CVPR 2011): points belong together if they have
+    the same neighbors. The distance is the approximation of Otto, Wang and Jain ("Clustering Millions of Faces by
+    Identity", PAMI 2018), eqs. 4 and 5, with O_a(b) the rank of b among the neighbors of a, nearest first, and f_a(i)
+    the neighbor with rank i:
 
         d(a, b) = number of i in 1 .. min(O_a(b), k) for which f_a(i) is not among the k nearest of b (or b itself),
         D(a, b) = (d(a, b) + d(b, a)) / min(O_a(b), O_b(a)).
 
-    Points with D at most `threshold`, one of them among the k nearest of the other, are in one group, and so are those
-    that a chain of such pairs connects. With k points or fewer all have the same neighbors and stay together.
+    Points are linked if D is at most `threshold` and one is among the k nearest of the other; groups are connected
+    components. A cluster of at most k points stays unchanged.
 
-    Only the first point of each block of s x s px takes part, s the smallest that leaves at most `max_points`; every
-    other point goes with the nearest of them. Of equally large groups the one seen first in the image stays. A dropped
-    point leaves the arrays, clusters keep their index.
+    Only the first point of each block of s x s px takes part, with the smallest s that leaves at most `max_points`. The
+    other points join the group of the nearest of them.
     """
 
     neighbors: int = 16  # from 2, k
@@ -39,12 +38,59 @@ class RankOrder(ClusterRefiner):
     max_points: int = 500  # from 10, of a cluster that are compared
 
     def __post_init__(self) -> None:
-        check_bounds(
-            self,
-            neighbors=(2, 254),  # ranks are bytes
-            threshold=(0.0, np.inf),
-            max_points=(10, 5000),  # their ranks are a square table
-        )
+        # ranks are bytes, in a square table
+        check_bounds(self, neighbors=(2, 254), threshold=(0.0, np.inf), max_points=(10, 5000))
 
     def refine(self, clusters: PointClusters, frame: Frame) -> PointClusters:
-        return keep_points(clusters, in_largest_group(clusters, self.neighbors, self.threshold, self.max_points))
+        from scipy.spatial import KDTree
+
+        order, firsts = grouped(clusters.cluster, len(clusters))
+        kept = np.ones(len(clusters.cluster), np.bool_)
+        for k in range(len(clusters)):
+            own = order[firsts[k] : firsts[k + 1]]
+            if len(own) > 1:
+                points = clusters.points_world[own]
+                sampled = points[_firsts_of_blocks(clusters.pixels[own], self.max_points)]
+                groups = rank_order_groups(sampled, self.neighbors, self.threshold)
+                _, nearest = KDTree(sampled).query(points)
+                kept[own] = groups[nearest] == np.bincount(groups).argmax()
+        return keep_points(clusters, kept)
+
+
+def _firsts_of_blocks(pixels: Int32, max_points: int) -> Int64:
+    """Return the first of the pixels (P, 2) in each block, with the smallest blocks that leave at most `max_points`."""
+    u, v = (pixels - pixels.min(axis=0)).T
+    side = int(np.ceil(np.sqrt(len(pixels) / max_points)))
+    while True:
+        columns = u.max() // side + 1
+        firsts = np.full(columns * (v.max() // side + 1), -1)
+        firsts[(v // side * columns + u // side)[::-1]] = np.arange(len(pixels))[::-1]  # the last write stays
+        if np.count_nonzero(firsts >= 0) <= max_points:
+            return np.sort(firsts[firsts >= 0])
+        side += 1
+
+
+def rank_order_groups(points: Float32, neighbors: int, threshold: float) -> Int32:
+    """Return (P,) the group of each of the points (P, 3), numbered by their first points."""
+    n, k = len(points), neighbors
+    if n <= k:  # all have the same neighbors
+        return np.zeros(n, np.int32)
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+    from sklearn.neighbors import NearestNeighbors
+
+    nearest = NearestNeighbors(n_neighbors=k).fit(points).kneighbors(return_distance=False)
+    absent = k + 1
+    ranks = np.full((n, n), absent, np.uint8)  # O_a(b)
+    np.fill_diagonal(ranks, 0)
+    np.put_along_axis(ranks, nearest, np.arange(1, k + 1, dtype=np.uint8), axis=1)
+
+    def unshared(a: Int64, b: Int64) -> Int64:
+        """d(a, b)."""
+        up_to_b = np.arange(k) < ranks[a, b][:, None]
+        return np.asarray((up_to_b & (ranks[b[:, None], nearest[a]] == absent)).sum(axis=1))
+
+    a, linked = np.arange(n), np.zeros((n, n), np.uint8)
+    for b in nearest.T:
+        linked[a, b] = unshared(a, b) + unshared(b, a) <= threshold * np.minimum(ranks[a, b], ranks[b, a])
+    return np.asarray(connected_components(csr_array(linked), directed=False)[1], np.int32)

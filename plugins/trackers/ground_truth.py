@@ -1,4 +1,4 @@
-"""The true pose: the upper bound of every tracker, and the way to map with the poses of another system."""
+"""The true pose: the upper bound of every tracker."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from framework.interfaces import PoseTracker, SceneMap
 
 @dataclass
 class GroundTruth(PoseTracker):
-    """Returns the pose that the sequence comes with; frames without one are skipped."""
+    """Returns the sequence's own poses; frames without one are skipped."""
 
     pose_source = "ground_truth"
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Raises NoPoseError for a frame without a pose: there is nothing to fall back on."""
+        """Raises NoPoseError for a frame without a pose."""
         if frame.T_world_camera is None:
             raise NoPoseError(f"frame {frame.index} has no true pose at {frame.timestamp:.3f} s")
         return Pose(frame.T_world_camera)
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
-        """The true poses are of the map's world; there is nothing to be found again."""
+        """Do nothing: the true poses are in the map's world."""

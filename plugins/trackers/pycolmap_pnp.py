@@ -17,37 +17,24 @@ from framework.tracking.keyframes import Keyframes
 class PycolmapPnp(PoseTracker):
     """Matches each frame's features with the nearest keyframes and estimates its pose with pycolmap's PnP and RANSAC.
 
-    A frame that the nearest keyframes do not explain is looked for among all of them, so that tracking resumes wherever
-    the camera returns to what it knows. The map is not looked at.
+    If that fails, it relocalizes among all keyframes. It does not use the map. The parameters are those of `Keyframes`.
     """
 
     max_features: int = 800  # >= 1, of a frame
-    min_features: int = 30  # >= 4, with depth: a frame with fewer does not become a keyframe
+    min_features: int = 30  # >= 4, with depth, of a keyframe
     max_keyframes: int = 200  # >= 1
-    min_distance: float = 0.15  # m, > 0: a keyframe is this far from every other, or turned, or half of each
-    min_angle: float = 0.2  # rad, > 0
+    min_distance: float = 0.15  # m, > 0, between keyframes; distance and angle add up as fractions of their limits
+    min_angle: float = 0.2  # rad, > 0, between keyframes
     candidates: int = 4  # >= 1, keyframes that a frame is matched with
-    max_ratio: float = 0.8  # in (0, 1]: of a match's distance to that of the second best
-    max_error: float = 4.0  # px, > 0: of the reprojection of an inlier
-    min_inliers: int = 20  # >= 4: with fewer the pose is lost
-    min_inlier_ratio: float = 0.15  # of the matches, in (0, 1]: likewise
+    max_ratio: float = 0.8  # in (0, 1], of a match's distance to that of the second best
+    max_error: float = 4.0  # px, > 0, of the reprojection of an inlier
+    min_inliers: int = 20  # >= 4; with fewer the pose is lost
+    min_inlier_ratio: float = 0.15  # of the matches, in (0, 1]; with fewer the pose is lost
     seed: int = 0  # >= 0
 
     def __post_init__(self) -> None:
-        self._keyframes = Keyframes(
-            max_keyframes=self.max_keyframes,
-            min_distance=self.min_distance,
-            min_angle=self.min_angle,
-            max_features=self.max_features,
-            min_features=self.min_features,
-            candidates=self.candidates,
-            max_ratio=self.max_ratio,
-            max_error=self.max_error,
-            min_inliers=self.min_inliers,
-            min_inlier_ratio=self.min_inlier_ratio,
-            seed=self.seed,
-        )
-        self._T_world_last: Float64 | None = None  # the last pose that was trusted
+        self._keyframes = Keyframes(**vars(self))
+        self._T_world_last: Float64 | None = None  # the last trusted pose
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         features = self._keyframes.extractor.extract(frame)
@@ -72,7 +59,7 @@ class PycolmapPnp(PoseTracker):
         self._keyframes.restore(keyframes)
 
     def _begin(self, frame: Frame, features: Features) -> Pose:
-        """The first frame with enough features is where the world begins."""
+        """Define the world by the first frame with enough features."""
         T_world_camera = np.eye(4) if frame.T_world_camera is None else frame.T_world_camera
         if not self._keyframes.add_with(frame, features, T_world_camera):
             reason = f"the frame has fewer than {self.min_features} features with depth"

@@ -1,4 +1,4 @@
-"""The poses of any other SLAM system, from a file."""
+"""The poses of another SLAM system, from a file."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from framework.interfaces import PoseTracker, SceneMap
 
 
 class World(Enum):
-    """Which world the poses are given in."""
+    """The world that the poses are given in."""
 
     FIRST_FRAME = "that in which the first frame has its true pose, or the identity"
     FILE = "that of the file"
@@ -26,17 +26,15 @@ class World(Enum):
 
 @dataclass
 class TrajectoryFile(PoseTracker):
-    """Returns the pose that a TUM file has for the frame's timestamp.
+    """Returns the pose in a TUM file nearest in time to the frame; frames without one are skipped.
 
-    A pose belongs to a frame by time, the nearest one counts: other systems drop frames, so that lines and frames need
-    not correspond. By default the whole trajectory is moved as one rigid body so that the first frame that has a pose
-    defines the world, as `PoseTracker` says; `world=FILE` keeps the file's own, for which the sequence's true poses
-    then mean nothing. A frame that no pose belongs to is skipped. Raises DataError, naming file and line, for a file
-    that is not a trajectory: a pose that is not finite or not rigid, timestamps that do not grow.
+    By default the trajectory is moved rigidly so that the first frame with a pose defines the world, as in
+    `PoseTracker`. `world=FILE` keeps the file's world, in which the sequence's true poses are meaningless. Raises
+    DataError, naming file and line, for poses that are not finite or not rigid and for timestamps that do not increase.
     """
 
     path: Path
-    max_time_difference: float = 0.02  # s, >= 0: of a frame and its pose; 2/3 of a frame at 30 Hz
+    max_time_difference: float = 0.02  # s, >= 0, between a frame and its pose; 2/3 of a frame at 30 Hz
     time_offset: float = 0.0  # s, added to the file's timestamps
     world: World = World.FIRST_FRAME
 
@@ -50,7 +48,7 @@ class TrajectoryFile(PoseTracker):
         self._T_world_file: Float64 | None = np.eye(4) if self.world is World.FILE else None
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
-        """Raises NoPoseError for a frame that no pose of the file belongs to."""
+        """Raises NoPoseError for a frame without a pose in the file."""
         nearest = int(np.abs(self._timestamps - frame.timestamp).argmin())
         difference = abs(float(self._timestamps[nearest]) - frame.timestamp)
         if difference > self.max_time_difference:
@@ -65,4 +63,4 @@ class TrajectoryFile(PoseTracker):
         return Pose(self._T_world_file @ T_file_camera)
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
-        """The poses are of the map's world, as they are given; there is nothing to be found again."""
+        """Do nothing: the poses are given in the map's world."""

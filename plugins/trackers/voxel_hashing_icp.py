@@ -1,4 +1,4 @@
-"""The paper's tracker: each frame is aligned to the view ray-cast from the map, by geometry and colour."""
+"""The paper's tracker: alignment of each frame to the view ray-cast from the map, by geometry and color."""
 
 from __future__ import annotations
 
@@ -21,28 +21,28 @@ from framework.tracking.keyframes import Keyframes
 from framework.tracking.pyramid import PyramidLevel, build_pyramid, is_coarse, model_intensities
 
 LEVELS = 3
-FINE_ENOUGH = 1e-4  # m and rad: a shorter step ends the finest level, four times as long a one the level before, ...
-SAME_PLACE = 0.05  # m and rad: two alignments that end nearer to each other than this have found the same pose
+CONVERGED = 1e-4  # m and rad; a shorter step ends the finest level, one four times as long the level before, ...
+SAME_POSE = 0.05  # m and rad between alignments with the same result
 SMALLEST = 8  # px, of the sides of the coarsest level
-CHANGED_SCENE = 0.95  # share of the points not behind the map's surface that agree with it, where a thing was removed
-EXPECTED_AGREEMENT = 0.8  # like min_agreement, where a prediction leads that has been right before
-EXPECTED_BEHIND = 0.1  # like max_behind, likewise
-STEADY = 5  # frames in a row whose prediction was right, after which the next one counts for something
-VISITED = 64  # poses, this far apart, that a lost camera tries where features do not tell, one a frame
-VISITED_APART = 0.1  # m and rad
-SURER = 2.0  # times min_information is what ends a loss: the next frame may well have more
+CHANGED_SCENE = 0.95  # min. agreement of the points not behind the map's surface, where an object was removed
+EXPECTED_AGREEMENT = 0.8  # like min_agreement, at a prediction with a steady motion
+EXPECTED_BEHIND = 0.1  # like max_occluded, at a prediction with a steady motion
+STEADY = 5  # consecutive frames with a correct prediction that make a motion steady
+VISITED = 64  # poses that a lost camera tries, one per frame
+VISITED_SEPARATION = 0.1  # m and rad between them
+RECOVERY_INFORMATION = 2.0  # times min_information that a lost camera needs
 
 
 class Alignment(NamedTuple):
-    """Where the alignment of a frame has ended."""
+    """The result of aligning a frame. Ratios are of the points in view unless stated otherwise."""
 
     T_world_camera: Float64
-    matched: float  # share of the points in view that have a weight
-    agreement: float  # share of the points in view that agree with the map
-    behind: float  # share of the points in view that are behind the map's surface
-    beside: float  # share that agrees, of those that are not behind it
-    reason: str  # why it is impossible, empty if it is not
-    doubt: str  # why it takes a second witness to trust it, empty if it does not
+    matched: float  # ratio of points with a weight
+    agreement: float  # ratio of points that agree with the map
+    behind: float  # ratio of points behind the map's surface
+    agreement_in_front: float  # ratio that agrees, of the points not behind the map's surface
+    reason: str  # for rejection, empty if the pose is possible
+    doubt: str  # for which a second source must confirm the pose, empty without one
 
     @property
     def trusted(self) -> bool:
@@ -53,107 +53,70 @@ class Alignment(NamedTuple):
 class VoxelHashingIcp(PoseTracker):
     """Frame-to-model ICP plus RGB, coarse to fine, with lost detection (after VoxelHashing and ElasticFusion).
 
-    A pose is trusted for what agrees with the map, more easily where the prediction has led, and for features that lead
-    to the same pose. Agreement alone does not tell: measured on every fourth frame, alignments that began at the pose
-    or up to 1 m and 1 rad beside it, were within 2 cm and 1.5 degrees of it (right) or 8 cm and 6 degrees off (wrong),
-    shares of the points in view:
-
-                                     right, agree / behind, worst 1 %     wrong and not impossible, most that agree
-        freiburg1_rpy, every frame   0.84 / 0.12                          0.99
-        freiburg1_rpy, every fifth   0.80 / 0.17                          0.97
-        redkitchen, every fifth      0.88 / 0.07                          0.49
-        a flat in 5 degree steps     0.87 / 0.09                          0.86
-        a ScanNet room, every fifth  0.96 / 0.04                          0.75
-        a synthetic room, likewise   0.98 / 0.01                          0.95
-
-    So a bound that all right poses pass is one for the place where the camera must be, and another pose takes a second
-    witness.
+    A pose needs agreement with the map: less at the prediction of a steady motion, more elsewhere. Agreement alone does
+    not separate right from wrong poses (docs/guides/trackers.md), so a pose elsewhere needs confirmation by features.
     """
 
-    finest_scale: float = 0.5  # of the image's size, a power of 1/2: the resolution of the view and of the finest level
+    finest_scale: float = 0.5  # of the image's size, a power of 1/2: resolution of the view and of the finest level
     iterations_coarse: int = 8  # >= 0, at 1/4 of the finest resolution
     iterations_middle: int = 6  # >= 0, at 1/2
     iterations_fine: int = 4  # >= 1
-    max_distance: float = 0.1  # m, > 0: of a point from its model point
-    close_distance: float = 0.05  # m, > 0: a reading this near to the map's surface agrees with it; a voxel at least
-    min_normal_dot: float = 0.7  # in [-1, 1]: cosine between the normals of a point and its model point
-    geometric_scale: float = 4.0  # standard deviations, > 0: Tukey's cut-off of a distance
-    photometric_scale: float = 4.0  # standard deviations, > 0: Tukey's cut-off of an intensity difference
-    intensity_noise: float = 0.05  # of [0, 1], > 0: standard deviation of an intensity difference
+    max_distance: float = 0.1  # m, > 0, of a point from its model point
+    close_distance: float = 0.05  # m, > 0, at least a voxel: a reading this near to the map's surface agrees with it
+    min_normal_dot: float = 0.7  # in [-1, 1], cosine between the normals of a point and its model point
+    geometric_scale: float = 4.0  # standard deviations, > 0, Tukey's cut-off of a distance
+    photometric_scale: float = 4.0  # standard deviations, > 0, Tukey's cut-off of an intensity difference
+    intensity_noise: float = 0.05  # of [0, 1], > 0, standard deviation of an intensity difference
     color_weight: float = 0.1  # lambda, >= 0; 0 = ICP alone
-    depth_weight: float = 1.0  # 1, or 0 = colour alone
-    max_step: float = 0.3  # m, > 0: a frame that seems to have moved farther is lost
-    max_turn: float = 0.35  # rad, > 0: likewise
-    min_visible: float = 0.05  # in [0, 1]: share of the points that must fall on the map; some are out of its range
-    min_matched: float = 0.4  # in [0, 1]: share of these that must agree with it
-    min_information: float = 1e-3  # of the mean, in [0, 1]: a motion that fewer points resist is not determined
-    min_agreement: float = 0.92  # in [0, 1]: share of the points in view that lie where the map has its surface ...
-    max_occluded: float = 0.015  # in [0, 1]: ... and behind it; what fails takes a second witness, see above
-    relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited places, when lost
+    depth_weight: float = 1.0  # 1, or 0 = color alone
+    max_step: float = 0.3  # m, > 0, between frames; a larger step is lost
+    max_turn: float = 0.35  # rad, > 0, between frames; a larger turn is lost
+    min_visible: float = 0.05  # in [0, 1], ratio of the frame's points that fall on the map
+    min_matched: float = 0.4  # in [0, 1], ratio of the points in view with a weight
+    min_information: float = 1e-3  # in [0, 1], smallest eigenvalue of A over the mean; less leaves a motion open
+    min_agreement: float = 0.92  # in [0, 1], ratio of the points in view that agree with the map ...
+    max_occluded: float = 0.015  # in [0, 1], ... and that lie behind it; other poses need confirmation
+    relocalize: bool = True  # by features, when lost, in doubt or jumping, and from visited poses, when lost
     seed: int = 0  # of the relocalization's random samples
 
     def __post_init__(self) -> None:
         check_bounds(
-            self,
-            finest_scale=(1 / 64, 1.0),
-            iterations_coarse=(0, 1000),
-            iterations_middle=(0, 1000),
-            iterations_fine=(1, 1000),
-            max_distance=(1e-4, 10.0),
-            close_distance=(1e-4, 10.0),
-            min_normal_dot=(-1.0, 1.0),
-            geometric_scale=(1e-3, 1e3),
-            photometric_scale=(1e-3, 1e3),
-            intensity_noise=(1e-3, 1.0),
-            color_weight=(0.0, 1e3),
-            depth_weight=(0.0, 1.0),
-            max_step=(1e-3, 100.0),
-            max_turn=(1e-3, 3.15),
-            min_visible=(0.0, 1.0),
-            min_matched=(0.0, 1.0),
-            min_information=(0.0, 1.0),
-            min_agreement=(0.0, 1.0),
-            max_occluded=(0.0, 1.0),
-        )
+            self, finest_scale=(1 / 64, 1.0), iterations_coarse=(0, 1000), iterations_middle=(0, 1000),
+            iterations_fine=(1, 1000), max_distance=(1e-4, 10.0), close_distance=(1e-4, 10.0),
+            min_normal_dot=(-1.0, 1.0), geometric_scale=(1e-3, 1e3), photometric_scale=(1e-3, 1e3),
+            intensity_noise=(1e-3, 1.0), color_weight=(0.0, 1e3), depth_weight=(0.0, 1.0), max_step=(1e-3, 100.0),
+            max_turn=(1e-3, 3.15), min_visible=(0.0, 1.0), min_matched=(0.0, 1.0), min_information=(0.0, 1.0),
+            min_agreement=(0.0, 1.0), max_occluded=(0.0, 1.0),
+        )  # fmt: skip
         require(np.log2(self.finest_scale) % 1 == 0, "VoxelHashingIcp.finest", self.finest_scale, "1, 1/2, 1/4, ...")
-        self._weights = Weights(
-            max_distance=np.float32(self.max_distance),
-            close_distance=np.float32(self.close_distance),
-            min_normal_dot=np.float32(self.min_normal_dot),
-            geometric_scale=np.float32(self.geometric_scale),
-            photometric_scale=np.float32(self.photometric_scale),
-            intensity_noise=np.float32(self.intensity_noise),
-            color_weight=np.float32(self.color_weight),
-            depth_weight=np.float32(self.depth_weight),
-        )
-        self._T_world_last: Float64 | None = None  # the last pose that was trusted
-        self._T_last_next = np.eye(4)  # its motion since the one before: the constant-velocity prediction
-        self._lost_frames = 0  # in a row
-        self._steady_frames = 0  # in a row, of which the prediction was right
+        self._weights = Weights(*(np.float32(getattr(self, name)) for name in Weights._fields))
+        self._T_world_last: Float64 | None = None  # the last trusted pose
+        self._T_last_next = np.eye(4)  # motion to the next frame under constant velocity
+        self._lost_frames = 0  # consecutive
+        self._steady_frames = 0  # consecutive, with a correct prediction
         self._keyframes = Keyframes(seed=self.seed)
         self._visited: deque[Float64] = deque(maxlen=VISITED)
-        self._T_world_doubted: Float64 | None = None  # the last frame's, where it was lost only by doubt
-        self._last: FrameFeatures | None = None  # of the last frame that was trusted
-        self._before: SceneMap | None = None  # a map from before, until the camera is found in it
+        self._T_world_doubted: Float64 | None = None  # pose of the last frame if only doubt made it lost
+        self._last: FrameFeatures | None = None  # of the last trusted frame
+        self._stored_scene: SceneMap | None = None  # the map to relocalize in; None once that is done
         self._coarse_depth = False  # too coarse for normals from neighboring readings
 
     def track(self, frame: Frame, scene: SceneMap) -> Pose:
         seen = FrameFeatures(frame, self._keyframes.extractor)
-        if self._before is not None:
-            return self._entered(seen, self._before)
+        if self._stored_scene is not None:
+            return self._relocalize_in_stored(seen, self._stored_scene)
         if self._T_world_last is None or scene.statistics.voxels == 0:
-            return self._first(seen, scene)
-        levels = build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS)
-        self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
+            return self._initialize(seen, scene)
+        levels = self._pyramid(frame)
         T_world_predicted = self._T_world_last @ self._T_last_next
         if self._lost_frames:
-            alignment = self._resumed(levels, scene)
+            alignment = self._align_lost(levels, scene)
         else:
-            alignment = self._continued(levels, scene, T_world_predicted)
+            alignment = self._align_predicted(levels, scene, T_world_predicted)
         if not (alignment.trusted and self._steady_frames >= STEADY) and levels[0].depth.any():
-            alignment = self._searched(alignment, seen, levels, scene)
-            if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
-                self._steady_frames = 0  # features led elsewhere
+            alignment = self._relocalized(alignment, seen, levels, scene)
+            if not _near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
+                self._steady_frames = 0
         if not alignment.trusted:
             self._lost_frames += 1
             self._steady_frames = 0
@@ -162,46 +125,47 @@ class VoxelHashingIcp(PoseTracker):
             return Pose(self._T_world_last, lost=True, reason=alignment.reason or alignment.doubt)
         T_last_next = inverse(self._T_world_last) @ alignment.T_world_camera
         self._T_last_next = np.eye(4) if self._lost_frames or self._is_jump(T_last_next) else T_last_next
-        return self._trusted(seen, alignment.T_world_camera)
+        return self._trust(seen, alignment.T_world_camera)
 
     def keyframes(self) -> Mapping[str, Array]:
         return self._keyframes.saved()
 
     def load_keyframes(self, keyframes: Mapping[str, Array], scene: SceneMap) -> None:
         self._keyframes.restore(keyframes)
-        self._before = scene
+        self._stored_scene = scene
 
-    def _entered(self, seen: FrameFeatures, before: SceneMap) -> Pose:
-        """Finds the camera in a map from before: features of its keyframes lead to where alignment with it stays."""
-        unknown = Alignment(np.eye(4), 0, 0, 0, 0, "it has not been found in the map from before", "")
+    def _pyramid(self, frame: Frame) -> list[PyramidLevel]:
+        self._coarse_depth = is_coarse(frame.depth, otherwise=self._coarse_depth)
+        return build_pyramid(frame.camera, frame.depth, frame.color, self.finest_scale, LEVELS)
+
+    def _relocalize_in_stored(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
+        """Find the camera in a stored map by features, confirmed by alignment."""
+        alignment = Alignment(np.eye(4), 0, 0, 0, 0, "it has not been found in the map from before", "")
         found = self._keyframes.relocalize(seen.frame)
-        alignment = unknown
         if found is not None:
-            levels = build_pyramid(seen.frame.camera, seen.frame.depth, seen.frame.color, self.finest_scale, LEVELS)
-            self._coarse_depth = is_coarse(seen.frame.depth, otherwise=self._coarse_depth)
-            alignment = self._checked(unknown, found.T_world_camera, levels, before)
+            alignment = self._confirmed(alignment, found.T_world_camera, self._pyramid(seen.frame), scene)
         if not alignment.trusted:
             return Pose(np.eye(4), lost=True, reason=alignment.reason)
-        self._before = None
-        return self._trusted(seen, alignment.T_world_camera)
+        self._stored_scene = None
+        return self._trust(seen, alignment.T_world_camera)
 
-    def _continued(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
-        """Aligns from where a steady motion has led, and is content with less where it ends there."""
+    def _align_predicted(self, levels: list[PyramidLevel], scene: SceneMap, T_world_predicted: Float64) -> Alignment:
+        """Align from the predicted pose; a result near it needs less agreement."""
         assert self._T_world_last is not None
         alignment = self._align(levels, scene, T_world_predicted, self._T_world_last)
-        if not _near(alignment.T_world_camera, T_world_predicted, SAME_PLACE):
+        if not _near(alignment.T_world_camera, T_world_predicted, SAME_POSE):
             self._steady_frames = 0
             return alignment
         self._steady_frames += 1
-        removed = alignment.beside >= CHANGED_SCENE  # what is behind the map's surface was removed from before it
+        object_removed = alignment.agreement_in_front >= CHANGED_SCENE
         expected = alignment.agreement >= EXPECTED_AGREEMENT and alignment.behind <= EXPECTED_BEHIND
-        enough = removed or (expected and self._steady_frames >= STEADY)
+        enough = object_removed or (expected and self._steady_frames >= STEADY)
         if enough and alignment.matched >= self.min_matched:
             return alignment._replace(doubt="")
         return alignment
 
-    def _resumed(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
-        """Aligns a lost camera from the last pose that was trusted, and from the last frame's that was in doubt."""
+    def _align_lost(self, levels: list[PyramidLevel], scene: SceneMap) -> Alignment:
+        """Align from the last trusted pose, and from the last frame's doubted one."""
         assert self._T_world_last is not None
         alignment = self._align_twice(levels, scene, self._T_world_last)
         if alignment.trusted or self._T_world_doubted is None:
@@ -209,8 +173,8 @@ class VoxelHashingIcp(PoseTracker):
         again = self._align_twice(levels, scene, self._T_world_doubted)
         return alignment if again.reason else again
 
-    def _first(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
-        """The pose that defines the world, of the first frame with something in it to be tracked by."""
+    def _initialize(self, seen: FrameFeatures, scene: SceneMap) -> Pose:
+        """Define the world by the first frame with enough depth."""
         frame = seen.frame
         if min(frame.camera.shape) * self.finest_scale < SMALLEST * 2 ** (LEVELS - 1):
             raise DataError(
@@ -223,14 +187,13 @@ class VoxelHashingIcp(PoseTracker):
         if readings < max(self.min_visible, 1 / frame.depth.size):
             few = f"{readings:.1%} of the pixels have a depth that is mapped, {nearest:g} to {farthest:g} m"
             return Pose(T_world_camera, lost=True, reason=few if frame.depth.any() else "the frame has no depth")
-        return self._trusted(seen, T_world_camera)
+        return self._trust(seen, T_world_camera)
 
     def _is_jump(self, T_last_next: Float64) -> bool:
-        """Whether this is farther than a camera moves from one frame to the next."""
         step, turn = np.linalg.norm(T_last_next[:3, 3]), rotation_angle(T_last_next[:3, :3])
         return bool(step > self.max_step or turn > self.max_turn)
 
-    def _trusted(self, seen: FrameFeatures, T_world_camera: Float64) -> Pose:
+    def _trust(self, seen: FrameFeatures, T_world_camera: Float64) -> Pose:
         self._T_world_last = T_world_camera
         self._T_world_doubted = None
         self._lost_frames = 0
@@ -240,22 +203,19 @@ class VoxelHashingIcp(PoseTracker):
                 self._keyframes.add_with(seen.frame, seen.found, T_world_camera)
             else:
                 self._keyframes.add(seen.frame, T_world_camera)
-            if not any(_near(T, T_world_camera, VISITED_APART) for T in reversed(self._visited)):  # the last is nearest
+            if not any(_near(T, T_world_camera, VISITED_SEPARATION) for T in reversed(self._visited)):
                 self._visited.append(T_world_camera)
         return Pose(T_world_camera)
 
-    def _searched(
+    def _relocalized(
         self, alignment: Alignment, seen: FrameFeatures, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """The best pose of a frame that alignment alone does not tell: asks features, then goes through visited places.
-
-        Two independent ways to one pose are trusted: features that lead to where alignment leads, too.
-        """
+        """Return the alignment confirmed or replaced by features; a lost camera also tries a visited pose."""
         if not self.relocalize:
             return alignment
-        found = self._told_by_features(seen)
+        found = self._pose_from_features(seen)
         if found is not None:
-            alignment = self._checked(alignment, found.T_world_camera, levels, scene)
+            alignment = self._confirmed(alignment, found.T_world_camera, levels, scene)
         if self._lost_frames and self._visited and not alignment.trusted:
             T_world_visited = self._visited[-1 - self._lost_frames % len(self._visited)]
             again = self._align_twice(levels, scene, T_world_visited)
@@ -263,15 +223,15 @@ class VoxelHashingIcp(PoseTracker):
                 return again
         return alignment
 
-    def _checked(
+    def _confirmed(
         self, alignment: Alignment, T_world_found: Float64, levels: list[PyramidLevel], scene: SceneMap
     ) -> Alignment:
-        """What to make of an alignment where features tell `T_world_found`: two ways to one pose are trusted."""
+        """Return the alignment that a pose from features confirms: a pose with two independent sources is trusted."""
         if alignment.trusted and _near(alignment.T_world_camera, T_world_found, self.max_distance):
             return alignment
         again = self._align(levels, scene, T_world_found, T_world_found)
-        borne_out = not again.reason and _near(again.T_world_camera, T_world_found, self.max_distance)
-        if borne_out and (alignment.reason or again.trusted or again.agreement > alignment.agreement):
+        agrees = not again.reason and _near(again.T_world_camera, T_world_found, self.max_distance)
+        if agrees and (alignment.reason or again.trusted or again.agreement > alignment.agreement):
             return again._replace(doubt="")
         if alignment.reason:
             return alignment
@@ -279,8 +239,8 @@ class VoxelHashingIcp(PoseTracker):
             return alignment._replace(doubt="")
         return alignment._replace(doubt=alignment.doubt or "features tell another pose than alignment with the map")
 
-    def _told_by_features(self, seen: FrameFeatures) -> AbsolutePose | None:
-        """The pose by features of the last trusted frame and of keyframes near it, else of those that look alike."""
+    def _pose_from_features(self, seen: FrameFeatures) -> AbsolutePose | None:
+        """Return the pose from features of the last trusted frame and keyframes near it, else of similar keyframes."""
         assert self._T_world_last is not None
         near = self._keyframes.nearest(self._T_world_last)
         if self._last is not None:
@@ -291,54 +251,52 @@ class VoxelHashingIcp(PoseTracker):
         return found
 
     def _align_twice(self, levels: list[PyramidLevel], scene: SceneMap, T_world_from: Float64) -> Alignment:
-        """Aligns from where the camera was, and again from where that ends: only the view from there tells whether the
-        frame determines its pose.
-        """
-        first = self._align(levels, scene, T_world_from, T_world_from)
-        if not first.trusted:
-            return first
-        second = self._align(levels, scene, first.T_world_camera, T_world_from)
-        if not _near(first.T_world_camera, second.T_world_camera, SAME_PLACE / 2):
-            return second._replace(doubt="two alignments, the second from where the first has ended, do not agree")
-        return second
+        """Align from a pose, and again to the view from the result: agreement shows that the frame determines it."""
+        alignment = self._align(levels, scene, T_world_from, T_world_from)
+        if not alignment.trusted:
+            return alignment
+        again = self._align(levels, scene, alignment.T_world_camera, T_world_from)
+        if not _near(alignment.T_world_camera, again.T_world_camera, SAME_POSE / 2):
+            return again._replace(doubt="two alignments, the second from where the first has ended, do not agree")
+        return again
 
     def _align(
         self, levels: list[PyramidLevel], scene: SceneMap, T_world_view: Float64, T_world_from: Float64
     ) -> Alignment:
-        """Aligns a frame to the view of the map at T_world_view, coarse to fine; it comes from T_world_from."""
+        """Align a frame to the view of the map at T_world_view, coarse to fine; the last pose is T_world_from."""
         view = scene.render_near(levels[0].camera, T_world_view, levels[0].depth)
         model, intensities = model_view(view), model_intensities(view, LEVELS)
         iterations = (self.iterations_fine, self.iterations_middle, self.iterations_coarse)
         T_view_camera = np.eye(4)
         brightness = 0.0
         for level in reversed(range(LEVELS)):
-            weights, model_here = self._weights_at(level), smoothed(model, level)
+            weights, smooth = self._weights_at(level), smoothed(model, level)
             for _ in range(iterations[level]):
-                equations = linearize(levels[level], model_here, intensities[level], T_view_camera, weights, brightness)
+                equations = linearize(levels[level], smooth, intensities[level], T_view_camera, weights, brightness)
                 brightness = equations.brightness
                 xi = _solved(equations)
                 T_view_camera = exp_se3(xi) @ T_view_camera
-                if np.abs(xi).max() < FINE_ENOUGH * 4**level:
+                if np.abs(xi).max() < CONVERGED * 4**level:
                     break
-        if np.abs(xi).max() >= FINE_ENOUGH:  # too long a step for what was known before it to tell where it has led
-            equations = linearize(levels[0], model_here, intensities[0], T_view_camera, weights, brightness)
+        if np.abs(xi).max() >= CONVERGED:  # the counts before such a step do not describe its result
+            equations = linearize(levels[0], smooth, intensities[0], T_view_camera, weights, brightness)
         T_world_camera = T_world_view @ T_view_camera
         # products of poses and of their inverses amplify rounding errors exponentially
         T_world_camera[:3, :3] = nearest_rotation(T_world_camera[:3, :3])
         matched, agreement, behind = (
             count / max(equations.visible, 1) for count in (equations.matched, equations.close, equations.behind)
         )
-        beside = equations.close / max(equations.visible - equations.behind, 1)
-        reason = self._why_impossible(levels[0], equations, inverse(T_world_from) @ T_world_camera)
+        agreement_in_front = equations.close / max(equations.visible - equations.behind, 1)
+        reason = self._rejection(levels[0], equations, inverse(T_world_from) @ T_world_camera)
         doubt = ""
         if agreement < self.min_agreement or behind > self.max_occluded:
             doubt = f"{agreement:.0%} of the points in view agree with the map, {behind:.1%} lie behind it"
         elif matched < self.min_matched:
             doubt = f"{agreement:.0%} of the points in view agree with the map, but {matched:.0%} in their normals, too"
-        return Alignment(T_world_camera, matched, agreement, behind, beside, reason, doubt)
+        return Alignment(T_world_camera, matched, agreement, behind, agreement_in_front, reason, doubt)
 
     def _weights_at(self, level: int) -> Weights:
-        """What is an outlier where the pose is known to a fraction of a voxel need not be one on the way there."""
+        """Return the weights of a level: coarse levels start from less accurate poses and tolerate larger residuals."""
         return self._weights._replace(
             min_normal_dot=np.float32(-1) if self._coarse_depth else self._weights.min_normal_dot,
             max_distance=self._weights.max_distance * np.float32(1 + level),
@@ -346,8 +304,8 @@ class VoxelHashingIcp(PoseTracker):
             photometric_scale=self._weights.photometric_scale * np.float32(2**level),
         )
 
-    def _why_impossible(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
-        """One line that says why this cannot be the pose, empty if it can."""
+    def _rejection(self, frame: PyramidLevel, equations: NormalEquations, T_from_camera: Float64) -> str:
+        """Return one line with the reason why this cannot be the pose, empty if it can."""
         points = int(np.count_nonzero(frame.depth))
         if points == 0:
             return "the frame has no depth"
@@ -360,19 +318,19 @@ class VoxelHashingIcp(PoseTracker):
             step, turn = np.linalg.norm(T_from_camera[:3, 3]), rotation_angle(T_from_camera[:3, :3])
             return f"a step of {step:.2f} m and {np.degrees(turn):.0f} deg is not plausible"
         information = np.linalg.eigvalsh(equations.A)
-        least = self.min_information * (SURER if self._lost_frames else 1.0)
+        least = self.min_information * (RECOVERY_INFORMATION if self._lost_frames else 1.0)
         if information[0] < least * information.mean():
             return "the surface in view does not determine the motion"
         return ""
 
 
 def _near(T_a: Float64, T_b: Float64, limit: float) -> bool:
-    """Whether two poses are within `limit` m and rad of each other."""
+    """Return whether two poses are within `limit` m and rad of each other."""
     T_ab = inverse(T_a) @ T_b
     return bool(np.linalg.norm(T_ab[:3, 3]) < limit and rotation_angle(T_ab[:3, :3]) < limit)
 
 
 def _solved(equations: NormalEquations) -> Float64:
-    """The Gauss-Newton step; undetermined directions stay where the prediction has them."""
+    """Return the Gauss-Newton step; damping keeps undetermined directions at the prediction."""
     damping = 1e-6 * max(float(np.trace(equations.A)), 1e-12) * np.eye(6)
     return np.asarray(np.linalg.solve(equations.A + damping, -equations.b))

@@ -16,6 +16,7 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
 from framework.refinement.mixtures import mixture, mixture_tree
+from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures
 from framework.refinement.neighborhood import Ring, surroundings
 from plugins.refiners.chain import Chain
 from plugins.refiners.connected import Connected
@@ -94,10 +95,9 @@ def test_em_beside_scikit_learn(benchmark):
     # a start without empty groups, which scikit-learn could not take
     labels = (np.arange(len(sample.points_camera)) * 7 // 3 % components).astype(np.int32)
 
-    def ours() -> mixture.Mixtures:
+    def ours() -> Mixtures:
         return mixture.fit(
-            sample.points_camera, sample.starts, labels, components, max_iterations=iterations, tolerance=-np.inf,
-            variance_floor=1e-6, outlier_fraction=0.0,
+            sample.points_camera, sample.starts, labels, components, EmSettings(iterations, -np.inf, 1e-6, 0.0),
         )  # fmt: skip
 
     def theirs() -> np.ndarray:
@@ -137,13 +137,13 @@ def test_tree_beside_flat_mixture(benchmark, levels: int, components: int):
     clusters, frame = ten_masks()
     sample = surroundings(clusters, frame, Ring()).sampled(10_000)
     points, starts = sample.points_camera, sample.starts
-    em = {"max_iterations": 8, "tolerance": 1e-3, "variance_floor": 0.01**2, "outlier_fraction": 0.02}
+    em = EmSettings(8, 1e-3, 0.01**2, 0.02)
 
     def tree() -> mixture_tree.MixtureTree:
-        return mixture_tree.fit(points, starts, levels=levels, children=8, min_support=0.0, min_points=32, **em)
+        return mixture_tree.fit(points, starts, em, levels=levels, children=8, min_support=0.0, min_points=32)
 
-    def flat() -> mixture.Mixtures:
-        return mixture.fit(points, starts, mixture_tree.cut(points, starts, components), components, **em)
+    def flat() -> Mixtures:
+        return mixture.fit(points, starts, mixture_tree.cut(points, starts, components), components, em)
 
     tree(), flat()
     grown = benchmark.pedantic(tree, rounds=9)

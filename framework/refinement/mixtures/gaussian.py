@@ -1,7 +1,7 @@
 """Gaussian densities and moments of blocks of points, in vector code: the inner loops of expectation maximization.
 
-The exponential and the eigenvalues are our own: a kernel calls NumPy's exp number by number (without Intel's SVML),
-and LAPACK for each 3x3 matrix.
+The exponential and the eigenvalues are our own: numba does not vectorize NumPy's exp without Intel's SVML, and calls
+LAPACK for each 3x3 matrix.
 """
 
 from __future__ import annotations
@@ -14,17 +14,17 @@ from numba import njit
 from framework.data import Float32, Float64
 
 LOG_2PI = float(np.log(2 * np.pi))
-JACOBI_SWEEPS = 6  # of a 3x3 matrix, at most: converges quadratically, 4 suffice for double precision
-NEGLIGIBLE = 1e-28  # of the squared trace: off-diagonal elements that change an eigenvalue in the 14th digit
-ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are
-FACTORS = 64  # with up to 10^4 components their product stays below 1e256
-SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
+JACOBI_SWEEPS = 6  # upper limit; 4 suffice for a 3x3 matrix in double precision
+NEGLIGIBLE = 1e-28  # of the squared trace: smaller off-diagonal elements change an eigenvalue in the 14th digit
+ABSENT = np.float32(-1e30)  # log density of a component with weight 0; finite, so that differences are finite
+FACTORS = 64  # with up to 10^4 components, their product stays below 1e256
+SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and respect infinities
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32) -> None:
-    """out[i] = log(pi_k N(x_i | mu_k, Sigma_k))."""
-    c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array itself takes longer than the loop
+    """Set out[i] = log(pi_k N(x_i | mu_k, Sigma_k))."""
+    c, mx, my, mz = row[0], row[1], row[2], row[3]  # unpacking the array takes longer than the loop
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
     for i in range(len(x)):
@@ -35,7 +35,7 @@ def log_densities(x: Float32, y: Float32, z: Float32, row: Float32, out: Float32
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to_density(x: Float32, y: Float32, z: Float32, row: Float32, values: Float32) -> None:
-    """values = max(values, log_densities)."""
+    """Set values = max(values, log_densities)."""
     c, mx, my, mz = row[0], row[1], row[2], row[3]
     w00, w10, w11, w20, w21, w22 = row[4], row[5], row[6], row[7], row[8], row[9]
     half = np.float32(-0.5)
@@ -54,16 +54,16 @@ def add_to(values: Float32, summands: Float32) -> None:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def raise_to(values: Float32, others: Float32, n: int) -> None:
-    """values = max(values, others), of the first n; a comparison vectorizes where max() does not."""
+    """Set values = max(values, others), of the first n; unlike max(), a comparison vectorizes."""
     for i in range(n):
         values[i] = others[i] if others[i] > values[i] else values[i]
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _exp(t: np.float32) -> np.float32:
-    """exp(t) for t <= 0 with a relative error of 3e-7, in steps that vectorize: 2^k * 2^r with |r| <= 1/2.
+    """Return exp(t) for t <= 0 with a relative error of 3e-7, as 2^k * 2^r with |r| <= 1/2, which vectorizes.
 
-    Below exp(-50) = 2e-22 it stays there: products with denormal numbers are a hundred times slower.
+    The result is at least exp(-50) = 2e-22: denormal numbers are slow.
     """
     t = max(t, np.float32(-50.0)) * np.float32(1.4426950408889634)
     k = math.floor(t + np.float32(0.5))
@@ -85,7 +85,7 @@ def constant_exponential(log_density: np.float32, largest: Float32, evidence: Fl
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int) -> None:
-    """densities = exp(densities - largest), added to the evidence; of the first n."""
+    """Set densities = exp(densities - largest) and add them to the evidence, of the first n."""
     for i in range(n):
         densities[i] = _exp(densities[i] - largest[i])
         evidence[i] += densities[i]
@@ -93,14 +93,14 @@ def exponentials(densities: Float32, largest: Float32, evidence: Float32, n: int
 
 @njit(cache=True, nogil=True)
 def log_evidence(largest: Float32, evidence: Float32, n: int) -> float:
-    """sum_i largest[i] + log(evidence[i]) of the first n, with one logarithm for many factors.
+    """Return sum_i largest[i] + log(evidence[i]) of the first n, with one logarithm per FACTORS factors.
 
-    Each of them lies between 1 and 1 + the number of components: FACTORS of them do not overflow.
+    A factor is between 1 and 1 + the number of components.
     """
     total = 0.0
-    for first in range(0, n, FACTORS):
-        end = min(first + FACTORS, n)
-        total += _sum(largest[first:end]) + math.log(_product(evidence[first:end]))
+    for begin in range(0, n, FACTORS):
+        end = min(begin + FACTORS, n)
+        total += _sum(largest[begin:end]) + math.log(_product(evidence[begin:end]))
     return total
 
 
@@ -122,7 +122,7 @@ def _product(values: Float32) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def invert(values: Float32, others: Float32, n: int) -> float:
-    """values = 1 / values, of the first n; returns the sum of others / values."""
+    """Set values = 1 / values, of the first n; return the sum of others / values."""
     total = np.float32(0.0)
     for i in range(n):
         values[i] = np.float32(1.0) / values[i]
@@ -132,7 +132,7 @@ def invert(values: Float32, others: Float32, n: int) -> float:
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: Float32, moment: Float64) -> None:
-    """Adds sum_i gamma_i (1, x_i, x_i x_i^T); single precision suffices within a block."""
+    """Add sum_i gamma_i (1, x_i, x_i x_i^T); single precision suffices within a block."""
     zero = np.float32(0.0)
     s, sx, sy, sz, sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero, zero, zero, zero, zero
     for i in range(len(x)):
@@ -154,7 +154,7 @@ def add_moments(x: Float32, y: Float32, z: Float32, densities: Float32, scale: F
 
 @njit(cache=True, nogil=True)
 def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) -> None:
-    """Adds gamma * (1, x, x x^T) of the centered point; of the symmetric matrix the upper triangle."""
+    """Add gamma * (1, x, x x^T) of the centered point, with the upper triangle of the symmetric matrix."""
     x, y, z = point[0] - center[0], point[1] - center[1], point[2] - center[2]
     gx, gy, gz = gamma * x, gamma * y, gamma * z
     moment[0] += gamma
@@ -171,7 +171,7 @@ def add_point(moment: Float64, point: Float32, center: Float64, gamma: float) ->
 
 @njit(cache=True, nogil=True)
 def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
-    """Raises the eigenvalues of a symmetric (3, 3) matrix to at least `floor`, in place (cyclic Jacobi)."""
+    """Raise the eigenvalues of a symmetric (3, 3) matrix to at least `floor`, in place (cyclic Jacobi)."""
     A, V = Sigma.copy(), np.eye(3)
     for _ in range(JACOBI_SWEEPS):
         if A[0, 1] * A[0, 1] + A[0, 2] * A[0, 2] + A[1, 2] * A[1, 2] < NEGLIGIBLE * (A[0, 0] + A[1, 1] + A[2, 2]) ** 2:
@@ -202,9 +202,9 @@ def floor_eigenvalues(Sigma: Float64, floor: float) -> None:
 
 @njit(cache=True, nogil=True)
 def set_coefficients(weight: float, mean: Float64, Sigma: Float64, row: Float32) -> None:
-    """row = log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
+    """Set row = log(pi_k / sqrt((2 pi)^3 |Sigma|)), mu_k, and L^-1 of Sigma = L L^T, row by row.
 
-    Whitening by L^-1 keeps single precision accurate where the entries of Sigma^-1 would cancel.
+    In single precision, whitening by L^-1 is accurate where entries of Sigma^-1 would cancel.
     """
     if weight <= 0.0:
         row[:] = 0.0

@@ -1,6 +1,6 @@
-"""Lloyd's k-means for many point sets at the same time.
+"""Lloyd's k-means for many point sets in parallel, and starts for it and for expectation maximization.
 
-scikit-learn fits one set a call, and takes a hundred times as long for a frame's (20 masks of redkitchen, one core).
+scikit-learn fits one set per call, which takes far longer for the masks of a frame.
 """
 
 from __future__ import annotations
@@ -8,14 +8,15 @@ from __future__ import annotations
 import numpy as np
 
 from framework.data import Float32, Float64, Int32, Int64
-from framework.refinement.mixtures.lloyd_iterations_kernels import group_depths, lloyd_all, nearest_all
+from framework.refinement.mixtures.lloyd_iterations_kernels import group_depths, lloyd_all, nearest_all, start_all
+from framework.refinement.neighborhood import Neighborhoods
 
 
 def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: int) -> tuple[Int32, Float64]:
-    """Labels (S,) and centers (N, K, 3) after Lloyd's iterations on each set `points[starts[k]:starts[k + 1]]`.
+    """Return labels (S,) and centers (N, K, 3) after Lloyd's iterations on each set `points[starts[k]:starts[k + 1]]`.
 
-    `centers` (N, K, 3) are the start. It ends when no label changes or after `max_iterations`. A center that loses all
-    of its points stays where it is; of equally near centers the first is taken.
+    `centers` (N, K, 3) are the start. It ends if no label changes or after `max_iterations`. A center that loses all
+    its points stays in place; of equally near centers the first is taken.
     """
     labels = np.full(len(points), -1, np.int32)
     centers = centers.copy()
@@ -24,14 +25,38 @@ def cluster(points: Float32, starts: Int64, centers: Float64, max_iterations: in
 
 
 def nearest_centers(points: Float32, begins: Int64, ends: Int64, centers: Float64) -> Int32:
-    """(S,) the nearest of the centers of set k for each of `points[begins[k]:ends[k]]`; -1 outside of the ranges."""
+    """Return (S,) the nearest center of set k for each of `points[begins[k]:ends[k]]`; -1 outside of the ranges."""
     return np.asarray(nearest_all(points, begins, ends, centers), np.int32)
 
 
 def depth_groups(points: Float32, starts: Int64, groups: int) -> Float64:
-    """(N, groups, 3) means of the points cut into `groups` equally many by depth: a start for `cluster`.
+    """Return (N, groups, 3) means of the points cut into `groups` of equal size by depth: a start for `cluster`.
 
-    Depth is what separates an occluder in front, the surface that carries an object and the wall behind. A set with
-    fewer points than groups gives repeated centers, an empty one zeros.
+    Depth separates an occluder, the supporting surface and the wall behind. A set with fewer points than groups gives
+    repeated centers, an empty one zeros.
     """
     return np.asarray(group_depths(points, starts, groups), np.float64)
+
+
+def start_centers(around: Neighborhoods, object_centers: int, background_centers: int) -> Float64:
+    """Return (N, object_centers + background_centers, 3) the `depth_groups` of mask and ring."""
+    of_ring = around.of_ring
+    mask_starts = np.concatenate([[0], np.cumsum(around.mask_counts)])
+    ring_starts = np.concatenate([[0], np.cumsum(around.ring_counts)])
+    objects = depth_groups(around.points_camera[~of_ring], mask_starts, object_centers)
+    background = depth_groups(around.points_camera[of_ring], ring_starts, background_centers)
+    return np.concatenate([objects, background], axis=1)
+
+
+def start_labels(around: Neighborhoods, log_odds: Float32, object_components: int, background_components: int) -> Int32:
+    """Return (S,) the start component of each point for EM: the object's come first, then the background's.
+
+    Lloyd's iterations group the mask's points with `log_odds` (S,) from 0, and the ring's points. The mask's other
+    points start in the nearest group of the ring.
+    """
+    labels = np.empty(len(around.points_camera), np.int32)
+    start_all(
+        around.points_camera, log_odds, around.starts, around.mask_counts, object_components, background_components,
+        labels,
+    )  # fmt: skip
+    return labels

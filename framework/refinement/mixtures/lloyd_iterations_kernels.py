@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-from framework.data import Float32, Float64, Int32, Int64
+from framework.data import Bool, Float32, Float64, Int32, Int64
+
+START_ITERATIONS = 5  # of Lloyd's algorithm, which need not converge for a start
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -20,9 +22,7 @@ def lloyd(points: Float32, centers: Float64, max_iterations: int, labels: Int32)
     sums = np.zeros((len(centers), 4))
     for _ in range(max_iterations):
         changed = False
-        for j in range(len(centers)):
-            for a in range(4):
-                sums[j, a] = 0.0
+        sums[:] = 0.0
         for i in range(len(points)):
             j = nearest(points[i], centers)
             changed |= j != labels[i]
@@ -69,40 +69,34 @@ def group_depths(points: Float32, starts: Int64, groups: int) -> Float64:
 
 @njit(cache=True, nogil=True)
 def depth_groups_of(points: Float32, groups: int) -> Float64:
-    """`depth_groups` of one set, (groups, 3)."""
+    """Return the `depth_groups` of one set, (groups, 3)."""
     n, means = len(points), np.zeros((groups, 3))
     if n == 0:
         return means
     order = _by_depth(points)
     for g in range(groups):
-        first, last = g * n // groups, (g + 1) * n // groups
-        last = max(last, first + 1)
-        for s in range(first, last):
+        begin, end = g * n // groups, (g + 1) * n // groups
+        end = max(end, begin + 1)
+        for s in range(begin, end):
             for a in range(3):
-                means[g, a] += points[order[s], a] / (last - first)
+                means[g, a] += points[order[s], a] / (end - begin)
     return means
 
 
 @njit(cache=True, nogil=True)
 def _by_depth(points: Float32) -> Int64:
-    """The points' numbers, nearest first, of equally near ones the first: a radix sort, byte by byte.
-
-    np.argsort takes a second to compile.
-    """
+    """Return the points' indices by increasing depth, in a stable radix sort; np.argsort takes long to compile."""
     n = len(points)
     depths = np.empty(n, np.float32)
     for i in range(n):
         depths[i] = points[i, 2]
     bits, keys = depths.view(np.int32), np.empty(n, np.int64)
-    for i in range(n):  # bits sort like their number, a negative one's backwards
+    for i in range(n):  # bits of positive numbers sort like the numbers, those of negative ones in reverse
         keys[i] = (np.int64(bits[i]) if bits[i] >= 0 else np.int64(bits[i] ^ np.int32(0x7FFFFFFF))) + (1 << 31)
-    order, sorted_ = np.empty(n, np.int64), np.empty(n, np.int64)
-    for i in range(n):
-        order[i] = i
+    order, sorted_ = np.arange(n), np.empty(n, np.int64)
     starts = np.empty(257, np.int64)
     for shift in range(0, 32, 8):
-        for byte in range(257):
-            starts[byte] = 0
+        starts[:] = 0
         for i in range(n):
             starts[((keys[i] >> shift) & 255) + 1] += 1
         for byte in range(256):
@@ -113,3 +107,48 @@ def _by_depth(points: Float32) -> Int64:
             starts[byte] += 1
         order, sorted_ = sorted_, order
     return order
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def start_all(
+    points: Float32, log_odds: Float32, starts: Int64, mask_counts: Int64, object_components: int,
+    background_components: int, labels: Int32,
+) -> None:  # fmt: skip
+    for k in prange(len(starts) - 1):
+        own = slice(starts[k], starts[k + 1])
+        _start_one(points[own], log_odds[own], mask_counts[k], object_components, background_components, labels[own])
+
+
+@njit(cache=True, nogil=True)
+def _start_one(
+    points: Float32, log_odds: Float32, mask_count: int, object_components: int, background_components: int,
+    labels: Int32,
+) -> None:  # fmt: skip
+    of_ring, in_core = np.empty(len(points), np.bool_), np.empty(len(points), np.bool_)
+    for i in range(len(points)):
+        of_ring[i] = i >= mask_count
+        in_core[i] = i < mask_count and log_odds[i] >= 0
+    _group(points, in_core, object_components, 0, labels)
+    centers = _group(points, of_ring, background_components, object_components, labels)
+    for i in range(mask_count):
+        if not in_core[i]:
+            labels[i] = object_components + nearest(points[i], centers)
+
+
+@njit(cache=True, nogil=True)
+def _group(points: Float32, chosen: Bool, groups: int, first_label: int, labels: Int32) -> Float64:
+    """Set the labels of the chosen points; return their groups' centers."""
+    own, own_labels, count = np.empty_like(points), np.empty(len(points), np.int32), 0
+    for i in range(len(points)):
+        if chosen[i]:
+            own[count, 0], own[count, 1], own[count, 2] = points[i, 0], points[i, 1], points[i, 2]
+            own_labels[count] = -1
+            count += 1
+    centers: Float64 = depth_groups_of(own[:count], groups)
+    lloyd(own[:count], centers, START_ITERATIONS, own_labels[:count])
+    count = 0
+    for i in range(len(points)):
+        if chosen[i]:
+            labels[i] = first_label + own_labels[count]
+            count += 1
+    return centers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -24,38 +25,63 @@ from framework.refinement.mixtures.gaussian import (
     set_coefficients,
 )
 
-MIN_SUPPORT = 4.0  # points that a component needs to have a covariance of its own in 3D; with fewer it is dropped
-BLOCK = 256  # points that a kernel handles at once: their densities stay in the first-level cache
-MARGIN = 1e-3  # nats, more than what single precision rounds log densities by
+MIN_SUPPORT = 4.0  # points of a component; with fewer, it has no covariance in 3D and is dropped
+BLOCK = 256  # points that a kernel handles at once, so that their densities stay in the first-level cache
+MARGIN = 1e-3  # nats, more than the rounding error of log densities in single precision
+
+
+class EmSettings(NamedTuple):
+    """The settings of expectation maximization."""
+
+    max_iterations: int
+    tolerance: float  # nats per point; EM ends when the mean log-likelihood increases by less
+    variance_floor: float  # m^2, smallest eigenvalue of a covariance
+    outlier_fraction: float  # of the points, at the start; 0 = no uniform component
+
+
+class Mixtures(NamedTuple):
+    """N mixtures of K Gaussians and one uniform component each. An absent component has weight 0."""
+
+    weights: Float64  # (N, K) pi_k
+    means: Float64  # (N, K, 3) mu_k, m
+    covariances: Float64  # (N, K, 3, 3) Sigma_k, m^2
+    outlier_weights: Float64  # (N,) pi of the uniform component
+    outlier_densities: Float64  # (N,) its density, 1 / m^3
+    log_likelihoods: Float64  # (N,) mean log p(x) of the points at the last E-step, in nats
+    iterations: Int64  # (N,) EM iterations made
+
+
+class Blocks(NamedTuple):
+    """B blocks of points, each of one set."""
+
+    sets: Int64  # (B,) index of the set
+    begins: Int64  # (B,)
+    ends: Int64  # (B,)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def fit_all(
-    points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, max_iterations: int,
-    tolerance: float, variance_floor: float, outlier_fraction: float, weights: Float64, means: Float64,
-    covariances: Float64, outliers: Float64, log_likelihoods: Float64, iterations: Int64,
+    points: Float32, starts: Int64, labels: Int32, odds: Float32, own_components: int, settings: EmSettings,
+    mixtures: Mixtures,
 ) -> None:  # fmt: skip
     for k in prange(len(starts) - 1):
         if starts[k + 1] > starts[k]:
-            _fit_one(
-                points[starts[k] : starts[k + 1]], labels[starts[k] : starts[k + 1]], odds[starts[k] : starts[k + 1]],
-                own_components, max_iterations, tolerance, variance_floor, outlier_fraction,
-                weights[k], means[k], covariances[k], outliers[k], log_likelihoods[k : k + 1], iterations[k : k + 1],
-            )  # fmt: skip
+            own = slice(starts[k], starts[k + 1])
+            _fit_one(points[own], labels[own], odds[own], own_components, settings, mixtures, k)
 
 
 @njit(cache=True, nogil=True)
 def _fit_one(
-    points: Float32, labels: Int32, odds: Float32, own_components: int, max_iterations: int, tolerance: float,
-    variance_floor: float, outlier_fraction: float, weights: Float64, means: Float64, covariances: Float64,
-    outlier: Float64, log_likelihood: Float64, iterations: Int64,
-) -> None:  # fmt: skip
-    count, components = len(points), len(weights)
+    points: Float32, labels: Int32, odds: Float32, own_components: int, settings: EmSettings, mixtures: Mixtures, k: int
+) -> None:
+    weights, means, covariances = mixtures.weights[k], mixtures.means[k], mixtures.covariances[k]
+    outlier_weights, log_likelihoods = mixtures.outlier_weights, mixtures.log_likelihoods
+    variance_floor, count, components = settings.variance_floor, len(points), len(weights)
     center, volume = _center_and_volume(points, variance_floor)
-    outlier[0], outlier[1] = outlier_fraction, 1.0 / volume
+    outlier_weights[k], mixtures.outlier_densities[k] = settings.outlier_fraction, 1.0 / volume
     moments = np.zeros((components, 10))
     for i in range(count):
-        add_point(moments[labels[i]], points[i], center, 1.0 - outlier_fraction)
+        add_point(moments[labels[i]], points[i], center, 1.0 - settings.outlier_fraction)
     _maximize(moments, center, count, variance_floor, weights, means, covariances)
     xyz = np.empty((3, count), np.float32)  # centered, so that single precision suffices
     for i in range(count):
@@ -63,24 +89,23 @@ def _fit_one(
             xyz[a, i] = points[i, a] - center[a]
     rows = np.zeros((components, 10), np.float32)
     previous = -np.inf
-    for iteration in range(max_iterations):
+    for iteration in range(settings.max_iterations):
         if not _any_left(weights):
             return
         for j in range(components):
             set_coefficients(weights[j], means[j], covariances[j], rows[j])
             for a in range(3):
                 rows[j, 1 + a] = means[j, a] - center[a]
-        log_outlier = np.float32(math.log(outlier[0] * outlier[1])) if outlier[0] > 0 else ABSENT
-        for j in range(components):
-            for a in range(10):
-                moments[j, a] = 0.0
+        outlier_evidence = outlier_weights[k] * mixtures.outlier_densities[k]
+        log_outlier = np.float32(math.log(outlier_evidence)) if outlier_weights[k] > 0 else ABSENT
+        moments[:] = 0.0
         total, outliers = _expect(xyz, odds, own_components, rows, log_outlier, moments)
         _maximize(moments, center, count, variance_floor, weights, means, covariances)
-        outlier[0] = outliers / count
-        iterations[0], log_likelihood[0] = iteration + 1, total / count
-        if log_likelihood[0] - previous < tolerance:
+        outlier_weights[k] = outliers / count
+        mixtures.iterations[k], log_likelihoods[k] = iteration + 1, total / count
+        if log_likelihoods[k] - previous < settings.tolerance:
             break
-        previous = log_likelihood[0]
+        previous = log_likelihoods[k]
 
 
 @njit(cache=True, nogil=True)
@@ -95,7 +120,7 @@ def _any_left(weights: Float64) -> bool:
 def _expect(
     xyz: Float32, odds: Float32, own_components: int, rows: Float32, log_outlier: np.float32, moments: Float64
 ) -> tuple[float, float]:
-    """E-step [2], which at once sums the M-step's moments; returns sum_i log p(x_i) and the outliers' N_k."""
+    """Make the E-step [2] and sum the M-step's moments; return sum_i log p(x_i) and the outliers' N_k."""
     components = len(rows)
     densities = np.empty((components, BLOCK), np.float32)
     largest, evidence = np.empty(BLOCK, np.float32), np.empty(BLOCK, np.float32)
@@ -127,7 +152,7 @@ def _maximize(
     moments: Float64, center: Float64, count: int, variance_floor: float, weights: Float64, means: Float64,
     covariances: Float64,
 ) -> None:  # fmt: skip
-    """M-step [3, 4]."""
+    """Make the M-step [3, 4]."""
     for j in range(len(weights)):
         N_k = moments[j, 0]
         if N_k < MIN_SUPPORT:
@@ -148,7 +173,7 @@ def _maximize(
 
 @njit(cache=True, nogil=True)
 def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64, float]:
-    """The mean of the points, and the volume of their bounding box with no side below four standard deviations."""
+    """Return the points' mean and the volume of their bounding box, with sides of at least 4 standard deviations."""
     center, low, high = np.zeros(3), np.empty(3), np.empty(3)
     for a in range(3):
         low[a] = high[a] = points[0, a]
@@ -166,30 +191,30 @@ def _center_and_volume(points: Float32, variance_floor: float) -> tuple[Float64,
 
 @njit(cache=True, nogil=True)
 def coefficients(weights: Float64, means: Float64, covariances: Float64) -> Float32:
-    rows = np.zeros((*weights.shape, 10), np.float32)
-    for k in range(weights.shape[0]):
-        for j in range(weights.shape[1]):
-            set_coefficients(weights[k, j], means[k, j], covariances[k, j], rows[k, j])
+    """Return the rows (M, 10) that `log_densities` takes, for M Gaussians."""
+    rows = np.zeros((len(weights), 10), np.float32)
+    for j in range(len(weights)):
+        set_coefficients(weights[j], means[j], covariances[j], rows[j])
     return rows
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def claim(
-    points: Float32, owner: Int64, firsts: Int64, lasts: Int64, odds: Float32, rows: Float32, log_outliers: Float32,
-    own_components: int, min_posterior: float, claimed: Bool,
+    points: Float32, blocks: Blocks, odds: Float32, rows: Float32, log_outliers: Float32, own_components: int,
+    min_posterior: float, claimed: Bool,
 ) -> None:  # fmt: skip
-    """Whether own / (own + others) > min_posterior for each point of the batches, of one mixture each."""
-    for b in prange(len(owner)):
-        k, first, last = owner[b], firsts[b], lasts[b]
+    """Set for each point of the blocks whether own / (own + others) > min_posterior."""
+    for b in prange(len(blocks.sets)):
+        k, begin, end = blocks.sets[b], blocks.begins[b], blocks.ends[b]
         absent = True
         for component in range(rows.shape[1]):
             absent = absent and rows[k, component, 0] <= ABSENT
         if absent:
-            claimed[first:last] = True
+            claimed[begin:end] = True
         else:
             _claim_batch(
-                points[first:last], odds[first:last], rows[k], log_outliers[k], own_components, min_posterior,
-                claimed[first:last],
+                points[begin:end], odds[begin:end], rows[k], log_outliers[k], own_components, min_posterior,
+                claimed[begin:end],
             )  # fmt: skip
 
 
@@ -198,7 +223,7 @@ def _claim_batch(
     points: Float32, odds: Float32, rows: Float32, log_outlier: np.float32, own_components: int, min_posterior: float,
     claimed: Bool,
 ) -> None:  # fmt: skip
-    """Most points need no exponential: a sum of n terms lies between its largest term and n times that."""
+    """Decide most points without exponentials: a sum of n terms is between its largest term and n times that."""
     components = len(rows)
     log_bound = math.log(min_posterior / (1.0 - min_posterior))
     certain = np.float32(log_bound + math.log(components - own_components + 1.0) + MARGIN)

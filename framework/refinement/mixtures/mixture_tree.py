@@ -1,8 +1,8 @@
-"""Hierarchical Gaussian mixtures: a tree over each of many point sets, all grown level by level at the same time.
+"""Hierarchical Gaussian mixtures: trees over many point sets, grown level by level in parallel.
 
 After Eckart, Kim, Troccoli, Kelly and Kautz, "Accelerated Generative Models for 3D Point Cloud Data", CVPR 2016: every
-node is a small mixture of its own points, and a point goes down to its best child alone. A level of J children a node
-then costs J Gaussians a point, where a flat mixture of as many components costs J^level.
+node is a small mixture of its own points, and a point descends to its best child alone. With J children per node, a
+level costs J Gaussians per point; a flat mixture with as many components costs J^level.
 """
 
 from __future__ import annotations
@@ -11,19 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Float32, Float64, Int32, Int64
+from framework.data import Bool, Float32, Float64, Int32, Int64
 from framework.refinement.mixtures import mixture
-from framework.refinement.mixtures.gaussian import (
-    ABSENT,
-)
-from framework.refinement.mixtures.mixture_kernels import BLOCK
-from framework.refinement.mixtures.mixture_tree_kernels import (
-    bounding_boxes,
-    cut_all,
-    pass_down,
-    set_all_coefficients,
-    share_all,
-)
+from framework.refinement.mixtures.mixture_kernels import BLOCK, EmSettings, Mixtures, coefficients
+from framework.refinement.mixtures.mixture_tree_kernels import bounding_boxes, cut_all, pass_down, set_own_ratios
+from framework.refinement.neighborhood import Neighborhoods
 from framework.refinement.neighborhood_kernels import grouped
 
 
@@ -31,9 +23,8 @@ from framework.refinement.neighborhood_kernels import grouped
 class Level:
     """M nodes of one level, below the Q nodes of the level above; above the first level are the N trees themselves.
 
-    Siblings lie together: the children of node q are the rows `firsts[q]:firsts[q + 1]`. A node without children is a
-    leaf. Weights are shares of the whole tree: those of a node's children and of the uniform component beside them
-    sum to its own.
+    The children of node q are the rows `firsts[q]:firsts[q + 1]`. A node without children is a leaf. Weights are ratios
+    of the whole tree: those of a node's children and of their uniform component sum to its own.
     """
 
     weights: Float64  # (M,) pi, above 0
@@ -41,19 +32,19 @@ class Level:
     covariances: Float64  # (M, 3, 3) Sigma, m^2
     firsts: Int64  # (Q + 1,)
     outlier_weights: Float64  # (Q,) pi of the uniform component among the children of node q; 0 for a leaf
-    outlier_boxes: Float64  # (Q, 2, 3) m, lowest and highest corner of the box that it fills
+    outlier_boxes: Float64  # (Q, 2, 3) m, lowest and highest corner of its box
 
     def __len__(self) -> int:
         return len(self.weights)
 
     @property
     def parents(self) -> Int64:
-        """(M,) the parent of each node: a node of the level above, at the first level a tree."""
+        """(M,) the parent of each node in the level above, at the first level its tree."""
         return np.repeat(np.arange(len(self.firsts) - 1), np.diff(self.firsts))
 
     @property
     def outlier_densities(self) -> Float64:
-        """(Q,) of the uniform component within its box, 1 / m^3; 0 for a leaf, which has none."""
+        """(Q,) density of the uniform component, 1 / m^3; 0 for a leaf."""
         volumes = np.prod(self.outlier_boxes[:, 1] - self.outlier_boxes[:, 0], axis=1)
         return np.asarray(np.where(volumes > 0, 1.0 / np.where(volumes > 0, volumes, 1.0), 0.0), np.float64)
 
@@ -65,73 +56,52 @@ class MixtureTree:
     levels: tuple[Level, ...]  # from the coarsest; at least one
 
     def passed(self, k: int, points: Float32, starts: Int64) -> Int64:
-        """(S,) the best node of level `k` for each point; -1 = the uniform component is likelier than each of them.
+        """Return (S,) the best node of level `k` for each point; -1 = the uniform component is more likely.
 
-        `points[starts[q]:starts[q + 1]]` have come down to node q of the level above.
+        `points[starts[q]:starts[q + 1]]` are the points of node q of the level above.
         """
-        nodes, ones, odds = np.ones(len(self.levels[k])), np.ones(len(starts) - 1), np.zeros(len(points))
-        child, _ = self.shared(
-            k, points, starts, nodes.astype(np.float32), ones.astype(np.float32), odds.astype(np.float32)
-        )
-        return child
+        ratios, outlier_ratios = np.ones(len(self.levels[k]), np.float32), np.ones(len(starts) - 1, np.float32)
+        return self.shared(k, points, starts, ratios, outlier_ratios, np.zeros(len(points), np.float32))[0]
 
     def shared(
-        self, k: int, points: Float32, starts: Int64, shares: Float32, above: Float32, log_odds: Float32
+        self, k: int, points: Float32, starts: Int64, ratios: Float32, outlier_ratios: Float32, log_odds: Float32
     ) -> tuple[Int64, Float32]:
-        """`passed`, and (S,) in [0, 1] how much of each point is ours by the densities of this level.
+        """Return `passed`, and (S,) the object's posterior at each point by the densities of this level.
 
-        A node is ours by its share in `shares` (M,), the uniform component below node q by `above[q]` (Q,). Our part
-        of the density is multiplied by exp(`log_odds`) (S,). A point at a leaf is not ours.
+        `ratios` (M,) are the object's parts of the nodes, `outlier_ratios` (Q,) of the uniform components. The object's
+        density is multiplied by exp(`log_odds`) (S,). The posterior of a point at a leaf is 0.
         """
         level = self.levels[k]
-        child, share = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+        child, posterior = np.empty(len(points), np.int64), np.empty(len(points), np.float32)
+        rows = coefficients(level.weights, level.means, level.covariances)
+        log_outliers = mixture.log_densities_of(level.outlier_weights * level.outlier_densities)
         pass_down(
-            points, log_odds, *_blocks(starts), _coefficients_of(level), shares, level.firsts, _log_outliers(level),
-            above, child, share,
+            points, log_odds, mixture.blocks_of(starts[:-1], starts[1:], BLOCK), rows, ratios, level.firsts,
+            log_outliers, outlier_ratios, child, posterior,
         )  # fmt: skip
-        return child, share
+        return child, posterior
 
 
 def fit(
-    points: Float32,
-    starts: Int64,
-    *,
-    levels: int,
-    children: int,
-    max_iterations: int,
-    tolerance: float,
-    variance_floor: float,
-    outlier_fraction: float,
-    min_support: float,
+    points: Float32, starts: Int64, settings: EmSettings, *, levels: int, children: int, min_support: float,
     min_points: int,
-) -> MixtureTree:
-    """Grows a tree of at most `levels` levels over each point set `points[starts[k]:starts[k + 1]]`.
+) -> MixtureTree:  # fmt: skip
+    """Grow a tree of at most `levels` levels over each point set `points[starts[k]:starts[k + 1]]`.
 
-    A node with `min_points` points or more gets `children` of its own, fitted to its points by `mixture.fit`, which
-    `max_iterations`, `tolerance`, `variance_floor` (m^2) and `outlier_fraction` are for, from the start that `cut`
-    makes. Each point then goes to its best child; one that the uniform component explains best goes no deeper. A child
-    that weighs less than `min_support` in its tree is dropped, to its siblings' gain. A set with too few points has no
-    nodes at all.
+    A node with at least `min_points` points gets `children`, fitted to its points by `mixture.fit` from the start of
+    `cut`. Each point then descends to its best child, or stays if the uniform component is more likely. A child with a
+    weight below `min_support` is dropped in favor of its siblings. A set with too few points has no nodes.
     """
     grown: list[Level] = []
     above = np.ones(len(starts) - 1)  # weights of the nodes that the points are at
+    least_side = 4 * np.sqrt(settings.variance_floor)
     for _ in range(levels):
         chosen = np.nonzero(np.diff(starts) >= max(min_points, 1))[0]
         if grown and len(chosen) == 0:
             break
         own, own_starts = _ranges(points, starts, chosen)
-        fitted = mixture.fit(
-            own,
-            own_starts,
-            cut(own, own_starts, children),
-            children,
-            max_iterations=max_iterations,
-            tolerance=tolerance,
-            variance_floor=variance_floor,
-            outlier_fraction=outlier_fraction,
-        )
-        boxes = bounding_boxes(own, own_starts, 4 * np.sqrt(variance_floor))
-        level = _level(fitted, boxes, chosen, above, min_support)
+        fitted = mixture.fit(own, own_starts, cut(own, own_starts, children), children, settings)
+        level = _level(fitted, bounding_boxes(own, own_starts, least_side), chosen, above, min_support)
         if grown and len(level) == 0:
             break
         grown.append(level)
@@ -143,30 +113,62 @@ def fit(
 
 
 def cut(points: Float32, starts: Int64, groups: int) -> Int32:
-    """(S,) each set cut into at most `groups` groups in [0, groups) that lie together: a start for `mixture.fit`.
+    """Return (S,) labels in [0, groups) that cut each set into compact groups: a start for `mixture.fit`.
 
-    The group of the largest scatter along one axis is cut in two at its mean, again and again (variance-based
-    bisection). A group that a cut would leave with too few points for a component stays whole.
+    Variance-based bisection: the group with the largest scatter along one axis is cut at its mean. A group is not cut
+    if that leaves too few points for a component.
     """
     labels = np.zeros(len(points), np.int32)
     cut_all(points, starts, groups, labels)
     return labels
 
 
-def own_shares(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
-    """(M,) the share of each node that is ours, from the evidence `log_odds[starts[j]:starts[j + 1]]` of its points.
+def own_ratios(log_odds: Float32, starts: Int64, above: Float32, above_points: float) -> Float32:
+    """Return (M,) the object's ratio of each node, from the evidence `log_odds[starts[j]:starts[j + 1]]` of its points.
 
-    Each point is ours or not; its evidence is the log-likelihood ratio of the two. The share rho is the likeliest one,
-    max sum_i log(rho exp(o_i) + 1 - rho), as if `above_points` more points shared the parent's share `above` (M,): the
-    fixed point of EM over the points' sides.
+    The evidence o_i of a point is its log-likelihood ratio. The ratio rho maximizes sum_i log(rho exp(o_i) + 1 - rho),
+    with `above_points` more points at the parent's ratio `above` (M,): the fixed point of EM over the points' classes.
     """
-    shares = above.astype(np.float32)
-    share_all(log_odds, starts, above_points, shares)
-    return shares
+    ratios = above.astype(np.float32)
+    set_own_ratios(log_odds, starts, above_points, ratios)
+    return ratios
 
 
-def _level(fitted: mixture.Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
-    """The level below nodes of the weights `above` (Q,), of which the `chosen` ones have been given children."""
+def object_ratios(tree: MixtureTree, sample: Neighborhoods, odds: Float32, parent_points: float) -> list[Float32]:
+    """Return for each level (M,) the object's ratio of each node, from the log-odds (S,) of the sample's points.
+
+    The parent's ratio counts as `parent_points` points.
+    """
+    points, starts = sample.points_camera, sample.starts
+    above, ratios = np.full(len(sample), 0.5, np.float32), []
+    for k, level in enumerate(tree.levels):
+        order, starts = grouped(tree.passed(k, points, starts).astype(np.int32), len(level))
+        points, odds = points[order], odds[order]
+        above = own_ratios(odds, starts, above[level.parents], parent_points)
+        ratios.append(above)
+    return ratios
+
+
+def claimed(tree: MixtureTree, ratios: list[Float32], own: Neighborhoods, odds: Float32, min_posterior: float) -> Bool:
+    """Return (S,) which of the masks' points have a posterior above `min_posterior` at their deepest level.
+
+    `odds` (S,) are the points' own log-odds.
+    """
+    claimed, remaining = np.zeros(len(own.points_camera), bool), np.arange(len(own.points_camera))
+    points, starts = own.points_camera, own.starts
+    above = np.zeros(len(own), np.float32)
+    for k, level in enumerate(tree.levels):
+        child, posterior = tree.shared(k, points, starts, ratios[k], above, odds)
+        claimed[remaining] = posterior > min_posterior
+        if k + 1 < len(tree.levels):
+            has_children = np.append(np.diff(tree.levels[k + 1].firsts) > 0, False)  # False for -1, an outlier
+            order, starts = grouped(np.where(has_children[child], child, -1).astype(np.int32), len(level))
+            remaining, points, odds, above = remaining[order], points[order], odds[order], ratios[k]
+    return claimed
+
+
+def _level(fitted: Mixtures, boxes: Float64, chosen: Int64, above: Float64, min_support: float) -> Level:
+    """Return the level below nodes with the weights `above` (Q,), of which the `chosen` ones got children."""
     kept = (fitted.weights > 0) & (fitted.weights * above[chosen, None] >= min_support)
     survivors = np.count_nonzero(kept, axis=1)
     weights = np.where(kept, fitted.weights, 0.0)
@@ -178,42 +180,16 @@ def _level(fitted: mixture.Mixtures, boxes: Float64, chosen: Int64, above: Float
     counts[chosen] = survivors
     outlier_weights[chosen] = outliers * scale
     outlier_boxes[chosen] = np.where((survivors > 0)[:, None, None], boxes, 0.0)
-    return Level(
-        weights=(weights * scale[:, None])[kept],
-        means=fitted.means[kept],
-        covariances=fitted.covariances[kept],
-        firsts=np.concatenate([[0], np.cumsum(counts)]),
-        outlier_weights=outlier_weights,
-        outlier_boxes=outlier_boxes,
-    )
+    firsts = np.concatenate([[0], np.cumsum(counts)])
+    nodes = (weights * scale[:, None])[kept], fitted.means[kept], fitted.covariances[kept]
+    return Level(*nodes, firsts, outlier_weights, outlier_boxes)
 
 
 def _ranges(points: Float32, starts: Int64, chosen: Int64) -> tuple[Float32, Int64]:
-    """The points of the chosen sets alone, and where each of them begins."""
+    """Return the points of the chosen sets and where each of them begins."""
     counts = np.diff(starts)
     if len(chosen) == len(counts):
         return points, starts
     inside = np.zeros(len(counts), bool)
     inside[chosen] = True
     return points[np.repeat(inside, counts)], np.concatenate([[0], np.cumsum(counts[chosen])])
-
-
-def _coefficients_of(level: Level) -> Float32:
-    """(M, 10) the rows that `log_densities` takes."""
-    rows = np.zeros((len(level), 10), np.float32)
-    set_all_coefficients(level.weights, level.means, level.covariances, rows)
-    return rows
-
-
-def _log_outliers(level: Level) -> Float32:
-    """(Q,) log(pi p) of the uniform components within their boxes, ABSENT where there is none."""
-    evidence = level.outlier_weights * level.outlier_densities
-    return np.where(evidence > 0, np.log(np.maximum(evidence, 1e-300)), ABSENT).astype(np.float32)
-
-
-def _blocks(starts: Int64) -> tuple[Int64, Int64, Int64]:
-    """Each set in blocks for the kernels: (B,) the set, where the block begins and where it ends."""
-    blocks = -(-np.diff(starts) // BLOCK)
-    sets = np.repeat(np.arange(len(blocks)), blocks)
-    begins = starts[sets] + BLOCK * (np.arange(len(sets)) - np.repeat(np.cumsum(blocks) - blocks, blocks))
-    return sets, begins, np.minimum(begins + BLOCK, starts[sets + 1])

@@ -6,22 +6,10 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Float32, Float64, Int32, Int64
-from framework.refinement.mixtures.gaussian import (
-    SIMD,
-    constant_exponential,
-    exponentials,
-    log_densities,
-    set_coefficients,
-)
-from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT
+from framework.refinement.mixtures.gaussian import SIMD, constant_exponential, exponentials, log_densities
+from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, Blocks
 
-SHARE_ITERATIONS = 20  # of EM over which side a node's points are on; the error at least halves where sides are clear
-
-
-@njit(cache=True, nogil=True)
-def set_all_coefficients(weights: Float64, means: Float64, covariances: Float64, rows: Float32) -> None:
-    for j in range(len(weights)):
-        set_coefficients(weights[j], means[j], covariances[j], rows[j])
+RATIO_ITERATIONS = 20  # of EM over a node's object ratio; where classes are clear, each halves the error
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -33,7 +21,7 @@ def cut_all(points: Float32, starts: Int64, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
-    """The members of each group lie together in `order`, so that a cut only looks at the group that it cuts."""
+    """Cut one set. The members of each group are together in `order`, so that a cut only reads its own group."""
     n = len(points)
     order, upper = np.arange(n), np.empty(n, np.int64)
     begins, ends = np.zeros(groups, np.int64), np.zeros(groups, np.int64)
@@ -72,7 +60,7 @@ def _cut_one(points: Float32, groups: int, labels: Int32) -> None:
 
 @njit(cache=True, nogil=True)
 def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -> None:
-    """The members' mean and their scatter along each axis."""
+    """Set the members' mean and their scatter along each axis."""
     origin = points[members[0]]  # sums of offsets from a member do not cancel
     count, sums, squares = len(members), np.zeros(3), np.zeros(3)
     for i in members:
@@ -87,7 +75,7 @@ def _measure(points: Float32, members: Int64, mean: Float64, scatter: Float64) -
 
 @njit(cache=True, nogil=True)
 def bounding_boxes(points: Float32, starts: Int64, least_side: float) -> Float64:
-    """(N, 2, 3) the bounding box of each set, with no side below `least_side`."""
+    """Return (N, 2, 3) the bounding box of each set, with sides of at least `least_side`."""
     boxes = np.zeros((len(starts) - 1, 2, 3))
     for k in range(len(starts) - 1):
         for a in range(3):
@@ -101,26 +89,26 @@ def bounding_boxes(points: Float32, starts: Int64, least_side: float) -> Float64
 
 @njit(cache=True, nogil=True, parallel=True)
 def pass_down(
-    points: Float32, log_odds: Float32, nodes: Int64, begins: Int64, ends: Int64, rows: Float32, shares: Float32,
-    firsts: Int64, log_outliers: Float32, above: Float32, child: Int64, share: Float32,
+    points: Float32, log_odds: Float32, blocks: Blocks, rows: Float32, ratios: Float32, firsts: Int64,
+    log_outliers: Float32, outlier_ratios: Float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
-    for b in prange(len(nodes)):
-        q, begin, end = nodes[b], begins[b], ends[b]
-        first, last = firsts[q], firsts[q + 1]
+    for b in prange(len(blocks.sets)):
+        q, own = blocks.sets[b], slice(blocks.begins[b], blocks.ends[b])
+        children = slice(firsts[q], firsts[q + 1])
         _pass_block(
-            points[begin:end], log_odds[begin:end], rows[first:last], shares[first:last], first, log_outliers[q],
-            above[q], child[begin:end], share[begin:end],
+            points[own], log_odds[own], rows[children], ratios[children], firsts[q], log_outliers[q],
+            outlier_ratios[q], child[own], posterior[own],
         )  # fmt: skip
 
 
 @njit(cache=True, nogil=True)
 def _pass_block(
-    points: Float32, log_odds: Float32, rows: Float32, shares: Float32, first: int, log_outlier: np.float32,
-    above: np.float32, child: Int64, share: Float32,
+    points: Float32, log_odds: Float32, rows: Float32, ratios: Float32, first_child: int, log_outlier: np.float32,
+    outlier_ratio: np.float32, child: Int64, posterior: Float32,
 ) -> None:  # fmt: skip
     n, children = len(points), len(rows)
     child[:] = -1
-    share[:] = 0
+    posterior[:] = 0
     if children == 0:
         return
     xyz, densities = np.empty((3, n), np.float32), np.empty((children, n), np.float32)
@@ -132,17 +120,17 @@ def _pass_block(
         log_densities(xyz[0], xyz[1], xyz[2], rows[j], densities[j])
         _take_better(densities[j], np.int32(j), largest, best)
     for i in range(n):
-        child[i] = first + best[i] if best[i] >= 0 else -1
+        child[i] = first_child + best[i] if best[i] >= 0 else -1
     evidence = np.empty(n, np.float32)
     constant_exponential(log_outlier, largest, evidence, n)
     for i in range(n):
-        share[i] = above * evidence[i]
+        posterior[i] = outlier_ratio * evidence[i]
     for j in range(children):
         exponentials(densities[j], largest, evidence, n)
-        _add_scaled(densities[j], shares[j], share)
+        _add_scaled(densities[j], ratios[j], posterior)
     for i in range(n):
-        ours = share[i] * np.exp(log_odds[i])
-        share[i] = ours / (ours + max(evidence[i] - share[i], np.float32(0)))
+        own = posterior[i] * np.exp(log_odds[i])
+        posterior[i] = own / (own + max(evidence[i] - posterior[i], np.float32(0)))
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
@@ -154,25 +142,26 @@ def _take_better(densities: Float32, j: np.int32, largest: Float32, best: Int32)
 
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
-def _add_scaled(densities: Float32, share: np.float32, values: Float32) -> None:
+def _add_scaled(densities: Float32, scale: np.float32, values: Float32) -> None:
     for i in range(len(values)):
-        values[i] += share * densities[i]
+        values[i] += scale * densities[i]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def share_all(log_odds: Float32, starts: Int64, above_points: float, shares: Float32) -> None:
+def set_own_ratios(log_odds: Float32, starts: Int64, above_points: float, ratios: Float32) -> None:
+    """Replace the parents' ratios (M,) by the nodes' own."""
     for j in prange(len(starts) - 1):
         if starts[j + 1] > starts[j]:
-            ratios = np.exp(log_odds[starts[j] : starts[j + 1]])
-            shares[j] = _likeliest_share(ratios, float(shares[j]), above_points)
+            odds = np.exp(log_odds[starts[j] : starts[j + 1]])
+            ratios[j] = _likeliest_ratio(odds, float(ratios[j]), above_points)
 
 
 @njit(cache=True, nogil=True)
-def _likeliest_share(ratios: Float32, above: float, above_points: float) -> float:
-    share = 0.5
-    for _ in range(SHARE_ITERATIONS):
-        ours = above_points * above
-        for ratio in ratios:
-            ours += share * ratio / (share * ratio + 1.0 - share)
-        share = ours / (len(ratios) + above_points)
-    return share
+def _likeliest_ratio(odds: Float32, above: float, above_points: float) -> float:
+    ratio = 0.5
+    for _ in range(RATIO_ITERATIONS):
+        own = above_points * above
+        for odd in odds:
+            own += ratio * odd / (ratio * odd + 1.0 - ratio)
+        ratio = own / (len(odds) + above_points)
+    return ratio

@@ -1,21 +1,21 @@
-"""Convex segments of a depth image: what hangs together without a jump in depth and without a concave crease.
+"""Convex segments of a depth image: connected parts without a jump in depth and without a concave crease.
 
-In the manner of Furrer et al., "Incremental Object Database: Building 3D Models from Multiple Partial Observations",
-IROS 2018, whose segments Voxblox++ (Grinvald et al., "Volumetric Instance-Aware Semantic Mapping and 3D Object
-Discovery", RA-L 2019) builds on, after Tateno, Tombari and Navab, "Real-Time and Scalable Incremental Segmentation on
-Dense SLAM", IROS 2015: normals from depth, edges where depth jumps or the surface is concave, edges closed, connected
-components. Three things differ, all for the sake of crisp borders under a sensor's noise (our choice):
+As in Furrer et al., "Incremental Object Database: Building 3D Models from Multiple Partial Observations", IROS 2018, on
+which Voxblox++ (Grinvald et al., "Volumetric Instance-Aware Semantic Mapping and 3D Object Discovery", RA-L 2019)
+builds, after Tateno, Tombari and Navab, "Real-Time and Scalable Incremental Segmentation on Dense SLAM", IROS 2015:
+normals from depth, edges where depth jumps or the surface is concave, closing, connected components. Three choices of
+ours give sharper borders under sensor noise:
 
-- planes are fitted in inverse depth, of which a plane in space is a linear function, in cells of a few pixels;
-- at a crease each cell takes the plane of a window beside it that does not reach over the crease, as the filter of
-  Kuwahara et al. (1976) does;
-- what the edges left over goes to the segment beside it whose plane foretells its depth best, pixel by pixel.
+- planes are fitted in inverse depth, which is linear on a plane in space, in cells of a few pixels;
+- at a crease, each cell takes the plane of an adjacent window on its own side (the filter of Kuwahara et al. 1976);
+- pixels at edges join the adjacent segment whose plane predicts their depth best.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 
 from framework.data import Bool, Camera, Float32, Int32
@@ -26,28 +26,27 @@ from framework.refinement.segmentation.convexity_kernels import (
     count_edges,
     fit_planes,
     pixel_labels,
-    spread,
     sum_cells,
 )
 
 
 @dataclass(frozen=True)
 class Limits:
-    """Where a surface ends."""
+    """The limits within which a surface is continuous and convex."""
 
     noise_factor: float  # standard deviations of depth that count as noise
-    min_noise: float  # m, least standard deviation of depth, where readings come in coarser steps than the sensor's
-    max_slope: float  # change of depth over the distance across the line of sight, m per m
-    max_angle: float  # rad, by which a surface may bend towards the camera; what noise may bend it by comes on top
+    min_noise: float  # m, smallest standard deviation of depth, for quantized readings
+    max_slope: float  # m per m, change of depth over the distance across the line of sight
+    max_angle: float  # rad, of a concave bend, in addition to that of noise
 
 
 def segments(
     depth: Float32, camera: Camera, *, cell: int, window: int, limits: Limits, closing: int, min_pixels: int
 ) -> tuple[Int32, int]:
-    """(H, W) the segment of each pixel in [0, count), -1 = none; and the count.
+    """Return (H, W) the segment of each pixel in [0, count), -1 = none; and the count.
 
     Planes are fitted to windows of (2 `window` + 1)^2 cells of `cell` x `cell` px. Gaps of edges up to 2 `closing`
-    cells are closed. Segments of fewer than `min_pixels` pixels are given up to those beside them.
+    cells are closed. Segments of fewer than `min_pixels` pixels are merged with their neighbors.
     """
     slope = np.float32(limits.max_slope * cell * 2 / (camera.fx + camera.fy))  # of depth over depth, a cell
     pinhole = np.array(
@@ -62,16 +61,16 @@ def segments(
     labels, count = connected(inverse, _closed(edges, closing), noise, slope, min_cells)
     for _ in range(2 + 2 * closing):  # as wide as edges are
         labels, planes = absorbed(inverse, labels, planes, noise)
-    # poles and legs are edges all over: what no segment took hangs together by depth alone
+    # poles and legs consist of edges: cells without a segment are connected by depth alone
     rest, rest_count = connected(inverse, (labels >= 0) | (inverse <= 0), noise, slope, min_cells)
     labels = np.where(rest >= 0, rest + count, labels)
     return pixel_labels(depth, inverse, labels, planes, cell, noise, slope), int(count + rest_count)
 
 
 def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> float:
-    """Standard deviation (rad) of the angle between two normals fitted 1 m away to `depth_noise` (m); grows as 1 / z.
+    """Return the standard deviation (rad) of the angle between two normals fitted at 1 m to `depth_noise` (m).
 
-    The slope of a line through M readings has the deviation sigma / (sqrt(M) * their root mean square offset).
+    It falls as 1 / z. The slope of a line through M readings has the deviation sigma / (sqrt(M) * rms offset).
     """
     readings = (cell * (2 * window + 1)) ** 2
     offset = cell * np.sqrt(window * (window + 1) / 3) * 2 / (camera.fx + camera.fy)  # m at 1 m
@@ -79,7 +78,6 @@ def normal_sigma(depth_noise: float, window: int, cell: int, camera: Camera) -> 
 
 
 def _closed(edges: Bool, radius: int) -> Bool:
-    """The edges with their gaps closed by a square of 2 `radius` + 1 cells; what lies outside of the image is none."""
-    if radius == 0:
-        return edges
-    return np.asarray(spread(spread(edges, radius, True), radius, False), np.bool_)
+    """Return the edges closed by a square of 2 `radius` + 1 cells."""
+    square = np.ones((2 * radius + 1, 2 * radius + 1), np.uint8)
+    return np.asarray(cv2.morphologyEx(edges.view(np.uint8), cv2.MORPH_CLOSE, square), np.bool_)

@@ -6,35 +6,35 @@ import numpy as np
 from numba import njit, prange
 
 from framework.data import Bool, Float32, Int32
+from framework.refinement.mixtures.gaussian import SIMD
 from framework.refinement.segmentation.union_find import root, unite
 from framework.sensors.noise_models import axial_sigma, axial_sigma_single
 
-SIMD = {"reassoc", "contract", "nsz", "arcp"}  # fast-math flags that allow vector code and leave infinities alone
-FEWEST_CELLS = 6  # that a plane is fitted to: three would fit without telling anything
-LEAST_SPREAD = 0.1  # least determinant of a window's second moments over its square, cells^4: a line has 0
-SWITCH = 1.5  # by how much a window beside a cell must fit better than the one around it
-STRIP = 16  # rows of cells in which pieces are connected in parallel
+FEWEST_CELLS = 6  # that a plane is fitted to; any three fit
+LEAST_SPREAD = 0.1  # cells^4, least determinant of a window's second moments over its square; a line has 0
+SWITCH = 1.5  # factor by which an adjacent window must fit a cell better than the one around it
+STRIP = 16  # rows of cells that are connected in parallel
 
 Noise = tuple[float, float]  # noise_factor and min_noise of the limits, for kernels
 
-_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the fast math of the loop that it stands in
+_axial_sigma = njit(inline="always")(axial_sigma_single.py_func)  # with the caller's fast-math flags
 
 
 @njit(cache=True, nogil=True)
 def _sigma(z: float, min_noise: float) -> float:
-    """Standard deviation (m) of depth z (m)."""
+    """Return the standard deviation (m) of depth z (m)."""
     return float(max(axial_sigma(z), min_noise))
 
 
 @njit(cache=True, nogil=True)
 def _noise_at(inverse: float, noise: Noise) -> np.float32:
-    """By how much inverse depth (1 / m) may be off by noise."""
+    """Return the noise of inverse depth, 1 / m."""
     return np.float32(noise[0] * _sigma(1.0 / inverse, noise[1]) * inverse * inverse)
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def sum_cells(depth: Float32, cell: int, noise: Noise, slope: np.float32) -> Float32:
-    """(rows, columns) mean inverse depth of each cell's nearest surface, 1 / m; 0 = no reading."""
+    """Return (rows, columns) mean inverse depth of each cell's nearest surface, 1 / m; 0 = no reading."""
     height, width = depth.shape
     rows, columns = -(-height // cell), -(-width // cell)
     inverse = np.zeros((rows, columns), np.float32)
@@ -64,7 +64,7 @@ def _add_offset(
     own: Float32, other: Float32, gate: Float32, gate_slope: Float32, x: np.float32, y: np.float32, reach: np.float32,
     sums: Float32,
 ) -> None:  # fmt: skip
-    """Adds the moments of the cells at one offset (x, y) to those of each cell of a row."""
+    """Add the moments of the cells at one offset (x, y) to those of each cell of a row."""
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -86,7 +86,7 @@ def _add_offset(
 
 @njit(cache=True, nogil=True)
 def _gates(inverse: Float32, noise: Noise, slope: np.float32, gate: Float32, gate_slope: Float32) -> None:
-    """How far inverse depth may be off between a row's cells and others: by noise, and a cell's distance apart."""
+    """Set the tolerance of inverse depth at a row's cells: by noise, and per cell of distance."""
     for c in range(len(inverse)):
         d = inverse[c]
         if d > 0:
@@ -96,7 +96,10 @@ def _gates(inverse: Float32, noise: Noise, slope: np.float32, gate: Float32, gat
 
 @njit(cache=True, nogil=True, parallel=True)
 def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
-    """(4, rows, columns) inverse depth a x + b y + c around each cell, and the mean squared residual (inf = no fit)."""
+    """Return (4, rows, columns) a, b, c of inverse depth a x + b y + c around each cell, and its mean squared residual.
+
+    The residual is inf where there is no fit.
+    """
     rows, columns = inverse.shape
     fits = np.zeros((4, rows, columns), np.float32)
     for row in prange(rows):
@@ -108,11 +111,11 @@ def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -
             for dx in range(-window, window + 1):
                 if not 0 <= r + dy < rows or abs(dx) >= columns:
                     continue
-                first, last = max(0, -dx), min(columns, columns - dx)
+                here = slice(max(0, -dx), min(columns, columns - dx))
+                there = slice(max(0, dx), min(columns, columns + dx))
                 _add_offset(
-                    inverse[r, first:last], inverse[r + dy, first + dx : last + dx], gate[first:last],
-                    gate_slope[first:last], np.float32(dx), np.float32(dy), np.float32(np.sqrt(dx * dx + dy * dy)),
-                    sums[:, first:last],
+                    inverse[r, here], inverse[r + dy, there], gate[here], gate_slope[here], np.float32(dx),
+                    np.float32(dy), np.float32(np.sqrt(dx * dx + dy * dy)), sums[:, here],
                 )  # fmt: skip
         _solve(inverse[r], sums, fits[:, r])
     return fits
@@ -120,7 +123,7 @@ def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
-    """Least squares of e = a x + b y + c for each cell of a row, by the centered normal equations."""
+    """Solve the least squares of e = a x + b y + c for each cell of a row, by the centered normal equations."""
     zero, one = np.float32(0), np.float32(1)
     n, sx, sy, sxx, sxy, syy, se, sxe, sye, see = sums
     for c in range(len(own)):
@@ -140,9 +143,9 @@ def _solve(own: Float32, sums: Float32, fit: Float32) -> None:
 
 @njit(cache=True, nogil=True, parallel=True)
 def best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) -> Float32:
-    """(3, rows, columns) a, b, c of the window that fits each cell best, of that around it and the eight beside it.
+    """Return (3, rows, columns) a, b, c of the window that fits each cell best, around it or adjacent to it.
 
-    Where noise alone would misfit as much, the window around the cell stays. c = 0 where no window fits.
+    Within noise, the window around the cell is preferred. c = 0 where no window fits.
     """
     rows, columns = inverse.shape
     planes = fits[:3].copy()
@@ -160,10 +163,11 @@ def best_planes(inverse: Float32, fits: Float32, window: int, min_noise: float) 
             for dx in (0, -window, window):
                 if (dx == 0 and dy == 0) or abs(dx) >= columns:
                     continue
-                first, last = max(0, -dx), min(columns, columns - dx)
+                here = slice(max(0, -dx), min(columns, columns - dx))
+                there = slice(max(0, dx), min(columns, columns + dx))
                 _take_better(
-                    inverse[r, first:last], fits[:, r + dy, first + dx : last + dx], np.float32(dx), np.float32(dy),
-                    variance[first:last], score[first:last], planes[:, r, first:last],
+                    inverse[r, here], fits[:, r + dy, there], np.float32(dx), np.float32(dy), variance[here],
+                    score[here], planes[:, r, here],
                 )  # fmt: skip
     return planes
 
@@ -176,19 +180,19 @@ def _take_better(
     fit_a, fit_b, fit_c, residual = fit
     plane_a, plane_b, plane_c = plane
     for c in range(len(own)):
-        here = fit_c[c] - fit_a[c] * dx - fit_b[c] * dy
-        off = own[c] - here
+        predicted = fit_c[c] - fit_a[c] * dx - fit_b[c] * dy
+        off = own[c] - predicted
         offered = switch * (variance[c] + residual[c] + off * off)
         better = (offered < score[c]) & (own[c] > np.float32(0))
         plane_a[c] = fit_a[c] if better else plane_a[c]
         plane_b[c] = fit_b[c] if better else plane_b[c]
-        plane_c[c] = here if better else plane_c[c]
+        plane_c[c] = predicted if better else plane_c[c]
         score[c] = offered if better else score[c]
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float) -> Bool:
-    """(rows, columns) cells without a plane, and those between two opposite neighbors where the surface ends."""
+    """Return (rows, columns) cells without a plane and cells where the surface ends between opposite neighbors."""
     _, rows, columns = planes.shape
     surface = np.empty((9, rows, columns), np.float32)
     for r in prange(rows):
@@ -202,10 +206,10 @@ def count_edges(planes: Float32, pinhole: Float32, noise: Noise, max_angle: floa
         for dy, dx in ((0, 1), (1, 0), (1, 1), (1, -1)):
             if r - dy < 0 or r + dy >= rows or columns < 3:
                 continue
-            first, last = abs(dx), columns - abs(dx)
+            begin, end = abs(dx), columns - abs(dx)
             _mark_between(
-                surface[:, r - dy, first - dx : last - dx], surface[:, r + dy, first + dx : last + dx],
-                np.float32(4 * np.sqrt(dx * dx + dy * dy) / (pinhole[0] + pinhole[1])), edges[r, first:last],
+                surface[:, r - dy, begin - dx : end - dx], surface[:, r + dy, begin + dx : end + dx],
+                np.float32(4 * np.sqrt(dx * dx + dy * dy) / (pinhole[0] + pinhole[1])), edges[r, begin:end],
             )  # fmt: skip
     return edges
 
@@ -215,8 +219,8 @@ def _set_surface(
     plane: Float32, y: np.float32, pinhole: Float32, noise: Noise, max_angle: float, normal_sigma_1m: float,
     surface: Float32,
 ) -> None:  # fmt: skip
-    """Of a row: unit normals (3) away from the camera, the planes' distances, points (3), what distance to a plane is
-    noise there, and the least cosine between the normals of a surface that does not bend.
+    """Set the surface (9, columns) of a row: unit normals (3) away from the camera, the planes' distances, points (3),
+    noise of the distance to a plane, and least cosine between the normals of a flat surface.
 
     1 / z = A (u - cx) + B (v - cy) + C is the plane (A fx, B fy, C) . p = 1. Without a plane the point is 0.
     """
@@ -227,16 +231,16 @@ def _set_surface(
     k, floor = np.float32(noise[0]), np.float32(noise[1])
     angle, angle_sigma = np.float32(max_angle), np.float32(normal_sigma_1m)
     for c in range(len(d)):
-        there = d[c] > zero
+        valid = d[c] > zero
         x = np.float32(c) - cx
-        z = one / (d[c] if there else one)
-        mx, my, mz = a[c] * fx, b[c] * fy, (d[c] if there else one) - a[c] * x - b[c] * y
+        z = one / (d[c] if valid else one)
+        mx, my, mz = a[c] * fx, b[c] * fy, (d[c] if valid else one) - a[c] * x - b[c] * y
         length = one / np.sqrt(mx * mx + my * my + mz * mz)
         nx[c], ny[c], nz[c], distance[c] = mx * length, my * length, mz * length, length
-        px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if there else zero
+        px[c], py[c], pz[c] = x / fx * z, y / fy * z, z if valid else zero
         sigma = _axial_sigma(z)
         gate[c] = k * (sigma if sigma > floor else floor)
-        # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; an angle beyond it is no crease
+        # cos t = 1 - t^2 / 2 + t^4 / 24, within 0.01 rad up to a right angle; a larger angle is no crease
         t = angle + gate[c] * angle_sigma / z
         t2 = t * t
         min_cosine[c] = one - np.float32(0.5) * t2 + t2 * t2 * np.float32(1 / 24) if t < np.float32(1.5) else zero
@@ -244,16 +248,15 @@ def _set_surface(
 
 @njit(cache=True, nogil=True, fastmath=SIMD)
 def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool) -> None:
-    """Marks cells whose two opposite neighbors are too far off each other's plane, or bend towards the camera.
+    """Mark cells whose two opposite neighbors are too far off each other's plane, or form a concave crease.
 
-    `spacing` is the distance between the two at 1 m. By as much each may lie behind the other's plane, which is how
-    two faces meet at a convex edge; before a step, one of them lies in front.
+    `spacing` is the distance between the two at 1 m. At a convex edge each may be as far behind the other's plane.
     """
     zero = np.float32(0)
     ax, ay, az, ad, apx, apy, apz, gate, min_cosine = one
     bx, by, bz, bd, bpx, bpy, bpz, _, _ = other
     for c in range(len(edges)):
-        # how far the other's point lies in front of one's plane, and the reverse
+        # distance of the other's point in front of one's plane, and the reverse
         h = ad[c] - (ax[c] * bpx[c] + ay[c] * bpy[c] + az[c] * bpz[c])
         g = bd[c] - (bx[c] * apx[c] + by[c] * apy[c] + bz[c] * apz[c])
         cosine = ax[c] * bx[c] + ay[c] * by[c] + az[c] * bz[c]
@@ -265,35 +268,11 @@ def _mark_between(one: Float32, other: Float32, spacing: np.float32, edges: Bool
         edges[c] |= both & (jump | concave)
 
 
-@njit(cache=True, nogil=True)  # as below, too little work to share
-def spread(marked: Bool, radius: int, value: bool) -> Bool:
-    """Cells that have `value` pass it on to all within `radius`."""
-    rows, columns = marked.shape
-    across, both = np.empty_like(marked), np.empty_like(marked)
-    for r in range(rows):
-        across[r] = marked[r]
-        for dx in range(1, min(radius, columns - 1) + 1):
-            _pass_on(marked[r, dx:], value, across[r, :-dx])
-            _pass_on(marked[r, :-dx], value, across[r, dx:])
-    for r in range(rows):
-        both[r] = across[r]
-        for dy in range(-radius, radius + 1):
-            if 0 <= r + dy < rows:
-                _pass_on(across[r + dy], value, both[r])
-    return both
-
-
-@njit(cache=True, nogil=True)
-def _pass_on(source: Bool, value: bool, target: Bool) -> None:
-    for c in range(len(source)):
-        target[c] = (target[c] | source[c]) if value else (target[c] & source[c])
-
-
 @njit(cache=True, nogil=True)
 def _unite_row(
     inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, r: int, upwards: bool, parents: Int32
-) -> None:  # fmt: skip
-    """Unites the cells of row r with those to their left, or above them, where depth does not jump."""
+) -> None:
+    """Unite the cells of row r with those to their left, or above them, where depth does not jump."""
     columns = inverse.shape[1]
     step = columns if upwards else 1
     flat_inverse, flat_edges = inverse.ravel(), edges.ravel()
@@ -308,7 +287,7 @@ def _unite_row(
 
 @njit(cache=True, nogil=True, parallel=True)
 def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, min_cells: int) -> tuple[Int32, int]:
-    """Connected pieces of cells that are no edge: (rows, columns) in [0, count), -1 = edge or too small a piece."""
+    """Return connected pieces of cells that are no edge: (rows, columns) in [0, count), -1 = edge or too small."""
     rows, columns = inverse.shape
     parents = np.arange(rows * columns).astype(np.int32)
     strips = -(-rows // STRIP)
@@ -325,22 +304,22 @@ def connected(inverse: Float32, edges: Bool, noise: Noise, slope: np.float32, mi
     for cell in range(rows * columns):
         if not flat_edges[cell]:
             sizes[root(parents, cell)] += 1
-    numbers, count = np.full(rows * columns, -1, np.int32), 0
+    piece_labels, count = np.full(rows * columns, -1, np.int32), 0
     labels = np.full(rows * columns, -1, np.int32)
     for cell in range(rows * columns):
-        first = root(parents, cell)
-        if flat_edges[cell] or sizes[first] < min_cells:
+        piece = root(parents, cell)
+        if flat_edges[cell] or sizes[piece] < min_cells:
             continue
-        if numbers[first] < 0:
-            numbers[first] = count
+        if piece_labels[piece] < 0:
+            piece_labels[piece] = count
             count += 1
-        labels[cell] = numbers[first]
+        labels[cell] = piece_labels[piece]
     return labels.reshape((rows, columns)), count
 
 
-@njit(cache=True, nogil=True)  # too little work to share: a fifth of a millisecond
+@njit(cache=True, nogil=True)  # too little work for threads
 def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> tuple[Int32, Float32]:
-    """One step of the segments into the cells that have none: to the neighbor whose plane foretells the cell best."""
+    """Grow segments by one cell: free cells join the neighbor whose plane predicts their depth best."""
     rows, columns = inverse.shape
     new_labels, new_planes = labels.copy(), planes.copy()
     for r in range(rows):
@@ -353,23 +332,22 @@ def absorbed(inverse: Float32, labels: Int32, planes: Float32, noise: Noise) -> 
                 s, t = r + dy, c + dx
                 if not (0 <= s < rows and 0 <= t < columns) or labels[s, t] < 0:
                     continue
-                foretold = planes[2, s, t] - planes[0, s, t] * dx - planes[1, s, t] * dy
-                if abs(d - foretold) < least:
-                    least = abs(d - foretold)
+                predicted = planes[2, s, t] - planes[0, s, t] * dx - planes[1, s, t] * dy
+                if abs(d - predicted) < least:
+                    least = abs(d - predicted)
                     new_labels[r, c] = labels[s, t]
                     new_planes[0, r, c], new_planes[1, r, c] = planes[0, s, t], planes[1, s, t]
-                    new_planes[2, r, c] = foretold
+                    new_planes[2, r, c] = predicted
     return new_labels, new_planes
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def pixel_labels(
-    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise,
-    slope: np.float32,
-) -> Int32:  # fmt: skip
-    """(H, W) of the cells nearest to a pixel (its own, and those beside it) the label of the one that foretells it.
+    depth: Float32, inverse: Float32, labels: Int32, planes: Float32, cell: int, noise: Noise, slope: np.float32
+) -> Int32:
+    """Return (H, W) the label of that of the nearest cells whose plane predicts the pixel best.
 
-    What none of their planes foretells takes the label of its own cell, where it lies near that cell's mean.
+    Without a prediction, a pixel near its own cell's mean takes that cell's label.
     """
     height, width = depth.shape
     rows, columns = labels.shape
@@ -384,7 +362,7 @@ def pixel_labels(
             d = inverse[r, c]
             gate = _noise_at(d, noise)
             label = labels[r, c]
-            alone = True  # in the midst of a segment there is nothing to choose
+            alone = True  # inside of a segment there is one label
             for n in range(9):
                 s, t = r + n // 3 - 1, c + n % 3 - 1
                 inside = 0 <= s < rows and 0 <= t < columns
@@ -418,7 +396,7 @@ def pixel_labels(
 
 @njit(cache=True, nogil=True)
 def _plane_of_cell(planes: Float32, inverse: Float32, r: int, c: int, plane: Float32) -> None:
-    """a, b, c of a cell; where no window fits, the plane at its depth."""
+    """Set a, b, c of a cell; without a fit, the plane at its depth."""
     if planes[2, r, c] > 0:
         plane[0], plane[1], plane[2] = planes[0, r, c], planes[1, r, c], planes[2, r, c]
     else:

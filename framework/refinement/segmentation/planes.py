@@ -1,12 +1,11 @@
 """The large planes of a depth image, by region growing on a coarse grid of cells.
 
-The idea of PEAC (Feng, Taguchi and Kamat, "Fast Plane Extraction in Organized Point Clouds Using Agglomerative
-Hierarchical Clustering", ICRA 2014) and CAPE (Proenca and Gao, "Fast Cylinder and Plane Extraction from Depth Cameras
-for Visual Odometry", IROS 2018), with fits in inverse depth. Of a plane n . p = d a camera reads the inverse depth
-q = 1 / z = m . r, where r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d. That is linear in the pixel: a fit is a
-3x3 system, the fit of a union of cells comes from the sum of their moments, and the noise of stereo and
-structured-light sensors, which grows with z^2, is the same everywhere. Open3D's RANSAC finds one plane at a time, by
-chance, in a cloud that has forgotten the image.
+As in PEAC (Feng, Taguchi and Kamat, "Fast Plane Extraction in Organized Point Clouds Using Agglomerative Hierarchical
+Clustering", ICRA 2014) and CAPE (Proenca and Gao, "Fast Cylinder and Plane Extraction from Depth Cameras for Visual
+Odometry", IROS 2018), with fits in inverse depth. At a plane n . p = d the inverse depth is q = 1 / z = m . r, with
+r = ((u - cx) / fx, (v - cy) / fy, 1) and m = n / d. It is linear in the pixel: a fit is a 3x3 system, the moments of a
+union of cells are sums, and the noise of stereo and structured-light sensors, which grows with z^2, is constant.
+Open3D's RANSAC finds one plane at a time, at random, without the image grid.
 """
 
 from __future__ import annotations
@@ -16,13 +15,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from framework.data import Bool, Float64, Frame, UInt8
+from framework.data import Bool, Float64, Frame, PointClusters, UInt8
 from framework.refinement.neighborhood import pinhole
+from framework.refinement.refine_kernels import PART
 from framework.refinement.segmentation.planes_kernels import (
     CELL,
     MAX_PLANES,
     SIGMAS,
     STEP,
+    find_off_planes,
     find_plane_cells,
     label_points,
     sum_moments,
@@ -32,13 +33,13 @@ from framework.refinement.segmentation.planes_kernels import (
 
 @dataclass(frozen=True)
 class Planes:
-    """The K planes found in one frame, in the order in which they were found."""
+    """The K planes of one frame, in the order in which they were found."""
 
     m: Float64  # (K, 3) 1/m, normal over distance: a point p in camera coordinates is on plane k where m . p = 1
-    deviations: Float64  # (K,) 1/m, rms of its readings' inverse depth around it, at most the noise allowed
-    areas: Float64  # (K,) m^2, of what is seen of it
+    deviations: Float64  # (K,) 1/m, rms of its readings' inverse depth around it, at most the allowed noise
+    areas: Float64  # (K,) m^2, visible
     shares: Float64  # (K,) of the frame's readings
-    behind: Float64  # (K,) readings on the far side of it, over readings on it
+    behind: Float64  # (K,) readings behind it over readings on it
 
     def __len__(self) -> int:
         return len(self.m)
@@ -49,17 +50,16 @@ class Planes:
         return np.asarray(-self.m / np.linalg.norm(self.m, axis=1, keepdims=True))
 
     def chosen(self, which: Bool) -> Planes:
-        """The planes where `which` (K,) is True."""
+        """Return the planes where `which` (K,) is True."""
         return Planes(*(values[which] for values in vars(self).values()))
 
 
 def find_planes(frame: Frame, distance: float, noise: float, min_area: float) -> Planes:
-    """The planes of which at least `min_area` m^2 are seen in the frame, a quarter of it in one piece.
+    """Return the planes with a visible area of at least `min_area` m^2, a quarter of it in one piece.
 
-    A cell of 16x16 px belongs to a plane when its readings lie around it with an rms of at most `distance` (m, along
-    the normal) for what is not flat plus `noise` (1/m, of inverse depth, so `noise` * z^2 m at depth z) for the sensor.
-    A plane begins at the flattest cell that is left, grows over neighboring cells and then takes all cells of the frame
-    that lie in it: what stands before a wall does not cut it in two.
+    A cell of 16x16 px belongs to a plane if the rms of its readings is at most `distance` (m, along the normal) plus
+    `noise` (1/m, of inverse depth: `noise` * z^2 m at depth z). A plane begins at the flattest free cell, grows over
+    neighboring cells and then takes all cells of the frame that lie in it, also on both sides of an occluder.
     """
     height, width = frame.camera.shape
     moments = np.zeros(((height + CELL - 1) // CELL, (width + CELL - 1) // CELL, 10))
@@ -76,10 +76,9 @@ def find_planes(frame: Frame, distance: float, noise: float, min_area: float) ->
 
 
 def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
-    """(H, W) 1 + the plane on which each reading lies, 0 = on none; of several the nearest.
+    """Return (H, W) 1 + the nearest plane of each reading, 0 = none.
 
-    A reading is on a plane within `distance` (m, along the normal) and three standard deviations of the noise, which
-    the plane's own readings tell.
+    A reading is on a plane within `distance` (m, along the normal) plus three standard deviations of the plane's noise.
     """
     image = np.zeros(frame.depth.shape, np.uint8)
     if len(planes):
@@ -89,3 +88,16 @@ def plane_image(frame: Frame, planes: Planes, distance: float) -> UInt8:
             (distance * lengths).astype(np.float32), (SIGMAS * planes.deviations).astype(np.float32), image,
         )  # fmt: skip
     return image
+
+
+def off_planes(clusters: PointClusters, on_plane: UInt8, planes: int, max_own: float) -> tuple[Bool, Bool]:
+    """Return (P,) which points stay, and (H, W) which pixels are on a plane and not in a cluster that keeps it.
+
+    `on_plane` is the `plane_image`. A cluster loses the planes of which it has at most `max_own` of the readings.
+    """
+    structure = on_plane > 0
+    rows = len(clusters) + 1  # the last is for points of no cluster
+    counts = np.zeros((-(-len(clusters.cluster) // PART), rows, planes + 1), np.int64)
+    stays = np.ones((rows, planes + 1), np.bool_)
+    kept = find_off_planes(clusters.cluster, clusters.pixels, on_plane, max_own, counts, stays, structure)
+    return kept, structure

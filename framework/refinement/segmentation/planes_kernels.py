@@ -5,23 +5,23 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit, prange
 
-from framework.data import Bool, Float32, Float64, Int64, UInt8
+from framework.data import Bool, Float32, Float64, Int32, Int64, UInt8
+from framework.refinement.refine_kernels import PART
 
-CELL = 16  # px a side: 9 cm at 3 m and 540 px focal length, smaller than what should count as a plane
-STEP = 2  # px between the readings of a cell that are looked at
-FULL = (CELL // STEP) ** 2  # of them in a whole cell
-REFITS = 3  # passes that collect the cells of a plane anew; it hardly moves in the last
-TRIM = 1.5  # times the median deviation of a plane's cells: what lies worse is left out of the fit
-SIGMAS = 3.0  # standard deviations of the noise that a reading may lie off its plane
+CELL = 16  # px, side of a cell: 9 cm at 3 m and 540 px focal length, smaller than a relevant plane
+STEP = 2  # px between the readings of a cell that are used
+FULL = (CELL // STEP) ** 2  # readings in a whole cell
+REFITS = 3  # passes that collect the cells of a plane again; it hardly moves in the last
+TRIM = 1.5  # times the median deviation of a plane's cells; cells above it are excluded from the fit
+SIGMAS = 3.0  # standard deviations of the noise within which a reading is on its plane
 MAX_PLANES = 32  # more than a frame has large ones
 
 
 @njit(cache=True, nogil=True, parallel=True)
 def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
-    """(rows, columns, 10) of each cell: the sums of 1, x, y, x x, x y, y y, q, x q, y q, q q over its readings."""
+    """Set moments (rows, columns, 10): each cell's sums of 1, x, y, x x, x y, y y, q, x q, y q, q q."""
     height, width = depth.shape
     fx, fy, cx, cy = pinhole[0], pinhole[1], pinhole[2], pinhole[3]
     for row in prange(moments.shape[0]):
@@ -49,9 +49,9 @@ def sum_moments(depth: Float32, pinhole: Float32, moments: Float64) -> None:
 
 @njit(cache=True, nogil=True)
 def _solve(moment: Float64, m: Float64) -> bool:
-    """Sets m to the least-squares plane of the readings, by Cramer's rule; False where they do not tell one.
+    """Set m to the least-squares plane of the readings by Cramer's rule; return False if they do not determine it.
 
-    The normal equations are centered: x and y of one cell vary by a hundredth of their size.
+    The normal equations are centered, because x and y of one cell vary by a hundredth of their size.
     """
     n = moment[0]
     if n < 3:
@@ -70,7 +70,7 @@ def _solve(moment: Float64, m: Float64) -> bool:
 
 @njit(cache=True, nogil=True)
 def _deviation(moment: Float64, m: Float64) -> float:
-    """The rms of q - m . r over the readings, 1/m."""
+    """Return the rms of q - m . r over the readings, 1/m."""
     n, sx, sy, sxx, sxy = moment[0], moment[1], moment[2], moment[3], moment[4]
     syy, sq, sxq, syq, sqq = moment[5], moment[6], moment[7], moment[8], moment[9]
     a, b, c = m[0], m[1], m[2]
@@ -86,13 +86,13 @@ def _length(m: Float64) -> float:
 
 @njit(cache=True, nogil=True)
 def _lies_in(moment: Float64, m: Float64, distance: float, noise: float) -> bool:
-    """A point at inverse depth q is |q - m . r| / (|m| q) m off the plane."""
+    """Return whether a cell is on the plane; a point at inverse depth q is |q - m . r| / (|m| q) m off it."""
     return bool(_deviation(moment, m) <= noise + distance * _length(m) * moment[6] / moment[0])
 
 
 @njit(cache=True, nogil=True)
 def _area(moment: Float64, m: Float64, spacing: float) -> float:
-    """m^2 of the plane that the cell's readings stand for: each for spacing^2 z^2 / |n . r| = spacing^2 |m| z^3."""
+    """Return the cell's area on the plane, m^2: a reading covers spacing^2 z^2 / |n . r| = spacing^2 |m| z^3."""
     n = moment[0]
     z = n / moment[6]
     return float(n * spacing * spacing * _length(m) * z * z * z)
@@ -100,7 +100,7 @@ def _area(moment: Float64, m: Float64, spacing: float) -> float:
 
 @njit(cache=True, nogil=True)
 def write_flatness(cells: Float64, distance: float, noise: float, flatness: Float64) -> None:
-    """Writes the deviation of each cell (C, 10) that is full and flat enough to begin a plane."""
+    """Set the deviation of each cell (C, 10) that is full and flat enough to begin a plane."""
     m = np.zeros(3)
     for i in range(len(cells)):
         if 2 * cells[i, 0] >= FULL and _solve(cells[i], m) and _lies_in(cells[i], m, distance, noise):
@@ -112,7 +112,7 @@ def find_plane_cells(
     cells: Float64, columns: int, seeds: Int64, free: Bool, distance: float, noise: float, min_area: float,
     spacing: float, found: Float64,
 ) -> int:  # fmt: skip
-    """Writes m, deviation, area, share and what is behind of each plane; how many there are. `free` is used up."""
+    """Set m, deviation, area, share and behind of each plane; return their number. Clears `free` at their cells."""
     m, total = np.zeros(3), np.zeros(10)
     tried = np.zeros(len(cells), np.bool_)
     readings = 0.0
@@ -131,8 +131,7 @@ def find_plane_cells(
             area += _area(cells[i], m, spacing)
         if 4 * area < min_area:
             continue
-        for a in range(10):
-            total[a] = 0.0
+        total[:] = 0.0
         for _ in range(REFITS):
             _collect(cells, free, m, distance, noise, deviations)
             _refit(cells, deviations, m, total)
@@ -157,14 +156,11 @@ def find_plane_cells(
 def _grow(
     cells: Float64, columns: int, seed: int, free: Bool, distance: float, noise: float, m: Float64, region: Int64
 ) -> int:
-    """Fills `region` with the cells that hang together with the seed in one plane, and m with the plane; their number.
+    """Set `region` to the seed's connected cells in one plane and m to that plane; return the number of cells.
 
-    The plane is fitted again with every cell that comes in.
+    The plane is fitted again with every new cell.
     """
-    seen = np.zeros(len(cells), np.bool_)
-    total = np.zeros(10)
-    for a in range(10):
-        total[a] = cells[seed, a]
+    seen, total = np.zeros(len(cells), np.bool_), cells[seed].copy()
     _solve(total, m)
     region[0], seen[seed] = seed, True
     size, done = 1, 0
@@ -191,7 +187,7 @@ def _grow(
 
 @njit(cache=True, nogil=True)
 def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: float, deviations: Float64) -> None:
-    """Sets the deviation of each free cell that lies in the plane, infinity for all others."""
+    """Set the deviation of each free cell that lies in the plane, infinity for all others."""
     slope = distance * _length(m)
     for i in range(len(cells)):
         deviations[i] = np.inf
@@ -203,9 +199,9 @@ def _collect(cells: Float64, free: Bool, m: Float64, distance: float, noise: flo
 
 @njit(cache=True, nogil=True)
 def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> None:
-    """The plane of the cells that lie best in m, and the sum of their moments: at least half of those that lie in it.
+    """Set m to the plane of its best cells, at least half of them, and `total` to the sum of their moments.
 
-    The others are cells across the line where two planes meet, which would tilt both towards each other.
+    The others are cells across the line where two planes meet, which would tilt the planes towards each other.
     """
     inside, count = np.empty(len(deviations)), 0
     for i in range(len(deviations)):
@@ -223,17 +219,16 @@ def _refit(cells: Float64, deviations: Float64, m: Float64, total: Float64) -> N
             for a in range(10):
                 best[a] += cells[i, a]
     if _solve(best, m):
-        for a in range(10):
-            total[a] = best[a]
+        total[:] = best
 
 
 @njit(cache=True, nogil=True)
 def _order(values: Float64, k: int) -> float:
-    """The k-th smallest value; moves the values (Hoare 1961, "Find"). np.median takes longer to compile."""
-    first, last = 0, len(values) - 1
-    while first < last:
-        pivot = values[(first + last) // 2]
-        i, j = first, last
+    """Return the k-th smallest value; reorders the values (Hoare 1961, "Find"). np.median compiles more slowly."""
+    low, high = 0, len(values) - 1
+    while low < high:
+        pivot = values[(low + high) // 2]
+        i, j = low, high
         while i <= j:
             while values[i] < pivot:
                 i += 1
@@ -243,9 +238,9 @@ def _order(values: Float64, k: int) -> float:
                 values[i], values[j] = values[j], values[i]
                 i, j = i + 1, j - 1
         if k <= j:
-            last = j
+            high = j
         elif k >= i:
-            first = i
+            low = i
         else:
             break
     return float(values[k])
@@ -253,7 +248,7 @@ def _order(values: Float64, k: int) -> float:
 
 @njit(cache=True, nogil=True)
 def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: float) -> float:
-    """Readings of the cells whose mean lies on the far side of the plane, clear of it."""
+    """Return the number of readings in cells whose mean is clearly behind the plane."""
     behind = 0.0
     for i in range(len(cells)):
         n = cells[i, 0]
@@ -267,9 +262,10 @@ def _readings_behind(cells: Float64, m: Float64, deviation: float, distance: flo
 
 @njit(cache=True, nogil=True, parallel=True)
 def label_points(
-    depth: Float32, pinhole: npt.NDArray[np.float32], m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
+    depth: Float32, pinhole: Float32, m: Float32, lengths: Float32, reach: Float32, sigmas: Float32,
     image: UInt8,
 ) -> None:  # fmt: skip
+    """Set image (H, W) to 1 + the nearest plane within reach of each reading."""
     fx, fy, cx, cy = pinhole
     for v in prange(depth.shape[0]):
         y = np.float32(v - cy) / fy
@@ -282,3 +278,57 @@ def label_points(
                 if z > 0 and off <= reach[k] + sigmas[k] * z and off < nearest[u] * lengths[k]:
                     nearest[u] = off / lengths[k]
                     image[v, u] = k + 1
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def find_off_planes(
+    cluster: Int32, pixels: Int32, on_plane: UInt8, max_own: float, counts: Int64, stays: Bool, structure: Bool
+) -> Bool:
+    """Return which points are kept, and clear `structure` at kept points on planes."""
+    labels, kept = np.empty(len(cluster), np.uint8), np.empty(len(cluster), np.bool_)
+    for part in prange(len(counts)):
+        own = slice(part * PART, (part + 1) * PART)
+        _count_on_planes(cluster[own], pixels[own], on_plane, labels[own], counts[part])
+    _judge(counts, on_plane, max_own, stays)
+    for i in prange(len(cluster)):
+        kept[i] = stays[cluster[i], labels[i]]
+        if kept[i] and cluster[i] >= 0 and labels[i] > 0:
+            structure[pixels[i, 1], pixels[i, 0]] = False
+    return kept
+
+
+@njit(cache=True, nogil=True)
+def _judge(counts: Int64, on_plane: UInt8, max_own: float, stays: Bool) -> None:
+    """Set `stays` by cluster, except the last row, and plane, except column 0 for no plane."""
+    parts, rows, columns = counts.shape
+    for label in range(1, columns):
+        most = max_own * _count(on_plane.ravel(), label)
+        for k in range(rows - 1):
+            own = 0
+            for part in range(parts):
+                own += counts[part, k, label]
+            stays[k, label] = own > most
+
+
+@njit(cache=True, nogil=True)
+def _count_on_planes(cluster: Int32, pixels: Int32, on_plane: UInt8, labels: UInt8, counts: Int64) -> None:
+    """Count points by cluster and plane, in runs of equal ones: a counter per point stalls on its own store."""
+    k, label, count = 0, 0, 0
+    for i in range(len(cluster)):
+        labels[i] = on_plane[pixels[i, 1], pixels[i, 0]]
+        if labels[i] != label or cluster[i] != k:
+            counts[k, label] += count
+            k, label, count = cluster[i], labels[i], 0
+        count += 1
+    counts[k, label] += count
+
+
+@njit(cache=True, nogil=True)
+def _count(labels: UInt8, label: int) -> int:
+    wanted, count = np.uint8(label), 0
+    for begin in range(0, len(labels), 128):  # counting bytes in a byte vectorizes best
+        some = np.uint8(0)
+        for found in labels[begin : begin + 128]:
+            some += np.uint8(found == wanted)
+        count += int(some)
+    return count

@@ -1,6 +1,6 @@
-"""Which mask owns which segment of the depth image, and clusters made of what their masks own.
+"""The mask that owns each segment of the depth image, and clusters of the owned segments.
 
-The rule of Voxblox++ (Grinvald et al., RA-L 2019).
+The rule is that of Voxblox++ (Grinvald et al., RA-L 2019).
 """
 
 from __future__ import annotations
@@ -9,31 +9,29 @@ from dataclasses import replace
 
 import numpy as np
 
-from framework.data import Frame, Int32, PointClusters
-from framework.refinement.absolute_orientation import camera_pose, points_at
+from framework.data import Float32, Float64, Frame, Int32, PointClusters
+from framework.errors import DataError
+from framework.geometry import nearest_rotation, transform
+from framework.refinement.refine import keep_points
 from framework.refinement.segmentation.segment_owners_kernels import find_owners, judged
-from framework.refinement.selection import keep_points
+
+LEAST_SPREAD = 0.02  # m, root of the scatter's second eigenvalue; single precision then moves 5 m by under 0.1 mm
+SAMPLE = 4096  # points, evenly spaced; more change the pose by less than single precision does
+TOLERANCE = 1e-3  # m, of a point from its depth reading
 
 
 def owned_segments(
     clusters: PointClusters, frame: Frame, labels: Int32, count: int, min_overlap: float, whole_segments: bool
 ) -> PointClusters:
-    """The clusters without what their masks caught beside their segments; `labels` (H, W) in [0, `count`), -1 = none.
+    """Return the clusters without points outside of their segments; `labels` (H, W) in [0, `count`), -1 = none.
 
-    A segment is the one mask's that covers most of it, if that is more than `min_overlap` of its pixels. With
-    `whole_segments` the clusters get their segments' readings outside of their masks, where the camera's pose is known.
+    A segment belongs to the mask that covers most of it, if that is more than `min_overlap` of its pixels. With
+    `whole_segments` clusters gain their segments' readings outside of their masks, if the camera's pose is determined.
     """
     owners = find_owners(clusters.pixels, clusters.cluster, len(clusters), labels, count, min_overlap)
     kept, missing, missing_owner = judged(clusters.pixels, clusters.cluster, labels, owners)
     refined = keep_points(clusters, kept)
-    return _grown(refined, clusters, frame, missing, missing_owner) if whole_segments else refined
-
-
-def _grown(
-    refined: PointClusters, clusters: PointClusters, frame: Frame, missing: Int32, missing_owner: Int32
-) -> PointClusters:
-    """The refined clusters with the readings at the `missing` pixels, each in its owner's."""
-    T_world_camera = camera_pose(clusters, frame) if len(missing) else None
+    T_world_camera = camera_pose(clusters, frame) if whole_segments and len(missing) else None
     if T_world_camera is None:
         return refined
     added = points_at(missing, frame, T_world_camera)
@@ -43,3 +41,42 @@ def _grown(
         pixels=np.concatenate([refined.pixels, missing]),
         cluster=np.concatenate([refined.cluster, missing_owner]),
     )
+
+
+def camera_pose(clusters: PointClusters, frame: Frame) -> Float64 | None:
+    """Return T_world_camera (4, 4) that moves the readings of `frame` at the clusters' pixels to the clusters' points.
+
+    The least-squares rigid motion (Arun, Huang and Blostein, "Least-Squares Fitting of Two 3-D Point Sets", PAMI 1987).
+    None if there are too few points or all are on one line, where SciPy's align_vectors only warns. Raises DataError if
+    the points are not from the readings of this frame.
+    """
+    step = max(len(clusters.pixels) // SAMPLE, 1)
+    points_world = clusters.points_world[::step].astype(np.float64)
+    points_camera = _readings(clusters.pixels[::step], frame)
+    if len(points_camera) < 3:
+        return None
+    offsets = points_camera - points_camera.mean(axis=0)
+    if np.sqrt(max(np.linalg.eigvalsh(offsets.T @ offsets)[1], 0.0)) < LEAST_SPREAD:
+        return None
+    T_world_camera = np.eye(4)
+    T_world_camera[:3, :3] = nearest_rotation((points_world - points_world.mean(axis=0)).T @ offsets)
+    T_world_camera[:3, 3] = points_world.mean(axis=0) - T_world_camera[:3, :3] @ points_camera.mean(axis=0)
+    farthest = np.linalg.norm(transform(T_world_camera, points_camera) - points_world, axis=1).max()
+    if farthest > TOLERANCE:
+        raise DataError(
+            f"frame {frame.index}: the clusters' points lie up to {farthest:.3g} m off the depth readings at their "
+            f"pixels, expected at most {TOLERANCE:g} m: they must come from this frame"
+        )
+    return T_world_camera
+
+
+def points_at(pixels: Int32, frame: Frame, T_world_camera: Float64) -> Float32:
+    """Return (P, 3) the readings of `frame` at `pixels` (P, 2) (u, v) in the world, in the arithmetic of `lift`."""
+    return np.asarray(transform(T_world_camera, _readings(pixels, frame)), np.float32)
+
+
+def _readings(pixels: Int32, frame: Frame) -> Float64:
+    """Return (P, 3) m, in the camera frame."""
+    camera = frame.camera
+    z = frame.depth[pixels[:, 1], pixels[:, 0]].astype(np.float64)
+    return np.stack([(pixels[:, 0] - camera.cx) / camera.fx * z, (pixels[:, 1] - camera.cy) / camera.fy * z, z], axis=1)

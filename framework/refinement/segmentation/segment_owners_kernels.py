@@ -10,7 +10,7 @@ from framework.data import Bool, Int32
 
 @njit(cache=True, nogil=True)
 def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, count: int, min_overlap: float) -> Int32:
-    """(count,) the cluster with the most pixels in each segment, the first of equals; -1 = none has enough of them."""
+    """Return (count,) the cluster with the most pixels in each segment, of equals the first; -1 = none has enough."""
     sizes, covered = np.zeros(count, np.int64), np.zeros((count, clusters), np.int64)
     for label in labels.ravel():
         if label >= 0:
@@ -29,24 +29,24 @@ def find_owners(pixels: Int32, cluster: Int32, clusters: int, labels: Int32, cou
 
 @njit(cache=True, nogil=True)
 def judged(pixels: Int32, cluster: Int32, labels: Int32, owners: Int32) -> tuple[Bool, Int32, Int32]:
-    """(P,) the points that stay; (A, 2) pixels of owned segments that their owner lacks, and (A,) the owner."""
+    """Return (P,) the points that stay; (A, 2) pixels of segments that their owner lacks, and (A,) that owner."""
     height, width = labels.shape
-    kept, there = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
+    kept, covered = np.ones(len(cluster), np.bool_), np.zeros(labels.shape, np.bool_)
     for i in range(len(cluster)):
         u, v = pixels[i, 0], pixels[i, 1]
         if cluster[i] >= 0:
             kept[i] = labels[v, u] >= 0 and owners[labels[v, u]] == cluster[i]
-            there[v, u] |= kept[i]
+            covered[v, u] |= kept[i]
     count = 0
     for v in range(height):
         for u in range(width):
-            there[v, u] |= labels[v, u] < 0 or owners[labels[v, u]] < 0
-            count += not there[v, u]
+            covered[v, u] |= labels[v, u] < 0 or owners[labels[v, u]] < 0
+            count += not covered[v, u]
     missing, owner = np.empty((count, 2), np.int32), np.empty(count, np.int32)
     count = 0
     for v in range(height):
         for u in range(width):
-            if not there[v, u]:
+            if not covered[v, u]:
                 missing[count, 0], missing[count, 1] = u, v
                 owner[count] = owners[labels[v, u]]
                 count += 1

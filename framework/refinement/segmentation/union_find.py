@@ -1,7 +1,4 @@
-"""Which cells hang together, as a forest: `parents[cell]` is a cell of the same piece, a root its own parent.
-
-SciPy's DisjointSet is a Python object, which kernels cannot call.
-"""
+"""Union-find for kernels: `parents[cell]` is a cell of the same piece, and a root is its own parent."""
 
 from __future__ import annotations
 
@@ -12,7 +9,7 @@ from framework.data import Int32
 
 @njit(cache=True, nogil=True)
 def root(parents: Int32, cell: int) -> int:
-    """The root of the cell's piece; shortens the way to it for the next time."""
+    """Return the root of the cell's piece, with path halving."""
     while parents[cell] != cell:
         parents[cell] = parents[parents[cell]]
         cell = parents[cell]
@@ -21,7 +18,7 @@ def root(parents: Int32, cell: int) -> int:
 
 @njit(cache=True, nogil=True)
 def unite(parents: Int32, a: int, b: int) -> None:
-    """Joins the pieces of two cells. The smaller root stays one: pieces are named after their first cells."""
+    """Join the pieces of two cells. The smaller root remains: a piece is named after its first cell."""
     a, b = root(parents, a), root(parents, b)
     if a < b:
         parents[b] = a

@@ -26,7 +26,7 @@ from framework.figures.refinement_figure import (
 from framework.figures.side_view import SideView, draw_side
 from framework.geometry import exp_se3
 from framework.refinement.lifting import lift
-from framework.refinement.selection import keep_points
+from framework.refinement.refine import keep_points
 from tests.support.scenes.corner_room import CornerRoom, SphereDetector
 
 Masks = list[np.ndarray]

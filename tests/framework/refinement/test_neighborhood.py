@@ -14,7 +14,7 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import ConfigError
 from framework.geometry import back_project
 from framework.refinement.lifting import lift
-from framework.refinement.neighborhood import Neighborhoods, Ring, members, surroundings, thread_shares
+from framework.refinement.neighborhood import Neighborhoods, Ring, members, surroundings, thread_schedule
 from framework.refinement.neighborhood_kernels import grouped
 
 CAMERA = Camera(60, 40, 50.0, 52.0, 29.5, 19.5)
@@ -71,7 +71,7 @@ def test_the_members_of_sorted_clusters_are_found_without_an_index(make):
 def test_threads_share_the_clusters_evenly():
     threads = numba.get_num_threads()
     for costs in ([5, 1, 9, 4, 3, 2], [7], [0, 0, 0], []):
-        order, starts = thread_shares(np.array(costs, np.int64))
+        order, starts = thread_schedule(np.array(costs, np.int64))
         assert sorted(order) == list(range(len(costs)))
         assert len(starts) == threads + 1
         assert (starts[0], starts[-1]) == (0, len(costs))

@@ -11,7 +11,8 @@ from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import DataError
 from framework.interfaces import ClusterRefiner
 from framework.refinement.lifting import lift
-from framework.refinement.refine import refine
+from framework.refinement.refine import keep_points, refine
+from framework.refinement.refine_kernels import PART
 
 CAMERA = Camera(5, 4, 4.0, 4.0, 2.0, 1.5)
 FRAME = Frame(0, 0.0, np.zeros((4, 5, 3), np.uint8), np.ones((4, 5), np.float32), CAMERA)
@@ -56,3 +57,25 @@ def test_a_refiner_may_leave_nothing() -> None:
             return replace(clusters, points_world=nothing, pixels=clusters.pixels[:0], cluster=clusters.cluster[:0])
 
     assert len(refine(Dropping(), whole_image(), FRAME).pixels) == 0
+
+
+@pytest.mark.parametrize("points", [0, 1, PART - 1, PART, PART + 1, 3 * PART + 100])
+@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
+def test_keep_points_is_boolean_indexing(points, share):
+    rng = np.random.default_rng(0)
+    ones = np.ones(3, np.float32)
+    clusters = PointClusters(
+        rng.normal(size=(points, 3)).astype(np.float32),
+        rng.integers(0, 640, (points, 2)).astype(np.int32),
+        rng.integers(-1, 3, points).astype(np.int32),
+        ones[:, None],
+        ones,
+        ("thing",),
+    )
+    kept = rng.random(points) < share
+    left = keep_points(clusters, kept)
+    np.testing.assert_array_equal(left.points_world, clusters.points_world[kept])
+    np.testing.assert_array_equal(left.pixels, clusters.pixels[kept])
+    np.testing.assert_array_equal(left.cluster, clusters.cluster[kept])
+    assert left.scores is clusters.scores
+    assert left.class_probabilities is clusters.class_probabilities

@@ -9,7 +9,7 @@ import pytest
 from framework.data import Frame
 from framework.geometry import exp_se3, inverse
 from framework.tracking.alignment import ModelView, NormalEquations, Weights, linearize, smoothed
-from framework.tracking.pyramid import build_pyramid, model_intensities
+from framework.tracking.pyramid import build_pyramid, intrinsics, model_intensities
 from plugins.trackers.voxel_hashing_icp import _solved
 from tests.support.scenes.analytic_scene import CAMERA, Scene, pose
 
@@ -40,8 +40,7 @@ def step(
     for k, (n, _) in enumerate(scene.planes, start=1):
         normals[surface == k] = gap @ n
     depth = np.where(surface <= len(scene.planes), depth, 0).astype(np.float32)
-    f, c = (np.float32(CAMERA.fx), np.float32(CAMERA.fy)), (np.float32(CAMERA.cx), np.float32(CAMERA.cy))
-    model = ModelView(depth, np.ascontiguousarray(normals.transpose(2, 0, 1)), *f, *c)
+    model = ModelView(depth, np.ascontiguousarray(normals.transpose(2, 0, 1)), *intrinsics(CAMERA))
     model = seen(model)
     view = dataclasses.make_dataclass("Seen", ["color", "depth"])(view_frame.color, depth)
     intensity = model_intensities(view, 3)[level]

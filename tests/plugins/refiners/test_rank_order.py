@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial.distance import cdist
 
 from framework.data import Camera, Frame, PointClusters
 from framework.errors import ConfigError
-from framework.refinement.rank_order_clustering import rank_order_groups
-from plugins.refiners.rank_order import RankOrder
+from plugins.refiners.rank_order import RankOrder, rank_order_groups
 from tests.support.thread_counts import by_one_thread_and_two
 
 CAMERA = Camera(90, 60, 50.0, 50.0, 44.5, 29.5)
@@ -111,3 +111,44 @@ def test_same_with_one_thread_and_two():
 def test_parameters_are_checked(parameters, message):
     with pytest.raises(ConfigError, match=message):
         RankOrder(**parameters)
+
+
+def neighbor_order(points: np.ndarray) -> list[list[int]]:
+    """All points in the order of their distance from each one; itself first, of equally near the first."""
+    distances = ((points[:, None].astype(np.float64) - points[None]) ** 2).sum(axis=-1)
+    np.fill_diagonal(distances, -1)
+    return [sorted(range(len(points)), key=lambda b, row=row: (row[b], b)) for row in distances]
+
+
+def slow_groups(points: np.ndarray, k: int, threshold: float) -> np.ndarray:
+    """The definition, word by word."""
+    order = neighbor_order(points)
+    n = len(points)
+
+    def d(a: int, b: int) -> int:
+        last = min(order[a].index(b), k)
+        return sum(order[b].index(order[a][i]) > k for i in range(1, last + 1))
+
+    linked = np.zeros((n, n), bool)
+    for a in range(n):
+        for b in range(n):
+            smaller = min(order[a].index(b), order[b].index(a))
+            linked[a, b] = 0 < smaller <= k and (d(a, b) + d(b, a)) / smaller <= threshold
+    return np.asarray(connected_components(linked)[1])
+
+
+def same_partition(a: np.ndarray, b: np.ndarray) -> bool:
+    pairs = np.unique(np.stack([a, b]), axis=1).shape[1]
+    return pairs == len(np.unique(a)) == len(np.unique(b))
+
+
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.7, 1.0, 1.5])
+@pytest.mark.parametrize(("points", "k"), [(blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3), (blobs(3, 8), 9)])
+def test_groups_are_those_of_the_definition(points, k, threshold):
+    assert same_partition(rank_order_groups(points, k, threshold), slow_groups(points, k, threshold))
+
+
+def test_the_definition_splits_the_sets_that_are_compared():
+    """Neither one group nor as many as points: the comparison above says something."""
+    for points, k in ((blobs(0, 70), 6), (blobs(1, 50), 9), (blobs(2, 60), 3)):
+        assert 1 < len(np.unique(slow_groups(points, k, 0.5))) < len(points) // 2

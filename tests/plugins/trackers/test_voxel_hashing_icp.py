@@ -301,8 +301,8 @@ def test_less_is_enough_where_the_prediction_leads_once_it_has_been_right_for_a_
 def test_features_are_asked_until_the_prediction_has_been_right_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
     frames = [room().frame(T, k) for k, T in enumerate(walk(40)[: STEADY + 4])]
     tracker, asked = VoxelHashingIcp(finest_scale=1.0), []
-    search = tracker._told_by_features
-    monkeypatch.setattr(tracker, "_told_by_features", lambda seen: asked.append(seen.frame.index) or search(seen))
+    search = tracker._pose_from_features
+    monkeypatch.setattr(tracker, "_pose_from_features", lambda seen: asked.append(seen.frame.index) or search(seen))
     poses, _ = run(tracker, frames)
     assert not any(pose.lost for pose in poses)
     assert asked == list(range(1, STEADY))
@@ -315,7 +315,7 @@ def test_a_pose_that_features_contradict_is_not_trusted(monkeypatch: pytest.Monk
     fuser = assemble(BayesianTsdf, voxel_size=0.02, max_depth=4.0)
     fuser.fuse(frames[0], tracker.track(frames[0], fuser.scene), NOTHING)
     elsewhere = AbsolutePose(walk(1)[0] @ moved(0.3), np.ones(50, np.bool_))
-    monkeypatch.setattr(tracker, "_told_by_features", lambda _: elsewhere)
+    monkeypatch.setattr(tracker, "_pose_from_features", lambda _: elsewhere)
     pose = tracker.track(frames[1], fuser.scene)
     assert pose.lost or np.linalg.norm((inverse(elsewhere.T_world_camera) @ pose.T_world_camera)[:3, 3]) < 0.1
 

@@ -17,7 +17,7 @@ from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, DataError
 from framework.evaluation.trajectory import evaluate
 from framework.geometry import inverse, rotation_angle
-from framework.tracking.keyframes_file import read_keyframes, write_keyframes
+from framework.tracking.keyframes import read_keyframes, write_keyframes
 from tests.support.scenes.corner_room import CornerRoom
 
 pytestmark = pytest.mark.integration

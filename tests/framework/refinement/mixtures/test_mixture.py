@@ -7,6 +7,7 @@ import pytest
 from sklearn.mixture import GaussianMixture
 
 from framework.refinement.mixtures import mixture
+from framework.refinement.mixtures.mixture_kernels import EmSettings, Mixtures
 
 
 def blobs(seed: int, count: int = 3000) -> tuple[np.ndarray, np.ndarray]:
@@ -42,8 +43,7 @@ def test_same_as_scikit_learn(iterations):
     points, labels = np.concatenate([p for p, _ in sets]), np.concatenate([label for _, label in sets])
     starts = np.cumsum([0] + [len(p) for p, _ in sets])
     ours = mixture.fit(
-        points, starts, labels, 4, max_iterations=iterations, tolerance=-np.inf, variance_floor=1e-12,
-        outlier_fraction=0.0,
+        points, starts, labels, 4, EmSettings(iterations, -np.inf, 1e-12, 0.0),
     )  # fmt: skip
     for k, (own_points, own_labels) in enumerate(sets):
         reference = sklearn_from(own_points, own_labels, iterations)
@@ -62,7 +62,7 @@ def test_same_as_scikit_learn(iterations):
 @pytest.mark.parametrize("bound", [0.1, 0.5, 0.9])
 def test_posterior_with_prior_and_outliers_by_hand(bound):
     """One object and one background Gaussian in 1D at -1 and 1, unit covariance, and a uniform density."""
-    ours = mixture.Mixtures(
+    ours = Mixtures(
         weights=np.array([[0.3, 0.6]]),
         means=np.array([[[-1.0, 0, 0], [1.0, 0, 0]]]),
         covariances=np.array([[np.eye(3), np.eye(3)]]),
@@ -90,7 +90,7 @@ def test_who_claims_a_point_is_decided_as_by_the_full_posterior(components):
     """Near the border and far from it: the points that are decided without a sum, and those that are not."""
     rng = np.random.default_rng(components)
     n = components + 2
-    ours = mixture.Mixtures(
+    ours = Mixtures(
         weights=rng.dirichlet(np.ones(n + 1), 2)[:, :n],
         means=rng.normal(0, 0.5, (2, n, 3)),
         covariances=np.tile(0.3**2 * np.eye(3), (2, n, 1, 1)),
@@ -121,14 +121,11 @@ def test_likelihood_never_falls_and_the_stopping_rule_stops():
     points, labels = blobs(5)
     starts = np.array([0, len(points)])
     fits = [
-        mixture.fit(points, starts, labels, 4, max_iterations=i, tolerance=-np.inf, variance_floor=1e-6,
-                    outlier_fraction=0.02)
+        mixture.fit(points, starts, labels, 4, EmSettings(i, -np.inf, 1e-6, 0.02))
         for i in range(1, 20)
     ]  # fmt: skip
     assert (np.diff([fit.log_likelihoods[0] for fit in fits]) > -1e-4).all(), "but for single precision"
-    stopped = mixture.fit(
-        points, starts, labels, 4, max_iterations=1000, tolerance=1e-3, variance_floor=1e-6, outlier_fraction=0.02
-    )
+    stopped = mixture.fit(points, starts, labels, 4, EmSettings(1000, 1e-3, 1e-6, 0.02))
     assert stopped.iterations[0] < 1000
     before = fits[stopped.iterations[0] - 2].log_likelihoods[0]
     assert stopped.log_likelihoods[0] - before < 1e-3
@@ -143,8 +140,7 @@ def test_eigenvalues_are_floored_and_the_others_left():
     axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     points = (plane @ axes[:2] + [0, 0, 2]).astype(np.float32)
     fitted = mixture.fit(
-        points, np.array([0, 5000]), np.zeros(5000, np.int32), 1, max_iterations=1, tolerance=0.0,
-        variance_floor=0.02**2, outlier_fraction=0.0,
+        points, np.array([0, 5000]), np.zeros(5000, np.int32), 1, EmSettings(1, 0.0, 0.02**2, 0.0),
     )  # fmt: skip
     sample = np.linalg.eigvalsh(np.cov(points.T.astype(np.float64), bias=True))
     assert sample[0] < 1e-9
@@ -157,9 +153,7 @@ def test_outliers_go_to_the_uniform_component():
     cluster, noise = rng.normal(0, 0.02, (2000, 3)), rng.uniform(-1, 1, (200, 3))
     points = np.concatenate([cluster, noise]).astype(np.float32)
     starts, labels = np.array([0, 2200]), np.zeros(2200, np.int32)
-    fitted = mixture.fit(
-        points, starts, labels, 1, max_iterations=50, tolerance=1e-6, variance_floor=1e-6, outlier_fraction=0.05
-    )
+    fitted = mixture.fit(points, starts, labels, 1, EmSettings(50, 1e-6, 1e-6, 0.05))
     assert fitted.outlier_weights[0] == pytest.approx(200 / 2200, rel=0.05)
     np.testing.assert_allclose(fitted.covariances[0, 0], 0.02**2 * np.eye(3), atol=1e-4)
     claimed = mixture.likely_members(points, starts[:-1], starts[1:], fitted, own_components=1, min_posterior=0.5)
@@ -170,8 +164,7 @@ def test_outliers_go_to_the_uniform_component():
 def test_sets_too_small_for_a_component():
     points = np.ones((6, 3), np.float32)
     fitted = mixture.fit(
-        points, np.array([0, 0, 2, 6]), np.zeros(6, np.int32), 2, max_iterations=5, tolerance=0.0, variance_floor=1e-4,
-        outlier_fraction=0.0,
+        points, np.array([0, 0, 2, 6]), np.zeros(6, np.int32), 2, EmSettings(5, 0.0, 1e-4, 0.0),
     )  # fmt: skip
     assert fitted.weights.tolist() == [[0, 0], [0, 0], [1, 0]]
     assert np.isfinite(fitted.log_likelihoods).all()
@@ -185,8 +178,8 @@ def test_prior_moves_the_fit():
     points[:, 0] = np.linspace(-1, 1, 200)
     odds = np.where(points[:, 0] < 0, np.log(4), -np.log(4)).astype(np.float32)
     fitted = mixture.fit(
-        points, np.array([0, 200]), (np.arange(200) // 2 % 2).astype(np.int32), 2, max_iterations=1, tolerance=0.0,
-        variance_floor=1e3, outlier_fraction=0.0, prior_log_odds=odds,
+        points, np.array([0, 200]), (np.arange(200) // 2 % 2).astype(np.int32), 2, EmSettings(1, 0.0, 1e3, 0.0),
+        prior_log_odds=odds,
     )  # fmt: skip
     mean = float(np.abs(points[:, 0]).mean())
     np.testing.assert_allclose(fitted.means[0, :, 0], [-0.6 * mean, 0.6 * mean], atol=1e-3)

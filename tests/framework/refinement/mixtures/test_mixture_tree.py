@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from framework.refinement.mixtures import mixture, mixture_tree
-from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT
+from framework.refinement.mixtures.mixture_kernels import MIN_SUPPORT, EmSettings
 from framework.refinement.mixtures.mixture_tree import Level, MixtureTree
 from tests.support.thread_counts import by_one_thread_and_two
 from tests.support.tree_densities import gaussian_densities, leaves, log_likelihoods, owners
@@ -27,9 +27,9 @@ def surface(seed: int, count: int) -> np.ndarray:
 
 
 def grown(points: np.ndarray, starts: np.ndarray, **changed: float) -> MixtureTree:
-    parameters = {"levels": 3, "children": 8, "max_iterations": 8, "tolerance": -np.inf, "variance_floor": FLOOR}
-    parameters |= {"outlier_fraction": 0.02, "min_support": 1e-4, "min_points": 32}
-    return mixture_tree.fit(points, starts, **(parameters | changed))  # type: ignore[arg-type]
+    parameters = {"levels": 3, "children": 8, "max_iterations": 8, "min_support": 1e-4, "min_points": 32} | changed
+    settings = EmSettings(parameters.pop("max_iterations"), -np.inf, FLOOR, 0.02)
+    return mixture_tree.fit(points, starts, settings, **parameters)
 
 
 # The recursion, in the plain words of the paper
@@ -109,8 +109,7 @@ def test_one_level_is_a_flat_mixture():
     points, starts = surface(2, 3000), np.array([0, 1000, 3000])
     tree = grown(points, starts, levels=1, min_support=0.0)
     flat = mixture.fit(
-        points, starts, mixture_tree.cut(points, starts, 8), 8, max_iterations=8, tolerance=-np.inf,
-        variance_floor=FLOOR, outlier_fraction=0.02,
+        points, starts, mixture_tree.cut(points, starts, 8), 8, EmSettings(8, -np.inf, FLOOR, 0.02),
     )  # fmt: skip
     there = flat.weights > 0
     totals = flat.weights.sum(axis=1) + flat.outlier_weights
@@ -119,8 +118,7 @@ def test_one_level_is_a_flat_mixture():
     np.testing.assert_array_equal(tree.levels[0].covariances, flat.covariances[there])
     np.testing.assert_allclose(tree.levels[0].outlier_densities, flat.outlier_densities, rtol=1e-6)
     more = mixture.fit(
-        points, starts, mixture_tree.cut(points, starts, 8), 8, max_iterations=9, tolerance=-np.inf,
-        variance_floor=FLOOR, outlier_fraction=0.02,
+        points, starts, mixture_tree.cut(points, starts, 8), 8, EmSettings(9, -np.inf, FLOOR, 0.02),
     )  # its last E-step, which the log-likelihood is from, sees the parameters of eight  # fmt: skip
     np.testing.assert_allclose(log_likelihoods(tree, points, starts), more.log_likelihoods, atol=1e-4)
 
@@ -180,19 +178,19 @@ def test_points_go_to_their_best_child_and_strays_to_none():
     np.testing.assert_allclose(share, ours / (ours + theirs), atol=1e-5)
 
 
-def test_own_shares_are_the_likeliest():
+def test_own_ratios_are_the_likeliest():
     rng = np.random.default_rng(0)
     odds = rng.normal(0.4, 1.5, 60).astype(np.float32)
     starts = np.array([0, 60, 60, 63, 66])
     odds = np.concatenate([odds, np.full(3, 2.0), np.full(3, -2.0)]).astype(np.float32)
     above = np.array([0.5, 0.7, 0.5, 0.5], np.float32)
-    shares = mixture_tree.own_shares(odds, starts, above, 4.0)
+    shares = mixture_tree.own_ratios(odds, starts, above, 4.0)
     grid = np.linspace(1e-4, 1 - 1e-4, 20001)
     ratios = np.exp(odds[:60].astype(np.float64))[:, None]
     objective = np.log(grid * ratios + 1 - grid).sum(axis=0) + 4 * (0.5 * np.log(grid) + 0.5 * np.log(1 - grid))
     assert shares[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
     assert shares[1] == pytest.approx(0.7), "without points, the parent's"
-    leaning = mixture_tree.own_shares(odds, starts, np.full(4, 0.9, np.float32), 4.0)
+    leaning = mixture_tree.own_ratios(odds, starts, np.full(4, 0.9, np.float32), 4.0)
     objective += 4 * (0.4 * np.log(grid) - 0.4 * np.log(1 - grid))
     assert leaning[0] == pytest.approx(grid[objective.argmax()], abs=2e-3)
     assert shares[2] > 0.6 > 0.4 > shares[3]

@@ -1,4 +1,4 @@
-"""The camera's pose, back from the points that were lifted with it."""
+"""The camera's pose from the points that were lifted with it."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import pytest
 from framework.data import Camera, Detections, Frame, PointClusters, Pose
 from framework.errors import DataError
 from framework.geometry import exp_se3
-from framework.refinement.absolute_orientation import camera_pose, points_at
 from framework.refinement.lifting import lift
+from framework.refinement.segmentation.segment_owners import camera_pose, points_at
 
 CAMERA = Camera(80, 60, 70.0, 72.0, 39.5, 29.5)
 T_WORLD_CAMERA = exp_se3(np.array([0.3, -2.0, 1.0, 0.2, -2.4, 0.1]))
