@@ -1,1 +1,29 @@
-"""Whether a recording can be mapped, and which of its conventions stands in the way."""
+"""Checks of a recording before it is mapped."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum
+
+
+class Verdict(Enum):
+    """Effect of a finding on mapping."""
+
+    FINE = "ok"
+    UNKNOWN = "?"  # the recording does not show it
+    NOTE = "note"  # the recording can be mapped, with worse results
+    FAULT = "WRONG"  # the recording cannot be mapped with these settings
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Result of one check."""
+
+    verdict: Verdict
+    subject: str
+    text: str
+    setting: str = ""  # the fix, KEY=VALUE for the command line; "" = there is no such parameter
+
+    def __str__(self) -> str:
+        line = f"{self.verdict.value:<6} {self.subject}: {self.text}"
+        return f"{line}; set {self.setting}" if self.setting else line

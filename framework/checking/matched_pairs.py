@@ -1,4 +1,4 @@
-"""Pairs of frames that show the same things, and the points that both show: what poses are measured by."""
+"""Pairs of frames with matched points, which measure poses."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ from framework.tracking.absolute_pose import AbsolutePoseEstimator
 from framework.tracking.features import FeatureExtractor, Features, match
 
 MAX_RATIO = 0.8  # of a match's distance to that of the second best (Lowe 2004)
-FEWEST_POINTS = 30  # of a pair that counts
+FEWEST_POINTS = 30  # of a pair
 STEPS = (1, 2, 4, 8, 16, 32)  # frames from the first of a pair to the second
-FARTHEST_APART = 0.25  # of the image's width: a pair whose points move farther is the last from its first frame
+FARTHEST_APART = 0.25  # of the image's width: after a larger motion, larger steps are not tried
 
 
 @dataclass(frozen=True)
 class MatchedPair:
-    """Two frames, and M points that both show, as the images alone tell."""
+    """Two frames and M matched points."""
 
     first: Frame
     second: Frame
-    step: int  # from the one to the other, in frames of the sequence
+    step: int  # frames of the sequence from the first to the second
     points_first: Float32  # (M, 3) m, in the first camera
     pixels_first: Float32  # (M, 2)
     pixels_second: Float32  # (M, 2)
-    T_second_first: Float64  # (4, 4) that the images tell: PnP of these points
+    T_second_first: Float64  # (4, 4), estimated from the points (PnP)
 
     @property
     def motion(self) -> float:
-        """px, how far half of the points move at least."""
+        """The median motion of the points in px."""
         return float(np.median(np.linalg.norm(self.pixels_second - self.pixels_first, axis=1)))
 
 
 class Matcher:
-    """Finds `MatchedPair`s in a sequence; a frame that cannot be read has none."""
+    """Finds `MatchedPair`s in a sequence. Frames that cannot be read are in no pair."""
 
     def __init__(self, sequence: RGBDSequence) -> None:
         self.sequence = sequence
         self._extractor = FeatureExtractor()
         self._estimator = AbsolutePoseEstimator(min_inliers=FEWEST_POINTS)
-        self._seen = lru_cache(maxsize=4 * len(STEPS))(self._look)
+        self._features = lru_cache(maxsize=4 * len(STEPS))(self._extract)
 
     def pairs(self, starts: Sequence[int], steps: Sequence[int] = STEPS) -> Iterator[MatchedPair]:
-        """Pairs from each of the positions `starts`, ever farther apart until they show too little in common."""
+        """Yield the pairs from each position in `starts`, until two frames have too little in common."""
         for k in starts:
             for step in steps:
                 pair = self.pair(k, step)
@@ -60,33 +60,29 @@ class Matcher:
                     break
 
     def pair(self, k: int, step: int) -> MatchedPair | None:
-        """Frames k and k + step of the sequence, None where too few of their points match."""
+        """Return the pair of the frames k and k + step of the sequence, or None if too few points match."""
         if k + step >= len(self.sequence):
             return None
-        first, second = self._seen(k), self._seen(k + step)
-        if first is None or second is None:
+        found_first, found_second = self._features(k), self._features(k + step)
+        if found_first is None or found_second is None:
             return None
-        (frame, features), (other, found) = first, second
-        matches = match(features.descriptors, found.descriptors, MAX_RATIO)
+        (first, features_first), (second, features_second) = found_first, found_second
+        matches = match(features_first.descriptors, features_second.descriptors, MAX_RATIO)
         if len(matches) < FEWEST_POINTS:
             return None
-        pixels_first, pixels_second = features.pixels[matches[:, 0]], found.pixels[matches[:, 1]]
-        points_first = back_project(frame.camera, pixels_first, features.depth[matches[:, 0]])
-        pose = self._estimator.estimate(other.camera, pixels_second, points_first, found.depth[matches[:, 1]])
+        in_first, in_second = matches.T
+        pixels_first, pixels_second = features_first.pixels[in_first], features_second.pixels[in_second]
+        points_first = back_project(first.camera, pixels_first, features_first.depth[in_first])
+        pose = self._estimator.estimate(second.camera, pixels_second, points_first, features_second.depth[in_second])
         if pose is None:
             return None
-        seen = pose.inliers
-        return MatchedPair(
-            frame,
-            other,
-            step,
-            points_first[seen],
-            pixels_first[seen],
-            pixels_second[seen],
-            inverse(pose.T_world_camera),
+        points_first, pixels_first, pixels_second = (
+            array[pose.inliers] for array in (points_first, pixels_first, pixels_second)
         )
+        T_second_first = inverse(pose.T_world_camera)
+        return MatchedPair(first, second, step, points_first, pixels_first, pixels_second, T_second_first)
 
-    def _look(self, k: int) -> tuple[Frame, Features] | None:
+    def _extract(self, k: int) -> tuple[Frame, Features] | None:
         try:
             frame = self.sequence[k]
         except FrameError:

@@ -1,45 +1,44 @@
-"""Whether the poses are those of frames a little later or earlier, and then move points where the images show them.
+"""Detection of poses that belong to frames a little earlier or later.
 
-A camera that moves as it did a moment ago tells nothing: only pairs of frames during which it does otherwise do.
+Only a camera whose motion changes shows a delay: the pairs of frames must differ with other delays.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from framework.checking.finding import Finding, Verdict
+from framework.checking import Finding, Verdict
 from framework.checking.matched_pairs import MatchedPair
 from framework.checking.pose_fit import ALIKE, POOR, SHORTEST_MOTION, PoseFit, error_of, motion_between
 from framework.data import Float64
 
-LONGEST_DELAY = 6  # frames, to either side; one more is tried: an error that still falls there has its least elsewhere
-CLEARLY = 0.75  # times the mean error as it is; other delays of kitchen, flat, desk and ScanNet have 0.88 and more
-TELLS = 1 / 640  # of the image's width: pairs whose errors differ by less do not tell
-MOST = 0.75  # of the pairs that tell must be better
-FEWEST_PAIRS = 5  # that tell
+LONGEST_DELAY = 6  # frames, in both directions; one more is tried: an error that still falls there has no minimum
+CLEARLY = 0.75  # times the mean error without delay, at most; wrong delays of real recordings have 0.88 and more
+TELLS = 1 / 640  # of the image's width: pairs whose errors differ by less are not counted
+MOST = 0.75  # of the counted pairs must improve
+FEWEST_PAIRS = 5  # that are counted
 
 
 @dataclass(frozen=True)
 class PoseDelay:
     """Poses that come late."""
 
-    frames: int  # by how many; negative = early
-    error: float  # px, the mean over the pairs of frames as the poses are
-    delayed_error: float  # px, with those that belong to them
+    frames: int  # delay; negative = early
+    error: float  # px, mean over the pairs with the poses as stored
+    delayed_error: float  # px, with the poses shifted by the delay
     pairs: int
     alike: tuple[int, ...]  # other delays that fit as well
 
     def finding(self, applied: int, step: float) -> Finding:
-        """What it says of a recording that is read with the delay `applied`, whose frames are `step` s apart."""
+        """Return the finding for a recording read with the delay `applied`, with frames `step` seconds apart."""
         count, (when, where) = abs(self.frames), ("late", "later") if self.frames > 0 else ("early", "before")
         frames = f"{count} frame{'s' * (count > 1)}"
         text = (
-            f"they come {frames} {when} ({count * step:.3f} s): in {self.pairs} pairs of frames, points lie "
-            f"{self.error:.1f} px from where they belong on average, and {self.delayed_error:.1f} px by the poses of "
-            f"{frames} {where}"
+            f"they come {frames} {when} ({count * step:.3f} s): in {self.pairs} pairs of frames, points are off by "
+            f"{self.error:.1f} px on average, and by {self.delayed_error:.1f} px with the poses of {frames} {where}"
         )
         if self.alike:
             others = " or ".join(f"dataset.pose_delay={applied + other}" for other in self.alike)
@@ -50,60 +49,52 @@ class PoseDelay:
 def find_delay(
     pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fits: Sequence[PoseFit]
 ) -> PoseDelay | None:
-    """By how much the poses of the pairs are late, read in the best of some ways; None where they are not, plainly.
+    """Return the delay of the pairs' poses in the best of some readings, or None if there is no clear delay.
 
-    `poses` (F) are those of all frames by `Frame.index`, (4, 4) each as it is stored, None = not known.
+    `poses` (F) are the stored poses (4, 4) of all frames by `Frame.index`, None = not known.
     """
+    known = {k: T for k, T in enumerate(poses) if T is not None}
     delays = range(-LONGEST_DELAY - 1, LONGEST_DELAY + 2)
-    telling = [
+    informative = [
         pair
         for pair in pairs
         if pair.motion > SHORTEST_MOTION * pair.first.camera.width
-        and all(_pose(poses, frame.index + d) is not None for frame in (pair.first, pair.second) for d in delays)
+        and all(frame.index + delay in known for frame in (pair.first, pair.second) for delay in delays)
     ]
-    if len(telling) < FEWEST_PAIRS:
+    if len(informative) < FEWEST_PAIRS:
         return None
     errors = np.array(
-        [[_errors(telling, poses, fit, delay) for delay in delays] for fit in fits]
+        [[[_error(pair, known, fit, delay) for pair in informative] for delay in delays] for fit in fits]
     )  # (fits, delays, pairs)
     means = errors.mean(axis=2)
     now, (fit, best) = int(means[:, LONGEST_DELAY + 1].argmin()), np.unravel_index(int(means.argmin()), means.shape)
-    as_it_is, delayed = errors[now, LONGEST_DELAY + 1], errors[fit, best]
-    gains = as_it_is - delayed
-    tells = np.abs(gains) > TELLS * telling[0].first.camera.width
-    motion = float(np.median([pair.motion for pair in telling]))
+    as_stored, shifted = errors[now, LONGEST_DELAY + 1], errors[fit, best]
+    gains = as_stored - shifted
+    counted = np.abs(gains) > TELLS * informative[0].first.camera.width
+    motion = float(np.median([pair.motion for pair in informative]))
     if (
         abs(delays[best]) > LONGEST_DELAY
-        or delayed.mean() > CLEARLY * as_it_is.mean()
-        or tells.sum() < FEWEST_PAIRS
-        or (gains[tells] > 0).mean() < MOST
-        or np.median(delayed) > POOR * motion
+        or shifted.mean() > CLEARLY * as_stored.mean()
+        or counted.sum() < FEWEST_PAIRS
+        or (gains[counted] > 0).mean() < MOST
+        or np.median(shifted) > POOR * motion
     ):
         return None
     alike = np.flatnonzero(means[fit] <= ALIKE * means[fit, best])
     others = tuple(delays[k] for k in alike if k != best)
-    return PoseDelay(delays[best], float(as_it_is.mean()), float(delayed.mean()), len(telling), others)
+    return PoseDelay(delays[best], float(as_stored.mean()), float(shifted.mean()), len(informative), others)
 
 
 def delayed(pair: MatchedPair, poses: Sequence[Float64 | None], delay: int) -> MatchedPair:
-    """The pair with the poses of so many frames later."""
+    """Return the pair with the poses of the frames `delay` later."""
+    stored = dict(enumerate(poses))
     first, second = (
-        replace(frame, T_world_camera=_pose(poses, frame.index + delay)) for frame in (pair.first, pair.second)
+        replace(frame, T_world_camera=stored.get(frame.index + delay)) for frame in (pair.first, pair.second)
     )
     return replace(pair, first=first, second=second)
 
 
-def _pose(poses: Sequence[Float64 | None], k: int) -> Float64 | None:
-    return poses[k] if 0 <= k < len(poses) else None
-
-
-def _errors(pairs: Sequence[MatchedPair], poses: Sequence[Float64 | None], fit: PoseFit, delay: int) -> list[float]:
-    """px, of each pair with the poses of so many frames later, which are known."""
-    errors = []
-    for pair in pairs:
-        T_world_first, T_world_second = poses[pair.first.index + delay], poses[pair.second.index + delay]
-        assert T_world_first is not None
-        assert T_world_second is not None
-        T_second_first = motion_between(T_world_first, T_world_second, fit.reading)
-        errors.append(error_of(pair, T_second_first, fit.depth_factor))
-    return errors
+def _error(pair: MatchedPair, poses: Mapping[int, Float64], fit: PoseFit, delay: int) -> float:
+    """The error of a pair in px with the poses of the frames `delay` later."""
+    T_second_first = motion_between(poses[pair.first.index + delay], poses[pair.second.index + delay], fit.reading)
+    return error_of(pair, T_second_first, fit.depth_factor)

@@ -1,34 +1,40 @@
-"""A folder of colour and depth images: how users bring their own data.
+"""A folder of color and depth images, the format for users' own data.
 
-    camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; metres = value / depth_scale;
+    camera.json         {"width", "height", "fx", "fy", "cx", "cy", "depth_scale"}; meters = value / depth_scale;
                         "distortion": [k1, k2, p1, p2, k3], optional, of the lens of all images: undistorted when read
     color/000000.jpg    JPEG or PNG, 8-bit
-    depth/000000.png    uint16, registered to colour, along z; 0 or 65535 = no reading
-    poses.txt           optional; TUM format, T_world_camera, one line a frame: timestamp tx ty tz qx qy qz qw
-    gravity.txt         optional; x y z, a line a frame: up in its camera, as a sensor told; nan nan nan = not known
+    depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
+    poses.txt           optional; TUM format, T_world_camera, one line per frame: timestamp tx ty tz qx qy qz qw
+    gravity.txt         optional; x y z, a line per frame: up in its camera, from a sensor; nan nan nan = not known
     instance/000000.png, instances.json     optional ground truth: uint16 ids, {"<id>": {"name", "class"}}; class is one
                                             of COCO's names, or null = not known
 
-Files belong together by the number in their names; the numbers may start anywhere and have gaps. Times are no such
-numbers: 1305031102.175304.png is refused. Line k of poses.txt and of gravity.txt (comments and empty lines not counted)
-is the k-th frame in the order of these numbers.
+Files of a frame have the same number in their names. The numbers may start anywhere and have gaps. Names with times,
+such as 1305031102.175304.png, are refused. Line k of poses.txt and gravity.txt, not counting comments and empty lines,
+is the k-th frame in ascending order.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from framework.data import Float64, FrameTruth, Int32, SceneTruth
 from framework.datasets.calibration.camera_json import read_camera, read_json_object
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording, numbered_images
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.datasets.frames.sequence_reader import (
+    FRAME_RATE,
+    Contents,
+    RecordedFrame,
+    Recording,
+    StoredImages,
+    numbered_images,
+)
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import is_there
@@ -39,14 +45,15 @@ from framework.files.tum_trajectory import TumLine, read_tum_lines
 from framework.vocabulary.label_spaces import COCO
 
 LARGEST_ID = 2**16 - 1  # of an instance: its image holds uint16
-MOST_DIGITS = 10  # of an id, zeros in front among them
+MOST_DIGITS = 10  # of an id, with leading zeros
 
+Entry = TypeVar("Entry")
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class RgbdFolder(Recording):
-    """An RGB-D video in a folder of images, with poses and instance ground truth where there are files for them."""
+    """An RGB-D video in a folder of images, with poses and instance ground truth if there are files for them."""
 
     ground_truth_spacing: float = 0.02  # m, spacing of the ground-truth surface points
 
@@ -62,13 +69,13 @@ class RgbdFolder(Recording):
         depth = numbered_images(self.folder / "depth", (".png",))
         _check_same_frames(color, depth)
         self._class_names, self._instances = self._read_instances(color)
-        lines = _read_poses(self.folder / "poses.txt", len(color))
+        lines = _read_optional(self.folder / "poses.txt", read_tum_lines, "poses", len(color))
+        ups = _read_optional(self.folder / "gravity.txt", read_gravity, "directions", len(color))
         self._has_poses = lines is not None
-        ups = _read_gravity(self.folder / "gravity.txt", len(color))
-        frames = [
-            _recorded(StoredImages.of_files(color[number], depth[number]), k, lines[k] if lines else None, ups[k])
-            for k, number in enumerate(color)
-        ]
+        frames = []
+        for k, number in enumerate(color):
+            images = StoredImages.of_files(color[number], depth[number])
+            frames.append(_recorded(images, k, lines[k] if lines else None, ups[k] if ups else None))
         return Contents(camera, path, depth_scale, frames, distortion)
 
     def truth_in(self, index: int) -> FrameTruth | None:
@@ -82,9 +89,9 @@ class RgbdFolder(Recording):
         return FrameTruth(ids, self._class_names)
 
     def scene_truth(self) -> SceneTruth | None:
-        """The chosen frames' depth, fused with its instance ids; None without instances or poses.
+        """Return the fused depth and instance ids of the selected frames, None without instances or poses.
 
-        Frames that cannot be read are left out. The points are as exact as the depth images.
+        Frames that cannot be read are skipped. The points are as exact as the depth images.
         """
         if not self._instances or not self._has_poses:
             return None
@@ -104,7 +111,7 @@ class RgbdFolder(Recording):
                 yield LabeledDepth(depth, truth.instance_ids, self.camera, recorded.T_world_camera)
 
     def _read_instances(self, color: dict[int, Path]) -> tuple[dict[int, str | None], list[Path]]:
-        """The class of each instance, and each frame's image of instances; nothing where nobody labelled them."""
+        """The class of each instance, and each frame's image of instances; empty without labels."""
         folder, names = self.folder / "instance", self.folder / "instances.json"
         if not is_there(folder) and not is_there(names):
             return {}, []
@@ -130,7 +137,7 @@ def _check_file(path: Path) -> None:
 
 
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
-    """Raises DataError, naming the first frame that has no partner, unless both hold the same frame numbers."""
+    """Raise DataError, with the first frame that has no partner, unless both have the same frame numbers."""
     unmatched = sorted(color.keys() ^ other.keys())
     if not unmatched:
         return
@@ -143,27 +150,15 @@ def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
     )
 
 
-def _read_poses(path: Path, frames: int) -> list[TumLine] | None:
-    """Each frame's line, which may be no pose; None without the file."""
+def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, frames: int) -> list[Entry] | None:
+    """The entry of each frame, None without the file."""
     if not is_there(path):
         return None
-    poses = read_tum_lines(path)
-    _check_count(path, len(poses), "poses", frames)
-    return poses
-
-
-def _read_gravity(path: Path, frames: int) -> list[Float64 | None]:
-    """Which way is up in each frame; None of all without the file."""
-    if not is_there(path):
-        return [None] * frames
-    ups = read_gravity(path)
-    _check_count(path, len(ups), "directions", frames)
-    return ups
-
-
-def _check_count(path: Path, count: int, what: str, frames: int) -> None:
-    if count != frames:
-        raise DataError(f"{path} holds {count} {what}, but color/ holds {frames} frames: one line a frame is needed")
+    entries = read(path)
+    if len(entries) != frames:
+        found = f"{path} holds {len(entries)} {name}, but color/ holds {frames} frames"
+        raise DataError(f"{found}: one line a frame is needed")
+    return entries
 
 
 def _read_class_names(path: Path) -> dict[int, str | None]:
@@ -180,9 +175,8 @@ def _read_class_names(path: Path) -> dict[int, str | None]:
 
 def _class_of(where: str, entry: Any) -> str | None:
     if not isinstance(entry, dict) or "class" not in entry:
-        raise DataError(
-            f'{where} must be {{"name": ..., "class": name or null}}, where null means not known, found {entry!r:.60}'
-        )
+        expected = '{"name": ..., "class": name or null}, where null means not known'
+        raise DataError(f"{where} must be {expected}, found {entry!r:.60}")
     name = entry["class"]
     if name is None or (isinstance(name, str) and name in COCO):
         return name

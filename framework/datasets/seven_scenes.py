@@ -1,11 +1,11 @@
 """7-Scenes (Shotton et al., CVPR 2013): handheld Kinect videos of seven places, with KinectFusion's poses.
 
-    chess/seq-01/frame-000000.color.png     8-bit colour
+    chess/seq-01/frame-000000.color.png     8-bit color
     chess/seq-01/frame-000000.depth.png     uint16, mm along z; 0 or 65535 = no reading
     chess/seq-01/frame-000000.pose.txt      T_world_depthcamera, four lines of four numbers, m
 
-Colour and depth are published unregistered and without calibration between the two cameras, of which only the depth
-camera's intrinsics are given. Without registration, masks miss their objects by 30 px and more.
+Color and depth are published unregistered, with the intrinsics of the depth camera only. Without registration, masks
+are off by 30 px and more.
 """
 
 from __future__ import annotations
@@ -17,33 +17,31 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera, Float64, UInt16
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, Recording
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
 from framework.datasets.seven_scenes_kernels import register_depth
 from framework.errors import DataError
 from framework.files.matrix_file import read_matrix
 
-DEPTH_SCALE = 1000.0  # units a metre
+DEPTH_SCALE = 1000.0  # units per meter
 DEPTH_CAMERA = Camera(640, 480, 585.0, 585.0, 320.0, 240.0)  # as published
-# Not published: fitted to 50 frames of redkitchen, outlines in depth against edges in colour. The cameras are taken as
-# parallel, 25 mm apart as a Kinect's are; a free fit of the offset gains nothing.
+# Not published: fitted to 50 frames of redkitchen, depth edges against color edges. The cameras are taken as parallel
+# and 25 mm apart as in a Kinect; a free fit of the offset is not better.
 COLOR_CAMERA = Camera(640, 480, 529.0, 529.0, 320.0, 239.0)
-BASELINE = 0.025  # m; the colour camera stands this far along the depth camera's x axis
+BASELINE = 0.025  # m from the depth to the color camera along the depth camera's x axis
 _IMAGE_NAME = re.compile(r"frame-([0-9]{6})\.(color|depth)\.png")
 
 
 @dataclass
 class SevenScenes(Recording):
-    """A sequence of 7-Scenes, depth and poses moved into the colour camera.
+    """A sequence of 7-Scenes, with depth and poses registered to the color camera.
 
-    Lens distortion is ignored, and colour and depth are taken as simultaneous.
+    Lens distortion and the time between color and depth are ignored.
     """
 
     def open(self) -> Contents:
         self.name = f"{self.folder.resolve().parent.name}-{self.name}"
-        numbers = sorted(
-            {int(match[1]) for path in self.folder.iterdir() if (match := _IMAGE_NAME.fullmatch(path.name))}
-        )
+        names = (_IMAGE_NAME.fullmatch(path.name) for path in self.folder.iterdir())
+        numbers = sorted({int(match[1]) for match in names if match})
         if not numbers:
             raise DataError(f"{self.folder} holds no frame-000000.color.png; dataset.scene is like chess/seq-01")
         frames = [_recorded(self.folder, number) for number in numbers]
@@ -58,28 +56,22 @@ def _recorded(folder: Path, number: int) -> RecordedFrame:
 
 
 def _color_pose(path: Path) -> Float64:
-    """T_world_camera (4, 4) of the colour camera. Raises DataError, naming the file, when it holds no pose."""
+    """T_world_camera (4, 4) of the color camera. Raises DataError, with the file, if it is not valid."""
     T_depthcamera_camera = np.eye(4)
     T_depthcamera_camera[0, 3] = BASELINE
     return read_matrix(path).pose() @ T_depthcamera_camera
 
 
 def register(raw: UInt16) -> UInt16:
-    """The depth camera's readings (H, W) mm as the colour camera sees them, the nearest one in each pixel.
+    """Return depth (H, W) of the color camera in mm, the nearest reading in each pixel.
 
-    An image of another size is returned as it is, so that the reader rejects its size. The colour camera sees more than
+    An image of another size is returned unchanged, so that the reader rejects its size. The color camera sees more than
     the depth camera: the border has no reading, and the image shrinks without holes.
     """
     if raw.shape != DEPTH_CAMERA.shape:
         return raw
     registered = np.zeros(COLOR_CAMERA.shape, np.uint16)
     ratio = COLOR_CAMERA.fx / DEPTH_CAMERA.fx
-    register_depth(
-        raw,
-        ratio,
-        COLOR_CAMERA.cx - ratio * DEPTH_CAMERA.cx,
-        COLOR_CAMERA.cy - ratio * DEPTH_CAMERA.cy,
-        BASELINE * DEPTH_SCALE * COLOR_CAMERA.fx,
-        registered,
-    )
+    u_0, v_0 = COLOR_CAMERA.cx - ratio * DEPTH_CAMERA.cx, COLOR_CAMERA.cy - ratio * DEPTH_CAMERA.cy
+    register_depth(raw, ratio, u_0, v_0, BASELINE * DEPTH_SCALE * COLOR_CAMERA.fx, registered)
     return registered

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from framework.checking.finding import Verdict
+from framework.checking import Verdict
 from framework.checking.matched_pairs import MatchedPair
 from framework.checking.pose_fit import PoseFit, PoseJudgement, motion_of
 from framework.checking.recording_check import RecordingCheck

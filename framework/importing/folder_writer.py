@@ -1,4 +1,4 @@
-"""Writes a source as an RGB-D folder, which `dataset=rgbd_folder` reads."""
+"""Writes a source as an RGB-D folder for `dataset=rgbd_folder`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from tqdm import tqdm
 
 from framework.config.validation import require
-from framework.data import MOST_PIXELS, Array, Camera, Float32, Float64, UInt16
+from framework.data import MOST_PIXELS, Array, Camera, Float64
 from framework.datasets.calibration.camera_json import DISTORTION
 from framework.datasets.calibration.color_registration import ColorRegistration
 from framework.errors import DataError
@@ -20,23 +20,23 @@ from framework.files.atomic_write import written_whole
 from framework.files.gravity_file import write_gravity
 from framework.files.json_file import write_json
 from framework.files.tum_trajectory import write_tum
-from framework.importing.depth.depth_upsampling import upsampled
+from framework.importing.depth_resampling import upsampled
 from framework.importing.phones.image_rotation import QUARTER, Turn
-from framework.importing.source import SURE, UNSURE, DeviceFrame, Source, StoredFrame
+from framework.importing.source import SURE, UNSURE, DeviceFrame, Source
 
-DEPTH_SCALE = 1000.0  # units a metre
-LONGER_SIDE = 640  # px, of the images that are written by default: what trackers and detectors are tuned for
-JPEG_QUALITY = 95  # in percent
+DEPTH_SCALE = 1000.0  # units per meter
+LONGER_SIDE = 640  # px, of the written images by default, as trackers and detectors are tuned for
+JPEG_QUALITY = 95  # percent
 
 
 @dataclass(frozen=True)
 class Writing:
-    """How much of a source is written."""
+    """Options of the written folder."""
 
-    width: int = 0  # px, of the images before they are turned, at most as stored; 0 = the longer side gets LONGER_SIDE
-    stride: int = 1  # every so many-th frame
-    confidence: int = 1  # 0, 1 or 2: depth of a lower one is left out, where the source tells it
-    turn: int = 0  # degrees clockwise, 0, 90, 180 or 270, of the images that are written
+    width: int = 0  # px, of the images before rotation, at most as stored; 0 = the longer side gets LONGER_SIDE
+    stride: int = 1  # use every stride-th frame
+    confidence: int = 1  # 0, 1 or 2: depth of a lower confidence is dropped, where it is known
+    turn: int = 0  # degrees clockwise, 0, 90, 180 or 270, of the written images
 
     def __post_init__(self) -> None:
         require(0 <= self.width <= MOST_PIXELS, "--width", self.width, f"0 or positive and at most {MOST_PIXELS} px")
@@ -46,31 +46,31 @@ class Writing:
 
     @property
     def turned(self) -> Turn:
-        """How the images are turned."""
+        """The rotation of the images."""
         return Turn(self.turn // QUARTER)
 
     def camera(self, stored: Camera) -> Camera:
-        """That of the images which are written, before they are turned."""
+        """Return the camera of the written images before rotation."""
         factor = self.width / stored.width if self.width else LONGER_SIDE / max(stored.width, stored.height)
         return stored.scaled(min(1.0, factor))
 
 
 @dataclass
 class Written:
-    """What became of a source's frames."""
+    """The frames of a source after writing."""
 
-    timestamps: list[float] = field(default_factory=list)  # s, of the frames that were written
+    timestamps: list[float] = field(default_factory=list)  # s, of the written frames
     poses: list[Float64] = field(default_factory=list)  # T_world_camera (4, 4) of them, none without poses
-    faults: list[str] = field(default_factory=list)  # of each frame that was left out
-    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera of each as it was stored
+    faults: list[str] = field(default_factory=list)  # of each skipped frame
+    ups: list[Float64 | None] = field(default_factory=list)  # (3,) up in the camera of each before rotation
 
     def __str__(self) -> str:
-        said = f"{len(self.timestamps)} frames"
-        return f"{said}; left out are {len(self.faults)}, the first: {self.faults[0]}" if self.faults else said
+        count = f"{len(self.timestamps)} frames"
+        return f"{count}; left out are {len(self.faults)}, the first: {self.faults[0]}" if self.faults else count
 
 
 def check_new(directory: Path) -> None:
-    """Raises DataError unless nothing is there, or an empty folder."""
+    """Raise DataError unless the directory is missing or empty."""
     if directory.is_dir() and not any(directory.iterdir()):
         return
     if directory.exists() or directory.is_symlink():
@@ -78,25 +78,29 @@ def check_new(directory: Path) -> None:
 
 
 def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
-    """Writes the frames, then their poses, up and the camera: a folder without camera.json is not finished.
+    """Write the frames, then their poses and up directions, and camera.json last.
 
-    A frame that cannot be used is left out. Raises DataError when `directory` holds something, none can be used, or the
-    disk does not take a file.
+    Frames that cannot be used are skipped. Raises DataError if `directory` is not empty, no frame can be used, or a
+    file cannot be written.
     """
     check_new(directory)
     written = Written()
     turn = writing.turned
-    camera = None  # phones focus anew from frame to frame: all frames are brought to the first one's
+    camera = None  # the focal length of phones varies: all frames are resampled to the first one's
     for number, frame in _frames(source, writing.stride, written):
         if camera is None:
             camera = writing.camera(frame.camera)
             for name in ("color", "depth"):
                 (directory / name).mkdir(parents=True, exist_ok=True)
         color = ColorRegistration(frame.camera, camera).apply(frame.color)
-        depth = upsampled(_sure(frame, writing.confidence), frame.color, frame.camera, camera, color)
+        sure = frame.depth
+        if frame.confidence is not None:
+            sure = np.where(frame.confidence >= writing.confidence, frame.depth, np.float32(0))
+        units = np.rint(upsampled(sure, frame.color, frame.camera, camera, color) * DEPTH_SCALE)
+        depth = np.where(units < np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
         bgr = cv2.cvtColor(turn.image(color), cv2.COLOR_RGB2BGR)
         _write_image(directory / f"color/{number:06d}.jpg", bgr, cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-        _write_image(directory / f"depth/{number:06d}.png", _stored(turn.image(depth)), cv2.IMWRITE_PNG_COMPRESSION, 1)
+        _write_image(directory / f"depth/{number:06d}.png", turn.image(depth), cv2.IMWRITE_PNG_COMPRESSION, 1)
         written.timestamps.append(frame.timestamp)
         if frame.T_world_camera is not None:
             written.poses.append(turn.pose(frame.T_world_camera))
@@ -114,33 +118,19 @@ def write_folder(source: Source, directory: Path, writing: Writing) -> Written:
 
 
 def _frames(source: Source, stride: int, written: Written) -> Iterator[tuple[int, DeviceFrame]]:
-    """Number and content of each chosen frame that can be used; the faults of the others go to `written`."""
+    """The number and content of each usable frame; the errors of the others go to `written`."""
     chosen = islice(enumerate(source.frames), 0, None, stride)
     for number, stored in tqdm(chosen, total=-(-source.count // stride), unit=" frames", disable=None):
         try:
-            yield number, _checked(stored, source.posed, written.timestamps[-1:])
+            frame = stored()
+            if source.posed and frame.T_world_camera is None:
+                raise DataError(f"{frame.name} has no pose")
+            if written.timestamps and frame.timestamp <= written.timestamps[-1]:
+                raise DataError(f"{frame.name} is of {frame.timestamp:.6f} s, not later than the frame before")
         except DataError as error:
             written.faults.append(str(error))
-
-
-def _checked(stored: StoredFrame, posed: bool, before: list[float]) -> DeviceFrame:
-    frame = stored()
-    if posed and frame.T_world_camera is None:
-        raise DataError(f"{frame.name} has no pose")
-    if before and frame.timestamp <= before[0]:
-        raise DataError(f"{frame.name} is of {frame.timestamp:.6f} s, not later than the frame before")
-    return frame
-
-
-def _sure(frame: DeviceFrame, least: int) -> Float32:
-    if frame.confidence is None:
-        return frame.depth
-    return np.where(frame.confidence >= least, frame.depth, np.float32(0))
-
-
-def _stored(depth: Float32) -> UInt16:
-    units = np.rint(depth * DEPTH_SCALE)
-    return np.where(units < np.iinfo(np.uint16).max, units, 0).astype(np.uint16)
+        else:
+            yield number, frame
 
 
 def _write_image(path: Path, image: Array, *parameters: int) -> None:

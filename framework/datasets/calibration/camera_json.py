@@ -1,4 +1,4 @@
-"""Numbers and cameras in JSON files, whose keys each format names in its own way."""
+"""Cameras and numbers in JSON files, with the keys of each format."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ log = logging.getLogger(__name__)
 
 
 class StoredCamera(NamedTuple):
-    """The camera of a recording, as its file gives it."""
+    """The camera of a recording."""
 
     camera: Camera
     depth_scale: float  # units per meter
@@ -32,7 +32,7 @@ class StoredCamera(NamedTuple):
 
 
 def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
-    """The JSON object that a file of at most so many bytes holds. Raises DataError, naming it, when it holds none."""
+    """Return the JSON object in a file of at most `most` bytes. Raises DataError, with the file."""
     found = read_json(path, most)
     if not isinstance(found, dict):
         raise DataError(f"{path} must hold a JSON object, found {type(found).__name__}")
@@ -40,29 +40,28 @@ def read_json_object(path: Path, most: int = MOST_TEXT) -> dict[str, Any]:
 
 
 def read_camera(path: Path) -> StoredCamera:
-    """The camera of a camera.json. Raises DataError, naming the file and the key."""
+    """Return the camera in a camera.json. Raises DataError, with the file and the key."""
     content = read_json_object(path)
     check_keys(path, content, (*CAMERA_KEYS, DISTORTION))
     return StoredCamera(*camera_of(path, content, CAMERA_KEYS), distortion_of(path, content))
 
 
 def camera_of(path: Path, content: Mapping[str, Any], keys: Sequence[str]) -> tuple[Camera, float]:
-    """The camera and the depth scale (units per meter) that `content` of the file `path` gives.
+    """Return the camera and the depth scale (units per meter) under `keys`, in the order of CAMERA_KEYS.
 
-    `keys` are the names of width, height, fx, fy, cx, cy and of the depth scale. Raises DataError, naming the file and
-    the key.
+    Raises DataError, with the file and the key.
     """
     *camera, depth_scale = numbers_of(path, content, *keys)
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
         raise DataError(
-            f"{path}: {keys[-1]} must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], as metres = value / {keys[-1]} "
-            f"(1000 for millimetres), found {depth_scale:g}"
+            f"{path}: {keys[-1]} must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], as meters = value / {keys[-1]} "
+            f"(1000 for millimeters), found {depth_scale:g}"
         )
     return pinhole(path, *camera), depth_scale
 
 
 def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float, cx: float, cy: float) -> Camera:
-    """The camera with these numbers. Raises DataError, naming `where`, if there is no such camera."""
+    """Return the camera with these numbers. Raises DataError, with `where`, if they are not valid."""
     if width != int(width) or height != int(height):
         raise DataError(f"{where}: width and height must be whole numbers of pixels, found {width}x{height}")
     with errors_of(where):
@@ -70,10 +69,7 @@ def pinhole(where: Path | str, width: float, height: float, fx: float, fy: float
 
 
 def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> None:
-    """Says in the log which keys of `content` of the file `path` are not read, as they are none of the `known`.
-
-    Raises DataError for one that is nearly a known one: a misspelt lens distortion would be left out without a word.
-    """
+    """Log the keys that are not `known`. Raises DataError for one that is nearly known: it is misspelled."""
     unread = [key for key in content if key not in known]
     for key in unread:
         close = get_close_matches(key.lower(), known, n=1, cutoff=0.8)
@@ -84,14 +80,14 @@ def check_keys(path: Path, content: Mapping[str, Any], known: Sequence[str]) -> 
 
 
 def number_list(where: Path | str, values: Any, count: int) -> list[float]:
-    """A list of so many finite numbers. Raises DataError, naming `where`, if `values` is none."""
+    """Return `values` as a list of `count` finite numbers. Raises DataError, with `where`."""
     if not isinstance(values, list) or len(values) != count or not all(map(_is_number, values)):
         raise DataError(f"{where} must be a list of {count} numbers, found {str(values)[:60]}")
     return [float(value) for value in values]
 
 
 def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> list[float]:
-    """The finite numbers under some keys. Raises DataError, naming `where` and the key."""
+    """Return the finite numbers under some keys. Raises DataError, with `where` and the key."""
     for key in keys:
         if key not in content:
             raise DataError(f"{where}: the key {key!r} is missing")
@@ -101,7 +97,7 @@ def numbers_of(where: Path | str, content: Mapping[str, Any], *keys: str) -> lis
 
 
 def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
-    """The lens distortion that `content` of the file `path` gives, None without one. Raises DataError."""
+    """Return the lens distortion in the content of a file, or None without one. Raises DataError."""
     if DISTORTION not in content:
         return None
     values = content[DISTORTION]

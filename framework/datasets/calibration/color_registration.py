@@ -1,4 +1,4 @@
-"""Colour images moved into the depth camera, where both look from one place and differ in size and intrinsics only."""
+"""Registration of color to a depth camera at the same place, with another size and other intrinsics."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from framework.data import MOST_PIXELS, Camera, UInt8
-from framework.datasets.frames.stored_frames import StoredImages
+from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
 
 LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp
@@ -17,7 +17,7 @@ LONGEST_SIDE = 2**15 - 2  # px, that OpenCV can warp
 
 @dataclass(frozen=True)
 class ColorRegistration:
-    """Where the colour of a pixel of the depth camera comes from. Raises DataError where that would be too large."""
+    """Warp from the color to the depth camera. Raises DataError if it would be too large."""
 
     color: Camera
     depth: Camera
@@ -26,24 +26,23 @@ class ColorRegistration:
         width, height = self._fine * self.depth.width, self._fine * self.depth.height
         if width * height > MOST_PIXELS or max(width, height, *self.color.shape) > LONGEST_SIDE:
             raise DataError(
-                f"colour of {self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px cannot be moved "
+                f"color of {self.color.width}x{self.color.height} px and fx = {self.color.fx:g} px cannot be moved "
                 f"into a depth camera of {self.depth.width}x{self.depth.height} px and fx = {self.depth.fx:g} px"
             )
 
     @property
     def _fine(self) -> int:
-        """How many of the colour camera's pixels lie along a pixel of the depth camera, rounded."""
+        """Pixels of the color camera along a pixel of the depth camera, rounded."""
         return max(1, round(min(self.color.fx / self.depth.fx, LONGEST_SIDE)))
 
     def apply(self, image: UInt8) -> UInt8:
-        """The depth camera's colours (H, W, 3) from an image of the colour camera.
+        """Return the depth camera's colors (H, W, 3) from an image of the color camera.
 
-        A pixel takes the mean of what it covers: the image is first resampled (bilinear) at about its own resolution,
-        `fine` times the depth camera's, then averaged over fine x fine. What the colour camera does not see repeats
-        the nearest colour that it sees.
+        A pixel is the mean of its area: the image is resampled (bilinear) at `fine` times the depth camera's
+        resolution, then averaged over fine x fine. Outside the color image, the nearest color is repeated.
         """
         fine = self._fine
-        # pixel i of the fine image has its centre at (i + 1/2) / fine - 1/2 in the depth image
+        # pixel i of the fine image has its center at (i + 1/2) / fine - 1/2 in the depth image
         u, u_0 = _line(self.color.fx, self.color.cx, self.depth.fx, self.depth.cx, fine)
         v, v_0 = _line(self.color.fy, self.color.cy, self.depth.fy, self.depth.cy, fine)
         resampled = cv2.warpAffine(
@@ -58,21 +57,20 @@ class ColorRegistration:
 
 
 def registered_images(images: StoredImages, registration: ColorRegistration) -> StoredImages:
-    """A frame's images, color moved into the depth camera when it is read."""
+    """Return a frame's images, with color registered to the depth camera when it is read."""
     return replace(images, color=partial(_registered_color, images, registration))
 
 
 def _registered_color(images: StoredImages, registration: ColorRegistration) -> UInt8:
     image, camera = images.color(), registration.color
     if image.shape[:2] != camera.shape:
-        raise FrameError(
-            f"{images.color_name} is {image.shape[1]}x{image.shape[0]}, but the colour camera's images are "
-            f"{camera.width}x{camera.height}"
-        )
+        size = f"{image.shape[1]}x{image.shape[0]}"
+        expected = f"{camera.width}x{camera.height}"
+        raise FrameError(f"{images.color_name} is {size}, but the color camera's images are {expected}")
     return registration.apply(image)
 
 
 def _line(f_color: float, c_color: float, f_depth: float, c_depth: float, fine: int) -> tuple[float, float]:
-    """(a, b): the fine image's coordinate i lies at a i + b in the colour image."""
+    """(a, b): the fine image's coordinate i lies at a i + b in the color image."""
     slope = f_color / f_depth
     return slope / fine, slope * (0.5 / fine - 0.5 - c_depth) + c_color

@@ -1,4 +1,4 @@
-"""How the raw images of a sensor become those of a frame: their size, the unit and range of depth, the lens."""
+"""Conversion of a sensor's raw images: the unit and range of depth, and the lens."""
 
 from __future__ import annotations
 
@@ -8,40 +8,40 @@ from pathlib import Path
 
 import numpy as np
 
+from framework.config.validation import require
 from framework.data import Camera, Float32, UInt8, UInt16
 from framework.datasets.calibration.undistortion import Distortion, Undistortion
-from framework.errors import ConfigError, FrameError
+from framework.errors import FrameError
 
 NO_READING = 65535  # uint16 that several sensors write instead of 0
 
 
 def check_max_depth(max_depth: float) -> None:
-    """Raises ConfigError for a range that is none."""
-    if not (math.isfinite(max_depth) and max_depth >= 0):
-        raise ConfigError(f"dataset.max_depth must be 0 (keep all) or positive metres, found {max_depth}")
+    """Raise ConfigError for an invalid range."""
+    require(math.isfinite(max_depth) and max_depth >= 0, "dataset.max_depth", max_depth, "0 (keep all) or positive m")
 
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera, and what is known of the images that it takes. Raises DataError for a lens that there cannot be."""
+    """A camera and the properties of its images. Raises DataError for an invalid lens."""
 
     camera: Camera
-    source: Path | str  # what says so, for messages
-    depth_scale: float  # units a metre
+    source: Path | str  # where it is stored, for messages
+    depth_scale: float  # units per meter
     max_depth: float  # m; farther readings become "no reading"; 0 = keep all
-    distortion: Distortion | None = None  # of the lens, in colour and depth alike; None = a pinhole
-    lens: Undistortion | None = field(init=False, repr=False)  # what undoes it
+    distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
+    lens: Undistortion | None = field(init=False, repr=False)  # undoes the distortion
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "lens", Undistortion(self.camera, self.distortion) if self.distortion else None)
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
-        """(H, W, 3) of the pinhole camera. Raises FrameError, which names the image, for one of another size."""
+        """Return color (H, W, 3) of the pinhole camera. Raises FrameError, with `name`, for another size."""
         self._check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
     def depth(self, raw: UInt16, name: Path | str) -> Float32:
-        """(H, W) m, 0 = no reading. Raises FrameError likewise."""
+        """Return depth (H, W) in m, 0 = no reading. Raises FrameError, with `name`, for another size."""
         self._check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
@@ -51,15 +51,15 @@ class Calibration:
         return self.lens.exact(depth) if self.lens else depth
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
-        """(H, W) numbers of something, none of them interpolated. Raises FrameError likewise."""
+        """Return labels (H, W), not interpolated. Raises FrameError, with `name`, for another size."""
         self._check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 
     def fault_of_size(self, name: Path | str, shape: tuple[int, ...]) -> str:
-        """What is wrong with the size of an image; "" = it is the camera's."""
+        """Return what is wrong with the size of an image, "" = nothing."""
         if shape[:2] == self.camera.shape:
             return ""
-        expected = f"{self.source} says {_size(self.camera.shape)}; colour, depth and camera must agree"
+        expected = f"{self.source} says {_size(self.camera.shape)}; color, depth and camera must agree"
         return f"{name} is {_size(shape)}, but {expected}"
 
     def _check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:

@@ -1,4 +1,4 @@
-"""Lens distortion: images as a pinhole camera would have taken them.
+"""Lens undistortion.
 
 The model is Brown and Conrady's as in OpenCV: a point at (x, y, 1) m in the camera appears at the pixel
 (fx x' + cx, fy y' + cy) of the recorded image, where with r^2 = x^2 + y^2
@@ -38,7 +38,7 @@ class Distortion:
             raise DataError(f"the distortion's coefficients must be finite, found {astuple(self)}")
 
     def distorted(self, camera: Camera, pixels: Float64) -> Float64:
-        """Where (N, 2) the recorded image has what a pinhole camera sees at `pixels` (N, 2)."""
+        """Return the position (N, 2) in the recorded image of the pinhole camera's `pixels` (N, 2)."""
         x, y = (pixels[:, 0] - camera.cx) / camera.fx, (pixels[:, 1] - camera.cy) / camera.fy
         r2 = x * x + y * y
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -48,10 +48,10 @@ class Distortion:
 
 
 class Undistortion:
-    """Turns recorded images into those of a pinhole camera with the same intrinsics.
+    """Converts recorded images into those of a pinhole camera with the same intrinsics.
 
-    Depth stays z along the optical axis. A pixel that the recorded image does not have becomes 0. Raises DataError when
-    the coefficients cannot be those of such a camera.
+    Depth stays z along the optical axis. Pixels outside the recorded image become 0. Raises DataError for
+    coefficients that do not fit the camera.
     """
 
     def __init__(self, camera: Camera, distortion: Distortion) -> None:
@@ -64,13 +64,12 @@ class Undistortion:
                 f"the distortion {astuple(distortion)} (k1, k2, p1, p2, k3) moves a pixel of the {camera.width}x"
                 f"{camera.height} image by {shift:.0f} px: is it of another lens model?"
             )
-        self._u = source[:, 0].reshape(camera.shape).astype(np.float32)
-        self._v = source[:, 1].reshape(camera.shape).astype(np.float32)
+        self._u, self._v = source.T.reshape(2, *camera.shape).astype(np.float32)
 
     def smooth(self, image: UInt8) -> UInt8:
-        """Colours (H, W, 3), interpolated."""
+        """Return undistorted colors (H, W, 3), interpolated."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_LINEAR), np.uint8)
 
     def exact(self, image: NDArray[Value]) -> NDArray[Value]:
-        """Depths or labels (H, W), of float32 or uint16: the nearest one, as between two nothing lies."""
+        """Return undistorted depth or labels (H, W), float32 or uint16, of the nearest pixel."""
         return np.asarray(cv2.remap(image, self._u, self._v, cv2.INTER_NEAREST), image.dtype)

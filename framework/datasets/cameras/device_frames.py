@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from abc import abstractmethod
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
@@ -13,6 +14,7 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from framework.config.validation import check_bounds
 from framework.data import Frame, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
+from framework.datasets.calibration.undistortion import Distortion
 from framework.errors import DataError, FrameError, in_one_line
 from framework.interfaces import FrameReader, LiveVideo
 
@@ -20,6 +22,7 @@ WAIT_MS = 100  # for a frame, before the reader reports that none has come
 LONGEST_SILENCE = 5.0  # s; a camera that runs and sends nothing for so long is broken, or its cable is
 
 Images = TypeVar("Images")
+log = logging.getLogger(__name__)
 
 
 class CameraDevice(Protocol):
@@ -34,13 +37,13 @@ class CameraDevice(Protocol):
         """Stop after a successful start."""
 
     def wait(self) -> Any:
-        """Both images, not registered yet; None = none came within WAIT_MS."""
+        """Return both images, not registered yet; None = none came within WAIT_MS."""
 
     def calibration(self, images: Any) -> Calibration | None:
-        """The calibration of the color camera; None = these images do not contain it."""
+        """Return the calibration of the color camera; None = these images do not contain it."""
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
-        """Color (H, W, 3) RGB and the depth (H, W) registered to it, copied from the library; None = not sent."""
+        """Return copies of color (H, W, 3), RGB, and the depth (H, W) registered to it; None = not sent."""
 
 
 @dataclass
@@ -61,7 +64,17 @@ class DepthCamera(LiveVideo):
 
     @abstractmethod
     def device(self) -> CameraDevice:
-        """The camera, not started yet. Raises ConfigError without the library."""
+        """Return the camera, not started yet. Raises ConfigError without the library."""
+
+    def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
+        """Return the lens distortion; None = there is none, or it is of an unsupported model, which is logged."""
+        if not any(coefficients):
+            return None
+        if model != brown_conrady or any(coefficients[5:]):
+            message = "%s: its lens distortion, %s, is of another model than ours and is not undone"
+            log.warning(message, self.name, model)
+            return None
+        return Distortion(*coefficients[:5])
 
     def frames(self) -> Generator[FrameReader | None]:
         device = self.device()
@@ -71,31 +84,28 @@ class DepthCamera(LiveVideo):
             which = f"the device {self.serial}" if self.serial else "a device"
             asked = f"{which} with {self.width}x{self.height} at {self.fps} Hz"
             raise DataError(f"{self.brand}: {asked} could not be started: {in_one_line(error)}") from error
+        number = count()
+        calibration: Calibration | None = None
         try:
-            yield from self._sent(device)
+            for images in images_of(self.brand, partial(_wait, self.brand, device)):
+                if images is not None and calibration is None:
+                    calibration = device.calibration(images)
+                if images is None or calibration is None:
+                    yield None
+                else:
+                    yield partial(_read, device, images, next(number), time.time(), calibration)
         finally:
             device.stop()
 
-    def _sent(self, device: CameraDevice) -> Generator[FrameReader | None]:
-        number = count()
-        calibration: Calibration | None = None
-        for images in images_of(self.brand, partial(_wait, self.brand, device)):
-            if images is not None and calibration is None:
-                calibration = device.calibration(images)
-            if images is None or calibration is None:
-                yield None
-            else:
-                yield partial(_read, device, images, next(number), time.time(), calibration)
-
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
-    """What `wait` returns, again and again; None = nothing came for WAIT_MS. Raises DataError after a long silence."""
-    heard = time.monotonic()
+    """Yield what `wait` returns, None = nothing came for WAIT_MS. Raises DataError after a long silence."""
+    last_time = time.monotonic()
     while True:
         images = wait()
         if images is not None:
-            heard = time.monotonic()
-        elif time.monotonic() - heard > LONGEST_SILENCE:
+            last_time = time.monotonic()
+        elif time.monotonic() - last_time > LONGEST_SILENCE:
             raise DataError(f"{name}: no frame has come for {LONGEST_SILENCE:g} s; is the camera still connected?")
         yield images
 
@@ -114,6 +124,6 @@ def _read(device: CameraDevice, images: Any, number: int, timestamp: float, cali
     except device.errors as error:
         raise FrameError(f"frame {number}: {in_one_line(error)}") from error
     if color is None or depth is None:
-        raise FrameError(f"frame {number}: the camera has sent no {'colour' if color is None else 'depth'}")
-    color = calibration.color(color, f"frame {number}: colour")
+        raise FrameError(f"frame {number}: the camera has sent no {'color' if color is None else 'depth'}")
+    color = calibration.color(color, f"frame {number}: color")
     return Frame(number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera)

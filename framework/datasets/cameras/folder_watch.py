@@ -1,13 +1,13 @@
-"""A folder into which frames are written while they are mapped: the same files as of dataset=rgbd_folder, as they come.
+"""A folder into which frames are written while they are mapped, with the files of dataset=rgbd_folder.
 
-    camera.json         as there; waited for
+    camera.json         as in an RGB-D folder; waited for
     color/000000.jpg    JPEG or PNG, 8-bit
-    depth/000000.png    uint16, registered to colour, along z; 0 or 65535 = no reading
+    depth/000000.png    uint16, registered to color, along z; 0 or 65535 = no reading
     end                 an empty file, written last: there will be no more frames
 
-A frame is there once both of its files are whole, in whatever order and however slowly they are written; best is to
-write each under a name that begins with a dot, and rename it. Numbers grow. A frame that is not whole when a later one
-is, or never, is a frame that cannot be used. Files that are no longer needed may be removed while the run goes on.
+A frame is complete with both of its files, in any order. Write each file under a name that begins with a dot, and
+rename it. Numbers must increase. A frame that is incomplete when a later one is complete, or at the end, cannot be
+used. Files of earlier frames may be removed during the run.
 """
 
 from __future__ import annotations
@@ -24,8 +24,7 @@ from framework.config.validation import check_bounds
 from framework.data import Frame
 from framework.datasets.calibration.camera_json import read_camera, read_json_object
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
-from framework.datasets.frames.sequence_reader import check_one_number, number_of
-from framework.datasets.frames.stored_frames import StoredImages
+from framework.datasets.frames.sequence_reader import StoredImages, check_one_number, number_of
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import read_bytes
 from framework.files.image_files import LARGEST_FILE, check_image
@@ -34,9 +33,9 @@ from framework.interfaces import FrameReader, LiveVideo
 
 COLOR, DEPTH = (".jpg", ".jpeg", ".png"), (".png",)
 LONGEST_WAIT = 86_400.0  # s
-LARGEST_NUMBER = 2**53  # of a frame; every program has smaller ones exactly
-LEAST_REST = 3.0  # times as long as the last look took, until the next one: a folder of many files is no full-time job
-CLOCK_TICK = 1e-6  # s, between the times of two frames that were found at once
+LARGEST_NUMBER = 2**53  # of a frame; smaller ones are exact in every program
+LEAST_REST = 3.0  # times the duration of the last poll, before the next one: folders of many files are slow to list
+CLOCK_TICK = 1e-6  # s, between the times of two frames that were found in one poll
 
 log = logging.getLogger(__name__)
 
@@ -45,10 +44,10 @@ log = logging.getLogger(__name__)
 class FolderWatch(LiveVideo):
     """Frames that another program writes into a folder of images while they are mapped."""
 
-    root: Path  # the folder, which must be there; a relative one in the working, else in the project folder
-    idle_timeout: float = 0.0  # s, in [0, 86400], without a new frame, after which it ends; 0 = never
+    root: Path  # the folder, which must exist, relative to the working or project folder
+    idle_timeout: float = 0.0  # s, in [0, 86400], without a new frame before it ends; 0 = never
     camera_timeout: float = 30.0  # s, in [0, 86400], to wait for camera.json
-    poll_interval: float = 0.01  # s, in [0.001, 0.1], between two looks into the folder
+    poll_interval: float = 0.01  # s, in [0.001, 0.1], between two polls of the folder
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
 
     def __post_init__(self) -> None:
@@ -63,13 +62,13 @@ class FolderWatch(LiveVideo):
     def frames(self) -> Generator[FrameReader | None]:
         calibration = yield from self._calibration()
         arrivals = Arrivals(self.folder)
-        last_time, heard = 0.0, time.monotonic()
+        last_time, last_arrival = 0.0, time.monotonic()
         while True:
             began = time.monotonic()
-            # asked first: what was there before it counts
-            over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - heard
+            # checked first: files that were written before `end` count
+            over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - last_arrival
             for arrival in arrivals.look(to_the_end=over):
-                last_time, heard = max(time.time(), last_time + CLOCK_TICK), began
+                last_time, last_arrival = max(time.time(), last_time + CLOCK_TICK), began
                 yield partial(arrival.read, last_time, calibration)
             if over:
                 return
@@ -77,7 +76,7 @@ class FolderWatch(LiveVideo):
             time.sleep(min(max(self.poll_interval, LEAST_REST * (time.monotonic() - began)), 0.1))
 
     def _calibration(self) -> Generator[None, None, Calibration]:
-        """What camera.json says, once it is there and whole."""
+        """The content of camera.json, once it is complete."""
         path, deadline = self.folder / "camera.json", time.monotonic() + self.camera_timeout
         while True:
             try:
@@ -94,14 +93,14 @@ class FolderWatch(LiveVideo):
 
 @dataclass(frozen=True)
 class Arrival:
-    """A frame that has come, or that is passed over."""
+    """A frame that is complete, or that is skipped."""
 
     number: int
     images: StoredImages | None
     fault: str = ""  # why it cannot be used
 
     def read(self, timestamp: float, calibration: Calibration) -> Frame:
-        """Raises FrameError when it cannot be used."""
+        """Return the frame. Raises FrameError if it cannot be used."""
         if self.images is None:
             raise FrameError(self.fault)
         color = calibration.color(self.images.color(), self.images.color_name)
@@ -110,26 +109,26 @@ class Arrival:
 
 
 class Arrivals:
-    """What has come into a folder since the last look, by its frames' numbers."""
+    """New frames in a folder, by number."""
 
     def __init__(self, folder: Path) -> None:
         self._color, self._depth = NewImages(folder / "color", COLOR), NewImages(folder / "depth", DEPTH)
-        self._last = -1  # number of the last frame that came
-        self._halves: set[int] = set()  # numbers that were passed over with one image
+        self._last = -1  # number of the last complete or skipped frame
+        self._halves: set[int] = set()  # numbers that were skipped with one image
 
     def look(self, to_the_end: bool = False) -> list[Arrival]:
-        """The new frames, by number: up to the newest one that is whole, or all of which there is anything."""
+        """Return the new frames up to the newest complete one, or all that have a file, in ascending order."""
         self._color.look()
         self._depth.look()
         color, depth = self._color.waiting, self._depth.waiting
         both, any_of = sorted(color.keys() & depth.keys()), sorted(color.keys() | depth.keys())
         newest = next((n for n in reversed(both) if _is_whole(color[n]) and _is_whole(depth[n])), -1)
-        newest = max(newest, self._last)  # what comes later than its successors is passed over
+        newest = max(newest, self._last)  # a frame that comes after its successors is skipped
         passed = any_of if to_the_end else [number for number in any_of if number <= newest]
         return [arrival for number in passed if (arrival := self._arrival(number, newest))]
 
     def _arrival(self, number: int, newest: int) -> Arrival | None:
-        """None for the second half of what was passed over."""
+        """None for the second image of a frame that was skipped."""
         color, depth = self._color.waiting.pop(number, None), self._depth.waiting.pop(number, None)
         if number in self._halves:
             self._halves.remove(number)
@@ -147,7 +146,7 @@ class Arrivals:
 
 @dataclass
 class NewImages:
-    """The images of a folder that nobody has taken yet."""
+    """The images of a folder that are not assigned to frames yet."""
 
     folder: Path
     suffixes: Sequence[str]
@@ -158,11 +157,11 @@ class NewImages:
         self._first: Path | None = None
 
     def look(self) -> None:
-        """Adds what is new. Raises DataError for names that are in no order."""
+        """Add the new images. Raises DataError for names without an order."""
         try:
             with os.scandir(self.folder) as entries:
                 names = {entry.name for entry in entries}
-        except OSError:  # nobody has made it yet
+        except OSError:  # it does not exist yet
             return
         new, self._names = names - self._names, names
         for name in sorted(new):

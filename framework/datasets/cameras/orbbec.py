@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,18 +9,15 @@ import numpy as np
 
 from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
-from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.cameras.device_frames import WAIT_MS, CameraDevice, DepthCamera
 from framework.errors import import_optional
 
-MILLIMETRES = 1000.0  # a metre: the unit of the library's depth scale
-
-log = logging.getLogger(__name__)
+MILLIMETERS = 1000.0  # per meter: the unit of the library's depth scale
 
 
 @dataclass
 class Orbbec(DepthCamera):
-    """An Orbbec camera: depth registered to colour, with the intrinsics that the device says."""
+    """An Orbbec camera."""
 
     brand = "Orbbec"
 
@@ -30,7 +26,7 @@ class Orbbec(DepthCamera):
 
 
 class OrbbecDevice:
-    """The camera as its library gives it."""
+    """An Orbbec camera, by its library."""
 
     def __init__(self, library: Any, video: Orbbec) -> None:
         self._ob, self._video = library, video
@@ -55,7 +51,7 @@ class OrbbecDevice:
         self._pipeline.start(config)
 
     def _mode(self, sensor: Any, pixels: Any, width: int, height: int) -> Any:
-        """A mode of a sensor; a size of 0 is any."""
+        """A mode of a sensor; size 0 = any."""
         modes = self._pipeline.get_stream_profile_list(sensor)
         return modes.get_video_stream_profile(width, height, pixels, self._video.fps)
 
@@ -71,20 +67,11 @@ class OrbbecDevice:
             return None
         found = self._color.get_intrinsic()
         camera = Camera(found.width, found.height, found.fx, found.fy, found.cx, found.cy)
-        units = MILLIMETRES / depth.get_depth_scale()
-        return Calibration(camera, self._video.name, units, self._video.max_depth, self._distortion())
-
-    def _distortion(self) -> Distortion | None:
-        found = self._color.get_distortion()
-        ours = Distortion(found.k1, found.k2, found.p1, found.p2, found.k3)
-        higher = (found.k4, found.k5, found.k6)
-        if ours == Distortion() and not any(higher):
-            return None
-        if found.model != self._ob.OBCameraDistortionModel.BROWN_CONRADY or any(higher):
-            message = "%s: its lens distortion, %s, is of another model than ours and is not undone"
-            log.warning(message, self._video.name, found.model)
-            return None
-        return ours
+        lens = self._color.get_distortion()
+        coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
+        distortion = self._video.distortion(coefficients, lens.model, self._ob.OBCameraDistortionModel.BROWN_CONRADY)
+        units = MILLIMETERS / depth.get_depth_scale()
+        return Calibration(camera, self._video.name, units, self._video.max_depth, distortion)
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)
@@ -94,7 +81,7 @@ class OrbbecDevice:
 
 
 def _pixels(image: Any, dtype: np.dtype[Any], channels: tuple[int, ...]) -> Any:
-    """(H, W, ...) copy of an image, None = there is none."""
+    """A copy (H, W, ...) of an image, None = there is none."""
     if image is None:
         return None
     raw = np.frombuffer(image.get_data(), dtype)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,16 +9,13 @@ import numpy as np
 
 from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
-from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.cameras.device_frames import WAIT_MS, CameraDevice, DepthCamera
 from framework.errors import import_optional
-
-log = logging.getLogger(__name__)
 
 
 @dataclass
 class RealSense(DepthCamera):
-    """A RealSense camera: depth registered to colour, with the intrinsics that the device says."""
+    """A RealSense camera."""
 
     brand = "RealSense"
 
@@ -28,7 +24,7 @@ class RealSense(DepthCamera):
 
 
 class RealSenseDevice:
-    """The camera as its library gives it."""
+    """A RealSense camera, by its library."""
 
     errors: tuple[type[Exception], ...] = (RuntimeError,)
 
@@ -56,13 +52,9 @@ class RealSenseDevice:
     def calibration(self, images: Any) -> Calibration:
         found = self._profile.get_stream(self._rs.stream.color).as_video_stream_profile().get_intrinsics()
         camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy)
-        metres = self._profile.get_device().first_depth_sensor().get_depth_scale()
-        distortion = Distortion(*found.coeffs[:5]) if any(found.coeffs) else None
-        if distortion is not None and found.model != self._rs.distortion.brown_conrady:
-            message = "%s: its lens distortion, %s, is of another model than ours and is not undone"
-            log.warning(message, self._video.name, found.model)
-            distortion = None
-        return Calibration(camera, self._video.name, 1 / metres, self._video.max_depth, distortion)
+        unit = self._profile.get_device().first_depth_sensor().get_depth_scale()
+        distortion = self._video.distortion(found.coeffs, found.model, self._rs.distortion.brown_conrady)
+        return Calibration(camera, self._video.name, 1 / unit, self._video.max_depth, distortion)
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)

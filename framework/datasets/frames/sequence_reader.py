@@ -1,4 +1,4 @@
-"""What the readers of recordings share: a reader says what there is, and this chooses frames and reads their images."""
+"""Base of the readers of recordings: a subclass lists what is stored, and `Recording` selects and reads frames."""
 
 from __future__ import annotations
 
@@ -7,56 +7,92 @@ import math
 import re
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from framework.data import Array, Camera, Float32, Frame, FrameTruth
+from framework.config.validation import require
+from framework.data import Array, Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import DepthReading, PoseReading
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
 from framework.errors import ConfigError, DataError, FrameError
+from framework.files.image_files import read_color, read_uint16
 from framework.files.search_paths import folder_of
 from framework.interfaces import RGBDSequence
 
-FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighbouring float32 numbers are 1 mm apart
-FRAME_RATE = 30.0  # Hz, of recordings without timestamps, or with some that cannot be
+FARTHEST = 1e4  # m from the world's origin, of a pose; beyond, neighboring float32 numbers are 1 mm apart
+FRAME_RATE = 30.0  # Hz, of recordings without usable timestamps
 
 TO_THE_END = -1  # value of `stop`
-_STREAM = zlib.crc32(b"share")  # a random stream of its own, beside all that a dataset draws from the same seed
+_STREAM = zlib.crc32(b"share")  # separates this random stream from others with the same seed
 
 log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class StoredImages:
+    """The two images of a frame, registered to each other and not read yet. Reading raises FrameError."""
+
+    color_name: Path | str  # the file, and the place in it, for messages
+    depth_name: Path | str
+    color: Callable[[], UInt8]  # (H, W, 3) RGB
+    depth: Callable[[], UInt16]  # (H, W) in units of the recording; 0 or 65535 = no reading
+
+    @classmethod
+    def of_files(cls, color: Path, depth: Path) -> StoredImages:
+        """Return the images of two JPEG or PNG files."""
+        return cls(color, depth, partial(read_color, color), partial(read_uint16, depth))
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """One frame of a recording, images not read yet."""
+
+    images: StoredImages
+    timestamp: float  # s
+    T_world_camera: Float64 | None = None  # (4, 4), None = not known
+    fault: str = ""  # why the frame cannot be used; "" = it can
+    up: Float64 | None = None  # (3,) unit vector against gravity in the camera, from a sensor; None = not known
+
+    @classmethod
+    def posed(cls, images: StoredImages, timestamp: float, pose: Callable[[], Float64 | None]) -> RecordedFrame:
+        """Return the frame with the pose that `pose` returns, or with its DataError as the fault."""
+        try:
+            return cls(images, timestamp, pose())
+        except DataError as error:
+            return cls(images, timestamp, fault=str(error))
+
+
+@dataclass(frozen=True)
 class Contents:
-    """All that a recording holds, before any frame is chosen."""
+    """Everything that a recording stores, before frames are selected."""
 
     camera: Camera
-    camera_source: Path | str  # what says so, for messages
-    depth_scale: float  # units a metre
+    camera_source: Path | str  # where it is stored, for messages
+    depth_scale: float  # units per meter
     frames: Sequence[RecordedFrame]
-    distortion: Distortion | None = None  # of the camera's lens, in colour and depth alike; None = a pinhole
+    distortion: Distortion | None = None  # of the lens, in color and depth alike; None = a pinhole
 
 
 @dataclass
 class Recording(RGBDSequence):
-    """An RGB-D video on disk. A subclass says what is there (`open`), and what is known of the truth.
+    """An RGB-D video on disk. A subclass lists what is stored (`open`), and knows the ground truth.
 
-    Faults of the whole recording raise DataError when it is opened; faults of one frame raise FrameError when that
-    frame is read, so that the pipeline counts it and goes on.
+    Errors of the whole recording raise DataError when it is opened. Errors of one frame raise FrameError when it is
+    read, so that the pipeline counts and skips it.
     """
 
-    root: Path  # the folder, or the folder of the scenes; a relative one in the working, else in the project folder
+    root: Path  # the folder of the recording or of the scenes, relative to the working or project folder
     scene: str = ""  # sub-folder of root; "" = root itself
     start: int = 0  # first frame
-    stop: int = TO_THE_END  # the frame to stop before; -1 = to the end
-    stride: int = 1  # take every stride-th frame
-    frame_fraction: float = 1.0  # in (0, 1], share of these frames, chosen at random with `seed`
+    stop: int = TO_THE_END  # frame to stop before; -1 = to the end
+    stride: int = 1  # use every stride-th frame
+    frame_fraction: float = 1.0  # in (0, 1], fraction of these frames, selected at random with `seed`
     seed: int = 0  # of the random selection
     max_depth: float = 10.0  # m; farther readings become "no reading"; 0 = keep all
     pose_reading: PoseReading = field(default_factory=PoseReading)
@@ -71,28 +107,24 @@ class Recording(RGBDSequence):
             project = "" if self.root.is_absolute() else ", neither here nor in a checkout of the project"
             raise DataError(f"dataset.root: the folder {self.folder} does not exist{project}")
         self.name = self.folder.resolve().name
-        self.contents = stored = self._read(self.open())
+        stored = self.open()
+        depth_scale = self.depth_reading.depth_scale or stored.depth_scale
+        posed = [_posed(frame, self.pose_reading) for frame in delay_poses(stored.frames, self.pose_reading.pose_delay)]
+        frames = delay_depth(_in_order_of_time(self.name, posed), self.depth_reading.depth_delay)
+        self.contents = replace(stored, frames=frames, depth_scale=depth_scale)
         self.camera = stored.camera
         self.calibration = Calibration(
-            self.camera, stored.camera_source, stored.depth_scale, self.max_depth, stored.distortion
+            self.camera, stored.camera_source, depth_scale, self.max_depth, stored.distortion
         )
-        self.chosen = choose_frames(
-            len(self.contents.frames), self.start, self.stop, self.stride, self.frame_fraction, self.seed
-        )
+        self.chosen = choose_frames(len(frames), self.start, self.stop, self.stride, self.frame_fraction, self.seed)
         self._check_first_image()
-
-    def _read(self, stored: Contents) -> Contents:
-        """What is stored, as it is meant."""
-        posed = [_posed(recorded, self.pose_reading) for recorded in self.pose_reading.frames(stored.frames)]
-        frames = self.depth_reading.frames(_in_order_of_time(self.name, posed))
-        return replace(stored, frames=frames, depth_scale=self.depth_reading.depth_scale or stored.depth_scale)
 
     @abstractmethod
     def open(self) -> Contents:
-        """What `self.folder` holds. Raises DataError, naming the file, when that is no such recording."""
+        """Return what `self.folder` stores. Raises DataError, with the file, if this is no such recording."""
 
     def truth_in(self, index: int) -> FrameTruth | None:
-        """The true instances in frame `index`, counted before any is chosen; None where nobody labelled them."""
+        """Return the true instances in stored frame `index`, or None if they are not known."""
         return None
 
     def __len__(self) -> int:
@@ -100,7 +132,7 @@ class Recording(RGBDSequence):
 
     def has_poses(self) -> bool:
         frames = [self.contents.frames[index] for index in self.chosen]
-        # a frame whose pose is no pose says so when it is read
+        # a frame with an invalid pose raises its error when it is read
         return any(recorded.T_world_camera is not None or recorded.fault for recorded in frames)
 
     def __getitem__(self, k: int) -> Frame:
@@ -120,12 +152,12 @@ class Recording(RGBDSequence):
         )
 
     def metric_depth(self, index: int) -> Float32:
-        """(H, W) m, 0 = no reading. Raises FrameError."""
+        """Return depth (H, W) in m, 0 = no reading. Raises FrameError."""
         images = self.contents.frames[index].images
         return self.calibration.depth(images.depth(), images.depth_name)
 
     def _check_first_image(self) -> None:
-        """A first image of the wrong size means that all are: better said at once than by skipping every frame."""
+        """Raise DataError for a first image of the wrong size: all others would be skipped one by one."""
         images = self.contents.frames[self.chosen[0]].images
         for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
             try:
@@ -136,8 +168,34 @@ class Recording(RGBDSequence):
                 raise DataError(fault)
 
 
+def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
+    """Give each frame the pose of the frame `delay` later; without one, the frame cannot be used."""
+    moved = []
+    for frame, other in _with_later(frames, delay):
+        fault = frame.fault or (other.fault if other else f"no pose is {delay} frames away")
+        moved.append(replace(frame, T_world_camera=other.T_world_camera if other else None, fault=fault))
+    return moved
+
+
+def delay_depth(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
+    """Give each frame the depth image of the frame `delay` later; without one, the frame cannot be used."""
+    moved = []
+    for frame, other in _with_later(frames, delay):
+        if other:
+            images = replace(frame.images, depth_name=other.images.depth_name, depth=other.images.depth)
+            moved.append(replace(frame, images=images))
+        else:
+            moved.append(replace(frame, fault=frame.fault or f"no depth image is {delay} frames away"))
+    return moved
+
+
+def _with_later(frames: Sequence[RecordedFrame], delay: int) -> Iterator[tuple[RecordedFrame, RecordedFrame | None]]:
+    for k, frame in enumerate(frames):
+        yield frame, frames[k + delay] if 0 <= k + delay < len(frames) else None
+
+
 def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
-    """The frame with the pose that is meant, or with a fault where that is farther off than anything is mapped."""
+    """The frame with its pose converted, or with a fault if the pose is too far away to be mapped."""
     if recorded.T_world_camera is None:
         return recorded
     T_world_camera = reading.pose(recorded.T_world_camera)
@@ -149,7 +207,7 @@ def _posed(recorded: RecordedFrame, reading: PoseReading) -> RecordedFrame:
 
 
 def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[RecordedFrame]:
-    """The frames, at 30 Hz where the times of those that can be used do not grow."""
+    """The frames, at 30 Hz if the times of the usable ones do not increase."""
     times = [recorded.timestamp for recorded in frames if not recorded.fault]
     if all(a < b for a, b in pairwise(times)):
         return frames
@@ -158,45 +216,38 @@ def _in_order_of_time(name: str, frames: Sequence[RecordedFrame]) -> Sequence[Re
 
 
 def check_selection(start: int, stop: int, stride: int, frame_fraction: float = 1.0) -> None:
-    """Raises ConfigError unless the parameters can choose frames at all."""
-    if start < 0:
-        raise ConfigError(f"dataset.start must be 0 or positive, found {start}")
-    if stop != TO_THE_END and stop <= start:
-        raise ConfigError(
-            f"dataset.stop must be above dataset.start ({start}), or {TO_THE_END} for the end; found {stop}"
-        )
-    if stride < 1:
-        raise ConfigError(f"dataset.stride must be at least 1, found {stride}")
-    if not 0 < frame_fraction <= 1:  # NaN is neither
-        raise ConfigError(f"dataset.frame_fraction must be in (0, 1], found {frame_fraction}")
+    """Raise ConfigError unless the parameters can select frames."""
+    require(start >= 0, "dataset.start", start, "0 or positive")
+    above = f"above dataset.start ({start}), or {TO_THE_END} for the end"
+    require(stop == TO_THE_END or stop > start, "dataset.stop", stop, above)
+    require(stride >= 1, "dataset.stride", stride, "at least 1")
+    require(0 < frame_fraction <= 1, "dataset.frame_fraction", frame_fraction, "in (0, 1]")
 
 
 def choose_frames(
     count: int, start: int, stop: int, stride: int, frame_fraction: float = 1.0, seed: int = 0
 ) -> Sequence[int]:
-    """The frame numbers chosen of `count` frames, ascending: as a Python slice chooses, and of those a random fraction.
+    """Return the selected frames of `count`, ascending: a slice, and a random fraction of it.
 
-    The same `seed` selects the same frames, at least one. Raises ConfigError when no frame is left.
+    The same `seed` selects the same frames, at least one. Raises ConfigError if no frame is left.
     """
     check_selection(start, stop, stride, frame_fraction)
     if start >= count:
         raise ConfigError(f"dataset.start is {start}, but the sequence has only {count} frames (0 to {count - 1})")
-    if seed < 0:
-        raise ConfigError(f"seed must be 0 or positive, found {seed}")
+    require(seed >= 0, "seed", seed, "0 or positive")
     chosen = range(start, count if stop == TO_THE_END else min(stop, count), stride)
     if frame_fraction == 1:
         return chosen
-    kept = np.random.default_rng([seed, _STREAM]).permutation(len(chosen))[
-        : max(1, round(frame_fraction * len(chosen)))
-    ]
-    return tuple(chosen[k] for k in np.sort(kept).tolist())
+    kept = max(1, round(frame_fraction * len(chosen)))
+    order = np.random.default_rng([seed, _STREAM]).permutation(len(chosen))
+    return tuple(chosen[k] for k in np.sort(order[:kept]).tolist())
 
 
 def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """The folder's images by the number in which their names end, in the order of these numbers.
+    """Return the folder's images by the number at the end of their names, in ascending order.
 
-    Raises DataError when there is none, a name has no number, two have the same, or the names differ in other digits,
-    too: the decimals of a time are no order.
+    Raises DataError if there is none, a name has no number, two have the same, or the names differ in other digits
+    as well, such as the decimals of a time.
     """
     if not folder.is_dir():
         raise DataError(f"the folder {folder} is missing")
@@ -222,7 +273,7 @@ def paired_images(
     color_name: Callable[[int], Path],
     depth_name: Callable[[int], Path],
 ) -> dict[int, StoredImages]:
-    """The images of each frame by its number; reading one that is missing raises FrameError, with the expected name."""
+    """Return the images of each frame by its number. Reading a missing one raises FrameError."""
     return {
         k: StoredImages.of_files(colors.get(k) or color_name(k), depths.get(k) or depth_name(k))
         for k in sorted(colors.keys() | depths.keys())
@@ -230,26 +281,26 @@ def paired_images(
 
 
 def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
-    """(width, height) px of the first image that can be read. Raises DataError if none can."""
-    faults = []
+    """Return (width, height) in px of the first image that can be read. Raises DataError if none can."""
+    errors = []
     for path in paths:
         try:
             height, width = read(path).shape[:2]
         except FrameError as error:
-            faults.append(str(error))
+            errors.append(str(error))
             continue
         return width, height
-    raise DataError(f"no image can be read: {faults[0]}")
+    raise DataError(f"no image can be read: {errors[0]}")
 
 
 def number_of(path: Path) -> int | None:
-    """The number in which the name of an image ends; None = there is none."""
+    """Return the number at the end of an image's name, or None without one."""
     digits = path.stem[len(_before_number(path)) :]
     return int(digits) if digits else None
 
 
 def check_one_number(files: Sequence[Path]) -> None:
-    """Raises DataError when the names of images differ in more than the number in which they end."""
+    """Raise DataError if the names of images differ in more than the number at their end."""
     for path in files:
         before, of_first = _before_number(path), _before_number(files[0])
         if before != of_first and re.search("[0-9]", before + of_first):

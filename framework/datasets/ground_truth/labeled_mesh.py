@@ -1,4 +1,4 @@
-"""A mesh whose vertices are labelled with the true instances, as data sets of scanned rooms publish them."""
+"""Meshes with instance labels at their vertices, as datasets of scanned rooms publish them."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 
 from framework.data import Camera, DeferredTruth, Float32, Float64, FrameTruth, Int32, SceneTruth
 from framework.datasets.frames.sequence_reader import Recording
+from framework.errors import DataError
 from framework.files.atomic_write import is_there
 from framework.files.hashing import add_array, path_hash
 from framework.rendering import rasterizer
@@ -21,7 +22,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LabeledMesh:
-    """The true surface of a scene and the instances on it."""
+    """The true surface of a scene with its instances."""
 
     vertices: Float32  # (V, 3) m, world
     triangles: Int32  # (F, 3)
@@ -30,23 +31,17 @@ class LabeledMesh:
     classes: tuple[str, ...] | None = None  # as in SceneTruth
 
     def scene_truth(self) -> SceneTruth:
-        """The vertices as points: all of them, whatever frames of the video are chosen."""
+        """Return all vertices as points, whatever frames of the video are selected."""
         return SceneTruth(self.vertices, self.instance_ids, dict(self.class_names), self.classes)
 
     def seen_by(self, camera: Camera, T_world_camera: Float64) -> FrameTruth:
-        """The instances that `camera` would see, rendered when they are asked for.
-
-        They are those of the mesh's vertices nearest to what the pixels meet.
-        """
+        """Return the instances of the vertices nearest to each pixel's surface point, rendered on demand."""
         return DeferredTruth(
-            render=lambda: self._drawn(camera, T_world_camera),
+            render=lambda: self._rasterizer.draw(camera, T_world_camera).nearest(self.triangles, self.instance_ids),
             shape=camera.shape,
             class_names=self.class_names,
             origin=f"{self._fingerprint} {camera!r} {T_world_camera.tobytes().hex()}",
         )
-
-    def _drawn(self, camera: Camera, T_world_camera: Float64) -> Int32:
-        return self._rasterizer.draw(camera, T_world_camera).nearest(self.triangles, self.instance_ids)
 
     @cached_property
     def _rasterizer(self) -> Rasterizer:
@@ -54,7 +49,7 @@ class LabeledMesh:
 
     @cached_property
     def _fingerprint(self) -> str:
-        """SHA-256 (hex) of what is rendered, and of the code that does."""
+        """SHA-256 (hex) of the mesh and the rendering code."""
         digest = hashlib.sha256()
         for array in (self.vertices, self.triangles, self.instance_ids):
             add_array(digest, array)
@@ -65,18 +60,29 @@ class LabeledMesh:
 
 @dataclass
 class LabeledRecording(Recording):
-    """A recording of a scene that may have a labelled mesh, which the subclass's `open` sets.
+    """A recording of a scene that may have a labeled mesh, which the subclass loads in `open`.
 
-    Truth is all of the mesh, whatever frames are chosen.
+    The ground truth is the whole mesh, whatever frames are selected.
     """
 
-    frame_ground_truth: bool = (
-        False  # whether frames have the true instances: the mesh is rendered for detectors that ask
-    )
+    frame_ground_truth: bool = False  # frames have the true instances: the mesh is rendered for detectors that need it
 
     def __post_init__(self) -> None:
         self.mesh: LabeledMesh | None = None
         super().__post_init__()
+
+    def load_mesh(self, files: Sequence[Path], read: Callable[..., LabeledMesh]) -> None:
+        """Load the mesh from its files, if all of them exist.
+
+        Raises DataError if one is missing and `frame_ground_truth` needs it.
+        """
+        missing = [path for path in files if not is_there(path)]
+        if not missing:
+            self.mesh = read(*files)
+        elif self.frame_ground_truth:
+            raise DataError(f"dataset.frame_ground_truth: expected the labeled mesh, found no {missing[0]}")
+        elif len(missing) < len(files):
+            log.warning("no true instances: %s is missing", missing[0])
 
     def truth_in(self, index: int) -> FrameTruth | None:
         T_world_camera = self.contents.frames[index].T_world_camera
@@ -86,11 +92,3 @@ class LabeledRecording(Recording):
 
     def scene_truth(self) -> SceneTruth | None:
         return self.mesh.scene_truth() if self.mesh else None
-
-
-def mesh_of(files: Sequence[Path], read: Callable[..., LabeledMesh]) -> LabeledMesh | None:
-    """What `read` makes of the files; None, with a word in the log where only some are missing, without all of them."""
-    missing = [path for path in files if not is_there(path)]
-    if 0 < len(missing) < len(files):
-        log.warning("no true instances: %s is missing", missing[0])
-    return None if missing else read(*files)

@@ -1,4 +1,4 @@
-"""Fuses exact depth, instance images and true poses into the labelled surface that a map is evaluated against."""
+"""Fusion of exact depth, instance images and true poses into the ground-truth surface."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from framework.config.validation import require
 from framework.data import Camera, Float32, Float64, Int32, SceneTruth
 from framework.datasets.ground_truth.scene_truth_kernels import KEY_OFFSET, Slots, move_slots, vote
-from framework.errors import ConfigError, DataError
+from framework.errors import DataError
 
-SMALLEST_VOXEL, LARGEST_VOXEL = 1e-3, 1.0  # m
 INITIAL_CAPACITY = 1 << 16  # slots; a power of two, doubled before more than half are taken
 
 
 @dataclass(frozen=True)
 class LabeledDepth:
-    """One view of the truth."""
+    """One view of the ground truth."""
 
     depth: Float32  # (H, W) m along z, 0 = no reading
     instance_ids: Int32  # (H, W), 0 = no instance
@@ -26,21 +26,18 @@ class LabeledDepth:
 
 
 def check_truth_voxel(size: float) -> None:
-    """Raises ConfigError for a spacing of true points that no recording has."""
-    if not SMALLEST_VOXEL <= size <= LARGEST_VOXEL:  # NaN is neither
-        raise ConfigError(
-            f"dataset.ground_truth_spacing: expected [{SMALLEST_VOXEL:g}, {LARGEST_VOXEL:g}] m, got {size}"
-        )
+    """Raise ConfigError for an implausible spacing of true points."""
+    require(1e-3 <= size <= 1, "dataset.ground_truth_spacing", size, "in [0.001, 1] m")
 
 
 def fuse_scene_truth(
     views: Iterable[LabeledDepth], class_names: Mapping[int, str | None], ground_truth_spacing: float = 0.02
 ) -> SceneTruth:
-    """One labelled point for each voxel of `ground_truth_spacing` metres that a view's pixels fall into.
+    """Return one labeled point for each voxel of `ground_truth_spacing` meters that contains a view's pixels.
 
-    Every pixel with depth votes for (its voxel, its instance id). A voxel gets the id with most votes, the smaller
-    one if two have as many, and the mean of the points that voted for it. Views are taken one by one, so memory
-    follows the surface and not the number of views. Points come in the order in which their voxels were first seen.
+    Every pixel with depth votes for (its voxel, its instance id). A voxel gets the id with most votes, the smaller of
+    two equal ones, and the mean of the points that voted for it. Points are in the order in which their voxels were
+    first seen. Memory depends on the surface, not on the number of views.
     """
     table = _VoteTable()
     for view in views:
@@ -57,8 +54,7 @@ class _VoteTable:
         self.slots = Slots.empty(INITIAL_CAPACITY)
 
     def add(self, view: LabeledDepth, ground_truth_spacing: float) -> None:
-        pixels = view.depth.size
-        while 2 * (self.taken + pixels) > len(self.slots.keys):  # a view can at worst bring one new slot a pixel
+        while 2 * (self.taken + view.depth.size) > len(self.slots.keys):  # at worst, each pixel needs a new slot
             larger = Slots.empty(2 * len(self.slots.keys))
             move_slots(self.slots, larger)
             self.slots = larger
@@ -73,12 +69,11 @@ class _VoteTable:
             self.taken,
         )
         if self.taken < 0:
-            raise DataError(
-                f"ground truth: a point lies more than {KEY_OFFSET * ground_truth_spacing:.0f} m from the origin"
-            )
+            farthest = KEY_OFFSET * ground_truth_spacing
+            raise DataError(f"ground truth: a point lies more than {farthest:.0f} m from the origin")
 
     def elect(self) -> tuple[Float32, Int32]:
-        """Each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
+        """Return each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
         keys, ids, votes, sums, first = self.slots
         taken = np.flatnonzero(votes)
         best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]

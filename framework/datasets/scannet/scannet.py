@@ -1,23 +1,22 @@
-"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and a depth sensor on it, with labelled meshes.
+"""ScanNet (Dai et al., CVPR 2017): rooms scanned with an iPad and a depth sensor on it, with labeled meshes.
 
     scene0000_00/scene0000_00.sens      the video in one file (`sens_file.py`), or as ScanNet's SensReader exports it:
-    scene0000_00/color/0.jpg            8-bit colour, from 0
+    scene0000_00/color/0.jpg            8-bit color, from 0
     scene0000_00/depth/0.png            uint16, mm along z
     scene0000_00/pose/0.txt             T_world_camera, four lines of four numbers, m
     scene0000_00/intrinsic/             intrinsic_color.txt, intrinsic_depth.txt and, optional, extrinsic_*.txt: 4x4
     scene0000_00/scene0000_00_vh_clean_2.ply, _vh_clean_2.0.010000.segs.json, .aggregation.json
-                                        optional: the mesh, its segments, and the objects made of these
-    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or the one above: which class is meant by
-                                        what the annotators wrote; without it fewer objects are evaluated
-    scannet-labels.combined.tsv         optional, likewise: the first release's, for annotations of that time
+                                        optional: the mesh, its segments, and the objects that consist of them
+    scannetv2-labels.combined.tsv       optional, in the folder of the scenes or its parent: the class of each name
+                                        that annotators wrote; without it fewer objects are evaluated
+    scannet-labels.combined.tsv         optional, in the same folders: for annotations of the first release
 
-Colour (1296x968) is moved into the depth camera (640x480), which is that of the frames.
+Color (1296x968) is registered to the depth camera (640x480), which is that of the frames.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,51 +24,52 @@ import numpy as np
 
 from framework.data import Camera
 from framework.datasets.calibration.color_registration import ColorRegistration, registered_images
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, first_size, numbered_images, paired_images
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
-from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording, mesh_of
+from framework.datasets.frames.sequence_reader import (
+    FRAME_RATE,
+    Contents,
+    RecordedFrame,
+    StoredImages,
+    first_size,
+    numbered_images,
+    paired_images,
+)
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording
 from framework.datasets.scannet.scannet_annotation import (
     FIRST_LABEL_TABLE,
     LABEL_TABLE,
     read_label_table,
     read_labeled_mesh,
 )
-from framework.datasets.scannet.sens_file import SensFile, open_sens
+from framework.datasets.scannet.sens_file import open_sens
 from framework.errors import DataError, errors_of
 from framework.files.atomic_write import is_there
 from framework.files.image_files import read_color, read_uint16
 from framework.files.matrix_file import PrintedMatrix, read_matrix
 from framework.geometry import inverse, rotation_angle
 
-MESH, SEGMENTS, OBJECTS = "_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json"
-DEPTH_SCALE = 1000.0  # units a metre, of exported depth
-MICROSECONDS = 1e6  # a second
-COLOR_SIZE = (1296, 968)  # px; exported colour may be smaller, its intrinsics are still those of this size
-NEAR = 2.0  # m, where what is left of the parallax is told
-SAME_WITHIN = 0.5  # px, of the depth camera: a shift of colour that is not worth a word
+MESH_FILES = ("_vh_clean_2.ply", "_vh_clean_2.0.010000.segs.json", ".aggregation.json")  # behind the scene's name
+DEPTH_SCALE = 1000.0  # units per meter, of exported depth
+MICROSECONDS = 1e6  # per second
+COLOR_SIZE = (1296, 968)  # px; exported color may be smaller, its intrinsics are still those of this size
+NEAR = 2.0  # m, the depth for which the parallax is logged
+LARGEST_SHIFT = 0.5  # px, of the depth camera, by which color may be shifted without a warning
 
 log = logging.getLogger(__name__)
 
 
 @dataclass
 class ScanNet(LabeledRecording):
-    """A scan of ScanNet v2, from its `.sens` file where there is one, otherwise from exported images.
+    """A scan of ScanNet v2, from its `.sens` file if there is one, otherwise from exported images.
 
-    Extrinsics between the two cameras are not applied: its authors say that depth is registered to colour already, and
-    publish identities; a warning tells by how many pixels colour is shifted where a recording has others. Truth is the
-    labelled mesh, all of it, whatever frames are chosen.
+    Extrinsics between the two cameras are not applied: the published ones are identities, as color is registered to
+    depth already. Others are logged with the shift in px that they would cause.
     """
 
     def open(self) -> Contents:
         above = self.folder.resolve().parents[:2]
         tables = [parent / name for name in (FIRST_LABEL_TABLE, LABEL_TABLE) for parent in reversed(above)]
         self._label_tables = [table for table in tables if is_there(table)]
-        files = [self.folder / f"{self.name}{end}" for end in (MESH, SEGMENTS, OBJECTS)]
-        self.mesh = mesh_of(files, self._read_mesh)
-        if self.mesh is None and self.frame_ground_truth:
-            raise DataError(
-                f"dataset.frame_ground_truth: expected {self.folder / self.name}{MESH}, {SEGMENTS} and {OBJECTS}"
-            )
+        self.load_mesh([self.folder / f"{self.name}{end}" for end in MESH_FILES], self._read_mesh)
         if self.mesh and not self._label_tables:
             log.warning("%s is missing: only objects whose own name means a class are evaluated", tables[-1])
         self.annotation = f"ScanNet v2{'' if self._label_tables else ', no label table'}" if self.mesh else ""
@@ -86,7 +86,7 @@ class ScanNet(LabeledRecording):
 
     def _read_mesh(self, mesh: Path, segments: Path, objects: Path) -> LabeledMesh:
         nyu40: dict[str, str] = {}
-        for table in self._label_tables:  # the second release's, and of two the nearer one, have the last word
+        for table in self._label_tables:  # the second release, and the nearer of two tables, take precedence
             nyu40 |= read_label_table(table)
         return read_labeled_mesh(mesh, segments, objects, nyu40)
 
@@ -94,27 +94,21 @@ class ScanNet(LabeledRecording):
 def _sens_contents(path: Path) -> Contents:
     file = open_sens(path)
     header = file.header
-    for camera, name in ((header.color_camera, "colour"), (header.depth_camera, "depth")):
+    for camera, name in ((header.color_camera, "color"), (header.depth_camera, "depth")):
         if not _fits(camera):
             raise DataError(f"{path}: {name} intrinsics do not belong to images of {camera.width}x{camera.height} px")
     _warn_of_parallax(path, header.color_extrinsics, header.depth_extrinsics, header.depth_camera)
     with errors_of(path):
         registration = ColorRegistration(header.color_camera, header.depth_camera)
-    frames = [
-        RecordedFrame.posed(
-            registered_images(frame.images, registration), frame.depth_time / MICROSECONDS, frame.camera_to_world.pose
-        )
-        for frame in file.frames
-    ]
-    return Contents(header.depth_camera, path, header.depth_scale, [*frames, *_lost_frames(path, file, frames)])
-
-
-def _lost_frames(path: Path, file: SensFile, frames: Sequence[RecordedFrame]) -> list[RecordedFrame]:
-    """The frames that the file should hold as well."""
-    lost = range(len(frames), file.header.frames)
+    frames = []
+    for frame in file.frames:
+        images = registered_images(frame.images, registration)
+        frames.append(RecordedFrame.posed(images, frame.depth_time / MICROSECONDS, frame.camera_to_world.pose))
+    lost = range(len(frames), header.frames)
     if lost:
-        log.warning("%s lacks the last %d of %d frames: %s", path, len(lost), file.header.frames, file.cut)
-    return [RecordedFrame(frames[-1].images, k / FRAME_RATE, fault=f"{path}, {file.cut}") for k in lost]
+        log.warning("%s lacks the last %d of %d frames: %s", path, len(lost), header.frames, file.cut)
+    frames += [RecordedFrame(frames[-1].images, k / FRAME_RATE, fault=f"{path}, {file.cut}") for k in lost]
+    return Contents(header.depth_camera, path, header.depth_scale, frames)
 
 
 def _exported_contents(folder: Path) -> Contents:
@@ -150,23 +144,23 @@ def _camera(path: Path, width: int, height: int) -> Camera:
 
 
 def _color_camera(path: Path, width: int, height: int) -> Camera:
-    """The camera of exported colour, which the SensReader may have made smaller without touching the intrinsics."""
+    """The camera of exported color, which the SensReader may have made smaller without changing the intrinsics."""
     matrix = read_matrix(path)
     if _fits(matrix.camera(width, height)) or not _fits(camera := matrix.camera(*COLOR_SIZE)):
         return _camera(path, width, height)
     u, v = width / camera.width, height / camera.height
-    # pixel centres are at integers
+    # pixel centers are at integers
     return Camera(width, height, u * camera.fx, v * camera.fy, u * (camera.cx + 0.5) - 0.5, v * (camera.cy + 0.5) - 0.5)
 
 
 def _fits(camera: Camera) -> bool:
-    """Whether the intrinsics can be those of images of this size: no camera looks so far past their middle."""
+    """True if the principal point is near the middle of the image."""
     u, v = camera.cx / camera.width, camera.cy / camera.height
     return max(abs(u - 0.5), abs(v - 0.5)) <= 1 / 8
 
 
 def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, camera: Camera) -> None:
-    """Says by how much colour is shifted where the two cameras do not have the same extrinsics."""
+    """Log by how much color is shifted if the two cameras do not have the same extrinsics."""
     try:
         T_color_depth = inverse(color.pose()) @ depth.pose()
     except DataError:
@@ -174,9 +168,9 @@ def _warn_of_parallax(source: Path, color: PrintedMatrix, depth: PrintedMatrix, 
         return
     baseline, angle = float(np.linalg.norm(T_color_depth[:3, 3])), rotation_angle(T_color_depth[:3, :3])
     shift = camera.fx * (baseline / NEAR + angle)
-    if shift > SAME_WITHIN:
+    if shift > LARGEST_SHIFT:
         log.warning(
-            "%s: colour and depth camera are %.0f mm and %.2f degrees apart, which is not applied: colour is shifted by"
+            "%s: color and depth camera are %.0f mm and %.2f degrees apart, which is not applied: color is shifted by"
             " up to %.0f px %.0f m away",
             *(source, 1000 * baseline, np.degrees(angle), shift, NEAR),
         )

@@ -1,17 +1,16 @@
 """ScanNet's `.sens` files, version 4: a header, then frame after frame with its pose, times and compressed images.
 
     uint32 version, uint64 n, n bytes: the sensor's name
-    float32[64]     four 4x4 matrices: colour intrinsics, colour extrinsics, depth intrinsics, depth extrinsics
-    int32[2]        compression of colour (0 raw, 1 PNG, 2 JPEG) and depth (0 raw, 1 zlib, 2 Occipital's)
-    uint32[4]       width and height of colour, of depth
-    float32         depth units a metre
+    float32[64]     four 4x4 matrices: color intrinsics, color extrinsics, depth intrinsics, depth extrinsics
+    int32[2]        compression of color (0 raw, 1 PNG, 2 JPEG) and depth (0 raw, 1 zlib, 2 Occipital's)
+    uint32[4]       width and height of color, of depth
+    float32         depth units per meter
     uint64          number of frames
-    for each frame: float32[16] camera to world, uint64[2] times of colour and depth (microseconds),
-                    uint64[2] sizes of colour and depth (bytes), the two
+    for each frame: float32[16] camera to world, uint64[2] times of color and depth (microseconds),
+                    uint64[2] sizes of color and depth (bytes), the two
     (IMU readings follow, which are not read)
 
-All little-endian. Such a file has gigabytes: opening it reads the 96 bytes before each frame's images. ScanNet's own
-reader, a script and no package, holds all of it in memory.
+All little-endian. Opening a file reads only the 96 bytes before each frame's images.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass
+from math import prod
 from pathlib import Path
 from typing import BinaryIO
 
@@ -26,15 +26,15 @@ import numpy as np
 
 from framework.data import MOST_PIXELS, Camera, Float64, UInt8, UInt16
 from framework.datasets.frames.conventions import COARSEST_DEPTH, FINEST_DEPTH
-from framework.datasets.frames.stored_frames import StoredImages
+from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import check_regular
 from framework.files.image_files import decode_color
 from framework.files.matrix_file import PrintedMatrix
 
 VERSION = 4
-RAW, PNG, JPEG = 0, 1, 2  # compression of color; of depth: RAW, or
-ZLIB, OCCIPITAL = 1, 2
+RAW, PNG, JPEG = 0, 1, 2  # compression of color
+ZLIB, OCCIPITAL = 1, 2  # compression of depth, or RAW
 LONGEST_NAME = 1024  # bytes, of the sensor: "StructureSensor" has 15
 MOST_FRAMES = 2**18  # two and a half hours at 30 Hz; ScanNet's longest has some 6,000
 START = struct.Struct("<IQ")
@@ -46,67 +46,67 @@ OVERHEAD = 2**16  # bytes by which a compressed image may be larger than twice t
 
 @dataclass(frozen=True)
 class SensHeader:
-    """What a file says of all its frames."""
+    """Properties of all frames."""
 
     color_camera: Camera
     depth_camera: Camera
-    color_extrinsics: PrintedMatrix  # identity in all that was published, so which way it maps is not known
-    depth_extrinsics: PrintedMatrix  # likewise
+    color_extrinsics: PrintedMatrix  # of undocumented direction: the identity in all published files
+    depth_extrinsics: PrintedMatrix  # of undocumented direction
     color_compression: int  # RAW, PNG or JPEG
     depth_compression: int  # RAW or ZLIB
-    depth_scale: float  # units a metre
+    depth_scale: float  # units per meter
     frames: int  # number of frames that the file should hold
 
 
 @dataclass(frozen=True)
 class SensFrame:
-    """One frame, its images not read yet."""
+    """One frame, images not read yet."""
 
     path: Path
     header: SensHeader
     number: int
-    byte: int  # where its images begin: colour, then depth
+    byte: int  # start of its images: color, then depth
     color_bytes: int
     depth_bytes: int
     color_time: int  # microseconds
     depth_time: int  # microseconds
-    camera_to_world: PrintedMatrix  # T_world_camera; -inf where the pose is not known
-
-    @property
-    def color_name(self) -> str:
-        return f"{self.path}, colour of frame {self.number} at byte {self.byte}"
-
-    @property
-    def depth_name(self) -> str:
-        return f"{self.path}, depth of frame {self.number} at byte {self.byte + self.color_bytes}"
+    camera_to_world: PrintedMatrix  # T_world_camera; -inf = not known
 
     @property
     def images(self) -> StoredImages:
         """The two images, each in its own camera."""
-        return StoredImages(self.color_name, self.depth_name, self.color, self.depth)
+        return StoredImages(self._color_name, self._depth_name, self.color, self.depth)
+
+    @property
+    def _color_name(self) -> str:
+        return f"{self.path}, color of frame {self.number} at byte {self.byte}"
+
+    @property
+    def _depth_name(self) -> str:
+        return f"{self.path}, depth of frame {self.number} at byte {self.byte + self.color_bytes}"
 
     def color(self) -> UInt8:
-        """(H, W, 3) RGB in the colour camera. Raises FrameError."""
-        data = self._read(self.color_name, self.byte, self.color_bytes)
+        """Return color (H, W, 3), RGB, in the color camera. Raises FrameError."""
+        data = self._read(self._color_name, self.byte, self.color_bytes)
         if self.header.color_compression != RAW:
-            return decode_color(self.color_name, data)
+            return decode_color(self._color_name, data)
         shape = (*self.header.color_camera.shape, 3)
-        _check_length(self.color_name, len(data), shape[0] * shape[1] * 3)
+        _check_length(self._color_name, len(data), prod(shape))
         return np.frombuffer(data, np.uint8).reshape(shape)
 
     def depth(self) -> UInt16:
-        """(H, W) in the depth camera; 0 = no reading. Raises FrameError."""
-        data = self._read(self.depth_name, self.byte + self.color_bytes, self.depth_bytes)
+        """Return depth (H, W) in the depth camera, 0 = no reading. Raises FrameError."""
+        data = self._read(self._depth_name, self.byte + self.color_bytes, self.depth_bytes)
         shape = self.header.depth_camera.shape
-        length = shape[0] * shape[1] * 2
+        length = 2 * prod(shape)
         if self.header.depth_compression == ZLIB:
-            data = _inflate(self.depth_name, data, length)
-        _check_length(self.depth_name, len(data), length)
+            data = _inflate(self._depth_name, data, length)
+        _check_length(self._depth_name, len(data), length)
         return np.frombuffer(data, "<u2").reshape(shape).astype(np.uint16, copy=False)
 
     def _read(self, name: str, byte: int, length: int) -> bytes:
         try:
-            with self.path.open("rb") as file:  # of its own: frames are read in several threads
+            with self.path.open("rb") as file:  # not shared: frames are read in several threads
                 file.seek(byte)
                 data = file.read(length)
         except OSError as error:
@@ -117,15 +117,15 @@ class SensFrame:
 
 @dataclass(frozen=True)
 class SensFile:
-    """What a file holds."""
+    """Contents of a file."""
 
     header: SensHeader
-    frames: tuple[SensFrame, ...]  # those whose images are there, from the first on
-    cut: str  # why the others of header.frames are not; "" = all are
+    frames: tuple[SensFrame, ...]  # the complete ones, from the first on
+    cut: str  # why there are fewer than header.frames; "" = all are complete
 
 
 def open_sens(path: Path) -> SensFile:
-    """The header and where the frames are. Raises DataError, naming the byte, when the header cannot be."""
+    """Read the header and the positions of the frames. Raises DataError, with the byte, for an invalid header."""
     check_regular(path)
     try:
         with path.open("rb", buffering=0) as file:
@@ -141,50 +141,43 @@ def open_sens(path: Path) -> SensFile:
 
 
 def _read_header(path: Path, file: BinaryIO, length: int) -> SensHeader:
-    version, name_bytes = START.unpack(_take(path, file, START.size, length))
+    def take(count: int) -> bytes:
+        data = file.read(count)
+        if len(data) < count:
+            at = file.tell() - len(data)
+            raise DataError(f"{path}, byte {at}: the file ends at byte {length}, within its header")
+        return data
+
+    version, name_bytes = START.unpack(take(START.size))
     if version != VERSION:
         raise DataError(f"{path}, byte 0: expected version {VERSION} of the .sens format, found {version}")
     if name_bytes > LONGEST_NAME:
         raise DataError(f"{path}, byte 4: the sensor's name has {name_bytes} bytes, more than {LONGEST_NAME}")
-    _take(path, file, name_bytes, length)
-    matrices = [_take_matrix(path, file, length) for _ in range(4)]
+    take(name_bytes)
+    color_intrinsics, color_extrinsics, depth_intrinsics, depth_extrinsics = (
+        _matrix(f"{path}, byte {file.tell()}", take(MATRIX_BYTES)) for _ in range(4)
+    )
     at = file.tell()
-    color_code, depth_code, *sizes, depth_scale, frames = IMAGES.unpack(_take(path, file, IMAGES.size, length))
-    for what, width, height in (("colour", *sizes[:2]), ("depth", *sizes[2:])):
+    color_code, depth_code, *sizes, depth_scale, frames = IMAGES.unpack(take(IMAGES.size))
+    for name, width, height in (("color", *sizes[:2]), ("depth", *sizes[2:])):
         if not 0 < width * height <= MOST_PIXELS:
-            raise DataError(f"{path}, byte {at + 8}: {what} images of {width}x{height} px; at most {MOST_PIXELS} px")
+            raise DataError(f"{path}, byte {at + 8}: {name} images of {width}x{height} px; at most {MOST_PIXELS} px")
     if not COARSEST_DEPTH <= depth_scale <= FINEST_DEPTH:
-        raise DataError(
-            f"{path}, byte {at + 24}: the depth units a metre must be in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}], "
-            f"found {depth_scale:g}"
-        )
+        expected = f"expected depth units per meter in [{COARSEST_DEPTH:g}, {FINEST_DEPTH:g}]"
+        raise DataError(f"{path}, byte {at + 24}: {expected}, found {depth_scale:g}")
     if frames > MOST_FRAMES or frames * FRAME.size > length:
         raise DataError(f"{path}, byte {at + 28}: {frames} frames cannot be in a file of {length} bytes")
-    _check_compressions(path, at, color_code, depth_code)
-    color_intrinsics, color_extrinsics, depth_intrinsics, depth_extrinsics = matrices
-    return SensHeader(
-        color_camera=color_intrinsics.camera(*sizes[:2]),
-        depth_camera=depth_intrinsics.camera(*sizes[2:]),
-        color_extrinsics=color_extrinsics,
-        depth_extrinsics=depth_extrinsics,
-        color_compression=color_code,
-        depth_compression=depth_code,
-        depth_scale=depth_scale,
-        frames=frames,
-    )
-
-
-def _take(path: Path, file: BinaryIO, count: int, length: int) -> bytes:
-    at = file.tell()
-    data = file.read(count)
-    if len(data) < count:
-        raise DataError(f"{path}, byte {at}: the file ends at byte {length}, within its header")
-    return data
-
-
-def _take_matrix(path: Path, file: BinaryIO, length: int) -> PrintedMatrix:
-    at = file.tell()
-    return _matrix(f"{path}, byte {at}", _take(path, file, MATRIX_BYTES, length))
+    if depth_code == OCCIPITAL:
+        raise DataError(
+            f"{path}, byte {at + 4}: depth is compressed by Occipital's own method, which only their library reads; "
+            "export the frames with ScanNet's SensReader"
+        )
+    for byte, name, code, known in ((at, "color", color_code, (0, 1, 2)), (at + 4, "depth", depth_code, (0, 1))):
+        if code not in known:
+            raise DataError(f"{path}, byte {byte}: expected a compression of {name} in {known}, found {code}")
+    color_camera, depth_camera = color_intrinsics.camera(*sizes[:2]), depth_intrinsics.camera(*sizes[2:])
+    extrinsics = color_extrinsics, depth_extrinsics
+    return SensHeader(color_camera, depth_camera, *extrinsics, color_code, depth_code, depth_scale, frames)
 
 
 def _matrix(where: str, data: bytes) -> PrintedMatrix:
@@ -192,53 +185,32 @@ def _matrix(where: str, data: bytes) -> PrintedMatrix:
     return PrintedMatrix(where, values)
 
 
-def _check_compressions(path: Path, at: int, color: int, depth: int) -> None:
-    if color not in (RAW, PNG, JPEG):
-        raise DataError(f"{path}, byte {at}: expected a compression of colour: 0, 1 or 2, found {color}")
-    if depth == OCCIPITAL:
-        raise DataError(
-            f"{path}, byte {at + 4}: depth is compressed by Occipital's own method, which only their library reads; "
-            "export the frames with ScanNet's SensReader"
-        )
-    if depth not in (RAW, ZLIB):
-        raise DataError(f"{path}, byte {at + 4}: expected a compression of depth: 0 or 1, found {depth}")
-
-
 def _find_frames(path: Path, file: BinaryIO, length: int, header: SensHeader) -> tuple[list[SensFrame], str]:
-    """The frames whose images are in the file, and why there are no more; "" when these are all."""
-    most_color = 2 * 3 * header.color_camera.width * header.color_camera.height + OVERHEAD
-    most_depth = 2 * 2 * header.depth_camera.width * header.depth_camera.height + OVERHEAD
+    """The complete frames, and why there are no more; "" = these are all."""
+    most_color = 2 * 3 * prod(header.color_camera.shape) + OVERHEAD
+    most_depth = 2 * 2 * prod(header.depth_camera.shape) + OVERHEAD
     frames: list[SensFrame] = []
     at = file.tell()
     for number in range(header.frames):
-        if at + FRAME.size > length:
-            return frames, f"byte {at}: the file ends at byte {length}, before frame {number} of {header.frames} does"
+        ended = f"byte {at}: the file ends at byte {length}, before frame {number} of {header.frames} does"
+        images = at + FRAME.size
+        if images > length:
+            return frames, ended
         file.seek(at)
         pose, color_time, depth_time, color_bytes, depth_bytes = FRAME.unpack(file.read(FRAME.size))
-        images = at + FRAME.size
         if color_bytes > most_color or depth_bytes > most_depth:
-            return frames, f"byte {at}: frame {number} claims {color_bytes} bytes of colour and {depth_bytes} of depth"
+            return frames, f"byte {at}: frame {number} claims {color_bytes} bytes of color and {depth_bytes} of depth"
         if images + color_bytes + depth_bytes > length:
-            return frames, f"byte {at}: the file ends at byte {length}, before frame {number} of {header.frames} does"
-        frames.append(
-            SensFrame(
-                path=path,
-                header=header,
-                number=number,
-                byte=images,
-                color_bytes=color_bytes,
-                depth_bytes=depth_bytes,
-                color_time=color_time,
-                depth_time=depth_time,
-                camera_to_world=_matrix(f"{path}, byte {at}", pose),
-            )
-        )
+            return frames, ended
+        T_world_camera = _matrix(f"{path}, byte {at}", pose)
+        sizes = color_bytes, depth_bytes
+        frames.append(SensFrame(path, header, number, images, *sizes, color_time, depth_time, T_world_camera))
         at = images + color_bytes + depth_bytes
     return frames, ""
 
 
 def _inflate(name: str, data: bytes, length: int) -> bytes:
-    """What zlib makes of `data`, of which never more than one byte over `length` is unpacked."""
+    """The unpacked `data`, of at most `length` bytes."""
     stream = zlib.decompressobj()
     try:
         unpacked = stream.decompress(data, length + 1)

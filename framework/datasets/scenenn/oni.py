@@ -1,4 +1,4 @@
-"""The frames of an OpenNI recording (.oni): colour and depth, paired as SceneNN's own play-back pairs them."""
+"""The frames of an OpenNI recording (.oni): color and depth, paired as by SceneNN's own play-back."""
 
 from __future__ import annotations
 
@@ -16,25 +16,25 @@ from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, 
 from framework.datasets.scenenn.openni import OniImage, play
 from framework.errors import DataError, InstanceMapError, errors_of
 
-LARGEST_TIME_DIFFERENCE = 33_000  # us; SceneNN's play-back takes what is further apart for different moments
-WAITING = 30  # images of one stream that wait for one of the other, 1 s: the rest of the file may lack it
+LARGEST_TIME_DIFFERENCE = 33_000  # us, of the two images of a frame, as in SceneNN's play-back
+WAITING = 30  # images of one stream that wait for the other, 1 s: the rest of the file may lack it
 
 
 @dataclass(frozen=True)
 class OniFrame:
-    """Colour and depth of about the same moment, as they were recorded: registered or mirrored, if they were then."""
+    """Color and depth of about the same moment, registered or mirrored if they were recorded so."""
 
     color: UInt8  # (H, W, 3) RGB
-    depth_mm: UInt16  # (H, W) mm, 0 = not measured
+    depth_mm: UInt16  # (H, W) mm, 0 = no reading
     color_time: int  # us
     depth_time: int  # us
 
 
 def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
-    """The frames of a recording; one that was cut off is copied into the folder `scratch` meanwhile.
+    """Yield the frames of a recording; a truncated one is copied into the folder `scratch` meanwhile.
 
-    Raises ConfigError where OpenNI 2 is not installed, DataError when it does not play the recording to its end, or the
-    images are of a kind that a frame cannot be made of.
+    Raises ConfigError without OpenNI 2, and DataError if OpenNI 2 cannot play the recording to its end or the images
+    cannot form a frame.
     """
     with (
         errors_of(contents.path),
@@ -45,10 +45,10 @@ def read_frames(contents: OniContents, scratch: Path) -> Generator[OniFrame]:
 
 
 def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
-    """Frames of images in the file's order; of two that are too far apart the earlier one is left out.
+    """Yield the frames of images in the file's order; of two that are too far apart the earlier one is dropped.
 
-    This is what SceneNN's play-back does, whose numbers the published trajectories refer to. Raises DataError when
-    colour and depth have different sizes.
+    The published trajectories use the frame numbers of SceneNN's play-back, which does the same. Raises DataError if
+    color and depth have different sizes.
     """
     waiting = {stream: deque[OniImage](maxlen=WAITING) for stream in Stream}
     colors, depths = waiting[Stream.COLOR], waiting[Stream.DEPTH]
@@ -68,17 +68,14 @@ def pair(images: Iterable[OniImage]) -> Iterator[OniFrame]:
 
 
 def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """`play` in a process of its own: OpenNI 2 crashes on some damaged recordings, and then only that process ends."""
+    """Run `play` in its own process, as OpenNI 2 crashes on some damaged recordings."""
     spawn = multiprocessing.get_context("spawn")  # the library's threads and locks do not survive a fork
     receiver, sender = spawn.Pipe(duplex=False)
     player = spawn.Process(target=_deliver, args=(sender, path, streams), daemon=True)
     player.start()
     sender.close()
     try:
-        while True:
-            received = receiver.recv()
-            if received is None:
-                return
+        while (received := receiver.recv()) is not None:
             if isinstance(received, InstanceMapError):
                 raise received
             yield received
@@ -92,8 +89,8 @@ def play_apart(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniIma
 
 
 def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -> None:
-    """Sends the images and then None, or the fault that ended them."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; the other one ends this one
+    """Send the images and then None, or the error that ended them."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C goes to both processes; the parent ends this one
     try:
         with closing(play(path, streams)) as images:
             for image in images:
@@ -102,4 +99,4 @@ def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -
     except InstanceMapError as error:
         sender.send(error)
     except BrokenPipeError:
-        return  # nobody listens any more
+        return  # the receiver is closed

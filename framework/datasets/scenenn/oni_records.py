@@ -1,6 +1,6 @@
-"""The records of an OpenNI recording (.oni): which streams it holds, how many images, and where it was cut off.
+"""The records of an OpenNI recording (.oni): its streams, their numbers of images, and where it is truncated.
 
-Hand-written, for OpenNI 2 plays the images, but can crash on a damaged file: what it is given is looked at before.
+OpenNI 2 plays the images, but can crash on a damaged file, so its records are checked first.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import BinaryIO
+from typing import BinaryIO, NamedTuple
 
 from framework.errors import DataError
 from framework.files.atomic_write import check_regular
@@ -22,15 +22,15 @@ FILE_HEADER = struct.Struct("<4sBBHIQI")  # magic, version (four numbers), large
 FILE_MAGIC = b"NI10"
 LARGEST_NODE_AT = FILE_HEADER.size - 4
 VERSIONS = (1, 0, 0, 4), (1, 0, 1, 0)  # that OpenNI 2 plays, from and to
-FIRST_WIDE = (1, 0, 1, 0)  # from this version on, places in the file are 64 bits
+FIRST_WIDE = (1, 0, 1, 0)  # from this version on, positions in the file have 64 bits
 IMAGE_FIELDS = struct.Struct("<QI")  # time, us; number
 RECORD_MAGIC = b"NIR\0"
-LARGEST_NODE = 255  # recorders number them from 1; OpenNI allocates as many as the file says
-LARGEST_FIELDS = 2**20  # bytes; OpenNI has a buffer of 5.8 MB for them and does not look
+LARGEST_NODE = 255  # recorders number them from 1; OpenNI allocates as many as the file claims
+LARGEST_FIELDS = 2**20  # bytes; OpenNI has a buffer of 5.8 MB for them and does not check
 
 
 class OniRecord(IntEnum):
-    """The kinds of records that matter here."""
+    """The kinds of records that are read."""
 
     NODE_ADDED_1_0_0_4 = 0x02
     NEW_DATA = 0x0A
@@ -40,7 +40,7 @@ class OniRecord(IntEnum):
 
 
 class Stream(IntEnum):
-    """What a node of a recording delivers, with the format's number for it."""
+    """Type of a node, with the format's number for it."""
 
     DEPTH = 2
     COLOR = 3
@@ -48,30 +48,30 @@ class Stream(IntEnum):
 
 @dataclass
 class Images:
-    """The images of one stream that the file holds whole."""
+    """The complete images of one stream."""
 
-    node: int  # which records are this stream's
+    node: int  # of this stream's records
     count: int = 0
-    last: int = 0  # number of the last one; recorders count from 1
+    last: int = 0  # number of the last one, from 1
 
 
 @dataclass(frozen=True)
 class OniContents:
-    """What the records of a file say."""
+    """Contents of a file's records."""
 
     path: Path
     streams: Mapping[Stream, Images]  # both
-    end: int  # bytes of whole records
-    cut_off: bool  # whether what follows them is no record, though the recording goes on
+    end: int  # bytes of complete records
+    cut_off: bool  # True if the recording has no end record
     largest_node: int
-    wide: bool  # whether places in the file have 64 bits, else 32
-    table_notes: tuple[int, ...]  # where the places of the tables for seeking are noted
+    wide: bool  # positions in the file have 64 bits, else 32
+    table_notes: tuple[int, ...]  # positions of the fields with the positions of the seek tables
 
 
 def read_contents(path: Path) -> OniContents:
-    """The streams and their images; pixels are not looked at.
+    """Return the streams and their images, without their pixels.
 
-    Raises DataError when it is no recording, or has no image of depth or of colour.
+    Raises DataError if the file is no recording, or has no image of depth or of color.
     """
     check_regular(path)
     try:
@@ -83,40 +83,39 @@ def read_contents(path: Path) -> OniContents:
 
 @contextmanager
 def playable(contents: OniContents, scratch: Path) -> Iterator[Path]:
-    """A file that OpenNI 2 plays: the recording, or a copy of its whole records in `scratch` where it was cut off.
+    """Yield a file that OpenNI 2 plays: the recording, or a repaired copy in `scratch` if it is truncated.
 
-    OpenNI looks for the tables for seeking at the recording's end, and without them refuses all of it.
+    OpenNI reads the seek tables at the recording's end, and refuses the recording without them.
     """
     if not contents.cut_off:
         yield contents.path
         return
-    place, record_header = _layouts(contents.wide)
+    position, record_header = _layouts(contents.wide)
     with TemporaryDirectory(prefix=".", dir=scratch) as folder:
-        copy = Path(folder) / "mended.oni"
+        copy = Path(folder) / "repaired.oni"
         shutil.copyfile(contents.path, copy)
         with copy.open("r+b") as file:
-            file.seek(LARGEST_NODE_AT)  # a recorder that was killed has not noted it
+            file.seek(LARGEST_NODE_AT)  # written only by a recorder that was not killed
             file.write(struct.pack("<I", contents.largest_node))
             for note in contents.table_notes:
                 file.seek(note)
-                file.write(place.pack(0))  # 0 = there is no table
+                file.write(position.pack(0))  # 0 = there is no table
             file.seek(contents.end)
             file.write(record_header.pack(RECORD_MAGIC, OniRecord.END, 0, record_header.size, 0, 0))
         yield copy
 
 
-@dataclass(frozen=True)
-class _Record:
+class _Record(NamedTuple):
     kind: int
     node: int
     fields: bytes
-    fields_end: int  # bytes from the file's beginning
+    fields_end: int  # position in the file
     end: int
 
 
 def _read_contents(path: Path, file: BinaryIO) -> OniContents:
     wide = _read_version(path, file) >= FIRST_WIDE
-    place, record_header = _layouts(wide)
+    position, record_header = _layouts(wide)
     streams: dict[Stream, Images] = {}
     notes = []
     end, cut_off, largest_node = FILE_HEADER.size, True, 0
@@ -131,9 +130,13 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
             if stream is not None:
                 streams.setdefault(stream, Images(record.node))
             if record.kind == OniRecord.NODE_ADDED:
-                notes.append(record.fields_end - place.size)
-        elif record.kind == OniRecord.NEW_DATA:
-            _count(streams, record)
+                notes.append(record.fields_end - position.size)
+        elif record.kind == OniRecord.NEW_DATA and len(record.fields) >= IMAGE_FIELDS.size:
+            _time, number = IMAGE_FIELDS.unpack_from(record.fields)
+            for images in streams.values():
+                if images.node == record.node and number:
+                    images.count += 1
+                    images.last = number
     missing = [stream.name.lower() for stream in Stream if stream not in streams or not streams[stream].count]
     if missing:
         where = f" before byte {end}, where it is cut off or damaged" if cut_off else ""
@@ -142,9 +145,9 @@ def _read_contents(path: Path, file: BinaryIO) -> OniContents:
 
 
 def _layouts(wide: bool) -> tuple[struct.Struct, struct.Struct]:
-    """Of a place in the file, and of what a record begins with: magic, kind, node, two sizes, a place."""
-    place = "Q" if wide else "I"
-    return struct.Struct(f"<{place}"), struct.Struct(f"<4s4I{place}")
+    """The layouts of a position in the file, and of a record's start: magic, kind, node, two sizes, a position."""
+    position = "Q" if wide else "I"
+    return struct.Struct(f"<{position}"), struct.Struct(f"<4s4I{position}")
 
 
 def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
@@ -162,7 +165,7 @@ def _read_version(path: Path, file: BinaryIO) -> tuple[int, ...]:
 
 
 def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
-    """The records up to the end, or up to the first that is not whole."""
+    """The records up to the end record, or up to the first incomplete one."""
     size = file.seek(0, 2)
     position = FILE_HEADER.size
     while position + header.size <= size:
@@ -177,25 +180,14 @@ def _records(file: BinaryIO, header: struct.Struct) -> Iterator[_Record]:
         ):
             return
         yield _Record(kind, node, file.read(fields_size - header.size), position + fields_size, end)
-        if kind == OniRecord.END:
-            return
         position = end
 
 
 def _added_stream(path: Path, record: _Record) -> Stream | None:
-    """Which stream a node delivers; None for a device, infrared or sound."""
+    """The stream of a node; None for a device, infrared or sound."""
     try:
         (name_size,) = struct.unpack_from("<I", record.fields)
         (node_type,) = struct.unpack_from("<I", record.fields, 4 + name_size)
     except struct.error as error:
         raise DataError(f"{path} is damaged: the record before byte {record.fields_end} is too short") from error
     return Stream(node_type) if node_type in list(Stream) else None
-
-
-def _count(streams: Mapping[Stream, Images], record: _Record) -> None:
-    for images in streams.values():
-        if images.node == record.node and len(record.fields) >= IMAGE_FIELDS.size:
-            _time, number = IMAGE_FIELDS.unpack_from(record.fields)
-            if number:
-                images.count += 1
-                images.last = number

@@ -1,4 +1,4 @@
-"""Plays an OpenNI recording (.oni) through OpenNI 2's C library, in this process: a damaged file can crash it."""
+"""Play-back of an OpenNI recording (.oni) by OpenNI 2's C library, which a damaged file can crash."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from framework.errors import ConfigError, DataError
 
 LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
 LONGEST_PATH = 255  # bytes, of OpenNI 2
-PATIENCE = 10_000  # ms until a player that delivers nothing is taken for stuck
+PATIENCE = 10_000  # ms without an image until the player counts as stuck
 
 # OniCAPI.h, OniCEnums.h and OniCProperties.h of OpenNI 2.2
 API_VERSION = 2002
@@ -26,7 +26,7 @@ OK, TIME_OUT = 0, 102
 SENSORS = {Stream.DEPTH: 3, Stream.COLOR: 2}
 DEPTH_1_MM, DEPTH_100_UM, RGB888 = 100, 101, 200
 PLAYBACK_SPEED, PLAYBACK_REPEAT = 100, 101
-MANUAL = -1.0  # speed: the next image when it is asked for, so that none is lost
+MANUAL = -1.0  # speed: images come on request, so that none is lost
 
 
 class _VideoMode(ctypes.Structure):
@@ -39,14 +39,9 @@ class _Frame(ctypes.Structure):
         ("data", ctypes.c_void_p),
         ("sensor", ctypes.c_int),
         ("timestamp", ctypes.c_uint64),
-        ("index", ctypes.c_int),
-        ("width", ctypes.c_int),
-        ("height", ctypes.c_int),
+        *((name, ctypes.c_int) for name in ("index", "width", "height")),
         ("mode", _VideoMode),
-        ("cropped", ctypes.c_int),
-        ("crop_x", ctypes.c_int),
-        ("crop_y", ctypes.c_int),
-        ("stride", ctypes.c_int),
+        *((name, ctypes.c_int) for name in ("cropped", "crop_x", "crop_y", "stride")),
     ]
 
 
@@ -57,22 +52,24 @@ class OniImage:
     stream: Stream
     number: int  # within its stream
     time: int  # us
-    pixels: npt.NDArray[Any]  # (H, W) uint16 mm of depth, 0 = not measured; (H, W, 3) uint8 RGB of colour
+    pixels: npt.NDArray[Any]  # (H, W) uint16 mm of depth, 0 = no reading; (H, W, 3) uint8 RGB of color
 
 
 def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """The images that OpenNI 2 finds in a file, up to the last of each stream; damaged ones are missing."""
+    """Yield the images that OpenNI 2 finds in a file, up to the last of each stream, without damaged ones."""
     openni = _library()
-    if len(os.fsencode(path)) > LONGEST_PATH:
+    file = os.fsencode(path)
+    if len(file) > LONGEST_PATH:
         raise DataError(f"OpenNI 2 takes paths of at most {LONGEST_PATH} bytes; move it")
     with ExitStack() as stack:
         _check(openni.oniInitialize(API_VERSION), openni, "OpenNI 2 does not start")
         stack.callback(openni.oniShutdown)
         device = ctypes.c_void_p()
-        _check(openni.oniDeviceOpen(os.fsencode(path), ctypes.byref(device)), openni, "OpenNI 2 does not open it")
+        _check(openni.oniDeviceOpen(file, ctypes.byref(device)), openni, "OpenNI 2 does not open it")
         stack.callback(openni.oniDeviceClose, device)
-        _set(openni, device, PLAYBACK_REPEAT, ctypes.c_int(False))
-        _set(openni, device, PLAYBACK_SPEED, ctypes.c_float(MANUAL))
+        for name, value in ((PLAYBACK_REPEAT, ctypes.c_int(False)), (PLAYBACK_SPEED, ctypes.c_float(MANUAL))):
+            status = openni.oniDeviceSetProperty(device, name, ctypes.byref(value), ctypes.sizeof(value))
+            _check(status, openni, "OpenNI 2 does not take a property of its play-back")
         handles = []
         for stream in Stream:
             handle = ctypes.c_void_p()
@@ -86,7 +83,7 @@ def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
 
 
 def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[Stream, Images]) -> Generator[OniImage]:
-    """`handles` are in the order of Stream."""
+    """The images of `handles`, which are in the order of Stream."""
     waited = (ctypes.c_void_p * len(handles))(*handles)
     last = dict.fromkeys(Stream, 0)
     while any(last[stream] < streams[stream].last for stream in Stream):
@@ -101,9 +98,8 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
         status = openni.oniStreamReadFrame(handles[which.value], ctypes.byref(frame))
         _check(status, openni, "OpenNI 2 does not play it")
         try:
-            last[stream] = frame.contents.index
+            last[stream], time = frame.contents.index, frame.contents.timestamp
             pixels = _pixels(stream, frame.contents)
-            time = frame.contents.timestamp
         finally:
             openni.oniFrameRelease(frame)
         if pixels is not None:
@@ -111,7 +107,7 @@ def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[St
 
 
 def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
-    """A copy of the pixels; None where OpenNI delivers fewer than the image has."""
+    """A copy of the pixels; None if OpenNI delivers fewer than the image has."""
     pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
     if frame.data_size < frame.stride * frame.height:
         return None
@@ -138,12 +134,7 @@ def _library() -> Any:
     raise ConfigError("OpenNI 2 is not installed: apt-get install libopenni2-0")
 
 
-def _set(openni: Any, device: ctypes.c_void_p, property_id: int, value: Any) -> None:
-    status = openni.oniDeviceSetProperty(device, property_id, ctypes.byref(value), ctypes.sizeof(value))
-    _check(status, openni, "OpenNI 2 does not take a property of its play-back")
-
-
-def _check(status: int, openni: Any, fault: str) -> None:
+def _check(status: int, openni: Any, failure: str) -> None:
     if status != OK:
-        said = " ".join((openni.oniGetExtendedError() or b"").decode(errors="replace").split())
-        raise DataError(f"{fault}: {said or f'status {status}'}")
+        reason = " ".join((openni.oniGetExtendedError() or b"").decode(errors="replace").split())
+        raise DataError(f"{failure}: {reason or f'status {status}'}")

@@ -1,21 +1,21 @@
-"""SceneNN (Hua et al., 3DV 2016): rooms scanned with an Asus Xtion or a Kinect v2, with labelled meshes.
+"""SceneNN (Hua et al., 3DV 2016): rooms scanned with an Asus Xtion or a Kinect v2, with labeled meshes.
 
-    NNN/image/image00001.png    8-bit colour, from 1
-    NNN/depth/depth00001.png    uint16, mm, registered to colour
-    NNN/timestamp.txt           optional: number, time of colour, time of depth (microseconds)
+    NNN/image/image00001.png    8-bit color, from 1
+    NNN/depth/depth00001.png    uint16, mm, registered to color
+    NNN/timestamp.txt           optional: number, time of color, time of depth (microseconds)
     NNN/trajectory.log          T_world_camera, m; the pose with id i belongs to image i + 1
-    NNN/NNN.ply, NNN/NNN.xml    optional: the mesh with a label for each vertex, and what the labels mean
+    NNN/NNN.ply, NNN/NNN.xml    optional: the mesh with a label for each vertex, and the classes of the labels
     intrinsic/asus.ini          fx, fy, cx, cy
     release.txt                 optional, one line: the release of the annotation
-    synthesize.json             only where `python -m framework synthesize` made it all: with which parameters
+    synthesize.json             only of `instancemap synthesize`: its parameters
 
-The images are those that the official play-back, or `python -m framework convert-oni`, extracts from oni/NNN.oni.
+The images are those that the official play-back, or `instancemap convert-oni`, extracts from oni/NNN.oni.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
@@ -23,11 +23,18 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera
-from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, first_size, numbered_images, paired_images
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
-from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording, mesh_of
+from framework.datasets.frames.sequence_reader import (
+    FRAME_RATE,
+    Contents,
+    RecordedFrame,
+    StoredImages,
+    first_size,
+    numbered_images,
+    paired_images,
+)
+from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording
 from framework.datasets.scenenn.intrinsics import read_intrinsics
-from framework.datasets.scenenn.scenenn_annotation import Annotated, read_annotation
+from framework.datasets.scenenn.scenenn_annotation import LARGEST_ID, Annotated, read_annotation
 from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_timestamps, read_trajectory_log
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError
@@ -36,15 +43,14 @@ from framework.files.image_files import read_color
 from framework.files.ply import read_ply
 from framework.vocabulary.label_spaces import SCENENN_TO_COCO
 
-DEPTH_SCALE = 1000.0  # units a metre
-MOST_ID = np.iinfo(np.int32).max
-MADE_BY = "synthesize.json"  # in the folder of rendered rooms
+DEPTH_SCALE = 1000.0  # units per meter
+MADE_BY = "synthesize.json"  # in the folder of synthetic scenes
 
 log = logging.getLogger(__name__)
 
 
 class SceneNNSensor(StrEnum):
-    """The camera of a recording: SceneNN has a file of intrinsics for each."""
+    """The camera of a recording, each with its own file of intrinsics."""
 
     ASUS = "asus"
     KINECT2 = "kinect2"
@@ -52,15 +58,14 @@ class SceneNNSensor(StrEnum):
 
 @dataclass
 class SceneNN(LabeledRecording):
-    """A sequence of SceneNN, or of what `python -m framework synthesize` writes in its format.
+    """A sequence of SceneNN, or of `instancemap synthesize` in its format.
 
-    A frame that lacks an image, or a usable pose where there is a trajectory, cannot be used; a recording may have
-    some. Truth is the labelled mesh, all of it, whatever frames are chosen.
+    A frame without an image, or without a usable pose where there is a trajectory, cannot be used.
     """
 
     scene: str = "011"  # the sequence
     sensor: SceneNNSensor = SceneNNSensor.ASUS  # names the file of intrinsics
-    release: str = ""  # of the annotation, for tables: two exist and give other results; "" = what release.txt says
+    release: str = ""  # of the annotation, for tables: two exist, with different results; "" = as in release.txt
 
     def open(self) -> Contents:
         if (self.root / MADE_BY).is_file():
@@ -76,15 +81,12 @@ class SceneNN(LabeledRecording):
         log_file = self.folder / "trajectory.log"
         poses = read_trajectory_log(log_file) if is_there(log_file) else None
         times = _optional_times(self.folder / "timestamp.txt", list(images))
-        self.mesh = mesh_of([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
-        if self.mesh is None and self.frame_ground_truth:
-            raise DataError(f"dataset.frame_ground_truth needs {self.folder / number}.ply and .xml, the labelled mesh")
+        self.load_mesh([self.folder / f"{number}.ply", self.folder / f"{number}.xml"], read_labeled_mesh)
         self.annotation = self.release or _named_release(self.root) if self.mesh else ""
         frames = [_recorded(pair, k - 1, poses, times.get(k, (k - 1) / FRAME_RATE)) for k, pair in images.items()]
-        ini = self.root / "intrinsic" / f"{self.sensor}.ini"
-        fx, fy, cx, cy = read_intrinsics(ini)
+        fx, fy, cx, cy = read_intrinsics(self.root / "intrinsic" / f"{self.sensor}.ini")
         camera = Camera(*first_size(colors.values(), read_color), fx, fy, cx, cy)
-        return Contents(camera, "the first colour image", DEPTH_SCALE, frames)
+        return Contents(camera, "the first color image", DEPTH_SCALE, frames)
 
 
 def _recorded(images: StoredImages, pose_id: int, poses: TrajectoryLog | None, timestamp: float) -> RecordedFrame:
@@ -110,50 +112,40 @@ def _optional_times(path: Path, images: Sequence[int]) -> Mapping[int, float]:
 
 
 def read_labeled_mesh(mesh: Path, annotation: Path) -> LabeledMesh:
-    """The mesh with its labels as instances: those of the nine classes under COCO's names.
+    """Return the mesh with its labels as instances, with COCO's names for the nine evaluated classes.
 
-    Labels that have no name, or that the annotation does not have, are instances of unknown class: what is found there
-    is neither right nor wrong. Labels of other classes (wall, cabinet, ...) are known to be none of the nine: instance
-    0, as is label 0. A detection of a class beyond the nine is neither right nor wrong. Raises DataError, naming the
-    file, when one cannot be read or the mesh has no labels.
+    Labels without a name, or that the annotation lacks, have the class None: detections there are not evaluated.
+    Labels of other classes (wall, cabinet, ...) and label 0 are instance 0: a detection of the nine classes there is
+    wrong. Raises DataError, with the file, if one cannot be read or the mesh has no labels.
     """
     ply = read_ply(mesh)
     labels = ply.properties.get("label")
     if labels is None or labels.dtype.kind not in "iu":
         raise DataError(f"{mesh}: expected a vertex property `label` of whole numbers, found {sorted(ply.properties)}")
-    if len(labels) and (labels.min() < 0 or labels.max() > MOST_ID):
-        raise DataError(f"{mesh}: a label must be in [0, {MOST_ID}], found {labels.min()} to {labels.max()}")
+    if len(labels) and (labels.min() < 0 or labels.max() > LARGEST_ID):
+        raise DataError(f"{mesh}: a label must be in [0, {LARGEST_ID}], found {labels.min()} to {labels.max()}")
     names = {one.id: one for one in read_annotation(annotation)}
     present, inverse = np.unique(labels.astype(np.int32), return_inverse=True)
-    _warn_of_unlisted(mesh, annotation, set(present.tolist()) - names.keys() - {0})
+    unlisted = set(present.tolist()) - names.keys() - {0}
+    if unlisted:
+        message = "%s: %s does not have %d of its labels, like %d: these are not evaluated"
+        log.warning(message, mesh, annotation.name, len(unlisted), min(unlisted))
     class_names: dict[int, str | None] = {}
     ids = np.zeros(len(present), np.int32)
     for k, label in enumerate(present.tolist()):
-        if label and not _is_of_another_class(names.get(label)):
+        nyu_class = _nyu_class(names.get(label))
+        if label and (not nyu_class or nyu_class in SCENENN_TO_COCO):
             ids[k] = label
-            class_names[label] = SCENENN_TO_COCO.get(_nyu_class(names.get(label)))
+            class_names[label] = SCENENN_TO_COCO.get(nyu_class)
     return LabeledMesh(ply.vertices, ply.triangles, ids[inverse], class_names, tuple(SCENENN_TO_COCO.values()))
 
 
-def _warn_of_unlisted(mesh: Path, annotation: Path, labels: Collection[int]) -> None:
-    if labels:
-        message = (
-            "%s: %s does not have %d of its labels, like %d: their classes are not known, and they are not evaluated"
-        )
-        log.warning(message, mesh, annotation.name, len(labels), min(labels))
-
-
 def _nyu_class(label: Annotated | None) -> str:
-    """Empty where nobody could name it."""
+    """The class of a label, "" = not known."""
     if label is None or not label.text.strip():
         return ""
     name = label.nyu_class.strip().lower()
     return "" if name == "unknown" else name
-
-
-def _is_of_another_class(label: Annotated | None) -> bool:
-    name = _nyu_class(label)
-    return bool(name) and name not in SCENENN_TO_COCO
 
 
 def _named_release(root: Path) -> str:

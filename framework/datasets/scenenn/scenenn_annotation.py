@@ -1,9 +1,9 @@
-"""SceneNN's annotation, NNN.xml: which objects the labels of the mesh are."""
+"""SceneNN's annotation, NNN.xml: the objects of the mesh's labels."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,18 +21,18 @@ from framework.errors import DataError
 from framework.files.atomic_write import read_bytes, written_whole
 
 LARGEST_FILE = 2**24  # bytes; annotations have some 100 KB, and 16 MiB of crafted XML take 9 s and 0.5 GB
-LARGEST_ID = int(np.iinfo(np.int32).max)  # what a label of the mesh can be
-QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | that is rounding of printed digits
+LARGEST_ID = int(np.iinfo(np.int32).max)  # of a label of the mesh
+QUATERNION_TOLERANCE = 1e-2  # largest | |q| - 1 | from rounding of printed digits
 NO_COLOR = (0, 0, 0)
 NOT_IN_XML = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
 class Annotated:
-    """One label of the mesh. What the file does not say, or not in a usable form, is "", NO_COLOR or None."""
+    """One label of the mesh. Missing or unusable values are "", NO_COLOR or None."""
 
     id: int  # the value of the mesh's vertex property `label`, 0 to LARGEST_ID
-    text: str  # what the annotators called it
+    text: str  # name given by the annotators
     nyu_class: str  # its class among NYU's
     color: tuple[int, int, int] = NO_COLOR  # RGB
     aabb: Float64 | None = None  # (2, 3) m, smallest and largest corner
@@ -40,10 +40,10 @@ class Annotated:
 
 
 def read_annotation(path: Path) -> tuple[Annotated, ...]:
-    """The labels of an annotation, in the file's order; elements and attributes that are not known are left out.
+    """Return the labels of an annotation, in the file's order; unknown elements and attributes are ignored.
 
-    Raises DataError, naming the line, when the file is not XML, declares a document type (with which entities and
-    default attributes come), has no label, or one with no integer as its id, or two that differ with one id.
+    Raises DataError, with the line, if the file is not XML, declares a document type (which brings entities and default
+    attributes), has no label, one without an integer id, or two different ones with one id.
     """
     content = read_bytes(path, LARGEST_FILE)
     labels = _Labels(path)
@@ -53,22 +53,30 @@ def read_annotation(path: Path) -> tuple[Annotated, ...]:
         parser.feed(content)
         parser.close()
     except DefusedXmlException as error:
-        raise DataError(
-            f"{path}, line {labels.line}: document types and entities are refused, as they can be an attack; remove it"
-        ) from error
+        raise labels.error("document types and entities are refused, as they can be an attack; remove it") from error
     except ParseError as error:
         raise DataError(f"{path}, line {error.position[0]}: this is not XML: {ErrorString(error.code)}") from error
     except (ValueError, LookupError) as error:
-        raise DataError(f"{path}, line {labels.line}: its encoding is not known, expected UTF-8") from error
+        raise labels.error("its encoding is not known, expected UTF-8") from error
     if not labels.found:
         raise DataError(f"{path} holds no <label>: it is no annotation of SceneNN's")
-    return tuple(_annotated(id_, attributes) for id_, (attributes, _) in labels.found.items())
+    return tuple(
+        Annotated(
+            id_,
+            attributes.get("text", ""),
+            attributes.get("nyu_class", ""),
+            _color(attributes.get("color", "")),
+            _aabb(attributes.get("aabbox", "")),
+            _obb(attributes.get("obbox", "")),
+        )
+        for id_, (attributes, _) in labels.found.items()
+    )
 
 
 def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
-    """Writes an annotation, whole or not at all; `read_annotation` gives back the same, rotations to 1e-15.
+    """Write an annotation atomically; `read_annotation` returns the same, rotations to 1e-15.
 
-    Raises DataError when it would not, or the disk does not take the file.
+    Raises DataError if it would not, or the file cannot be written.
     """
     if not objects:
         raise DataError(f"{path}: an annotation has at least one label")
@@ -93,16 +101,12 @@ def write_annotation(path: Path, objects: Sequence[Annotated]) -> None:
 
 
 class _Labels:
-    """Collects the labels while the parser goes through the file: no tree, however large or deep the file is."""
+    """Parser target that collects the labels without a tree, however large or deep the file is."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        self.expat: Any = None  # it knows the line
+        self.expat: Any = None  # its position is the line of an error
         self.found: dict[int, tuple[dict[str, str], int]] = {}  # by id: the label's attributes and its line
-
-    @property
-    def line(self) -> int:
-        return int(self.expat.CurrentLineNumber)
 
     def start(self, tag: str, attributes: dict[str, str]) -> None:
         if tag.rpartition("}")[2] != "label":  # behind its namespace, if it has one
@@ -110,33 +114,18 @@ class _Labels:
         id_ = _id(attributes.get("id", ""))
         if id_ is None:
             found = repr(attributes["id"][:40]) if "id" in attributes else "none"
-            raise self._fault(f"a label needs an id from 0 to {LARGEST_ID}, found {found}")
-        before, line = self.found.setdefault(id_, (attributes, self.line))
+            raise self.error(f"a label needs an id from 0 to {LARGEST_ID}, found {found}")
+        before, line = self.found.setdefault(id_, (attributes, self.expat.CurrentLineNumber))
         if attributes != before:
-            raise self._fault(f"the label {id_} is there already in line {line}, with other attributes")
+            raise self.error(f"the label {id_} is there already in line {line}, with other attributes")
 
-    def _fault(self, message: str) -> DataError:
-        return DataError(f"{self._path}, line {self.line}: {message}")
-
-
-def _annotated(id_: int, attributes: Mapping[str, str]) -> Annotated:
-    return Annotated(
-        id=id_,
-        text=attributes.get("text", ""),
-        nyu_class=attributes.get("nyu_class", ""),
-        color=_color(attributes.get("color", "")),
-        aabb=_aabb(attributes.get("aabbox", "")),
-        obb=_obb(attributes.get("obbox", "")),
-    )
+    def error(self, message: str) -> DataError:
+        return DataError(f"{self._path}, line {self.expat.CurrentLineNumber}: {message}")
 
 
 def _attributes(label: Annotated) -> dict[str, str]:
-    attributes = {
-        "id": str(label.id),
-        "color": " ".join(map(str, label.color)),
-        "text": label.text,
-        "nyu_class": label.nyu_class,
-    }
+    color = " ".join(map(str, label.color))
+    attributes = {"id": str(label.id), "color": color, "text": label.text, "nyu_class": label.nyu_class}
     if label.aabb is not None:
         attributes["aabbox"] = _written(label.aabb.ravel())
     if label.obb is not None:
@@ -151,9 +140,8 @@ def _written(numbers: Float64) -> str:
 
 def _id(text: str) -> int | None:
     text = text.strip()
-    if not (text.isascii() and text.isdigit() and len(text) <= 10 and int(text) <= LARGEST_ID):
-        return None
-    return int(text)
+    valid = text.isascii() and text.isdigit() and len(text) <= 10 and int(text) <= LARGEST_ID
+    return int(text) if valid else None
 
 
 def _color(text: str) -> tuple[int, int, int]:
@@ -165,7 +153,7 @@ def _color(text: str) -> tuple[int, int, int]:
 
 
 def _aabb(text: str) -> Float64 | None:
-    """From `minx miny minz maxx maxy maxz`."""
+    """The box of `minx miny minz maxx maxy maxz`."""
     numbers = _numbers(text, 6)
     if numbers is None or (numbers[:3] > numbers[3:]).any():
         return None
@@ -173,7 +161,7 @@ def _aabb(text: str) -> Float64 | None:
 
 
 def _obb(text: str) -> Box | None:
-    """From the centre, the dimensions and a quaternion xyzw (github.com/hkust-vgd/scenenn, issue 11)."""
+    """The box of a center, the dimensions and a quaternion xyzw (github.com/hkust-vgd/scenenn, issue 11)."""
     numbers = _numbers(text, 10)
     if numbers is None or (numbers[3:6] < 0).any():
         return None
@@ -183,12 +171,9 @@ def _obb(text: str) -> Box | None:
 
 
 def _numbers(text: str, count: int) -> Float64 | None:
-    """So many finite numbers, or None."""
-    words = text.split(maxsplit=count)
-    if len(words) != count:
-        return None
+    """The `count` finite numbers of a text, None if it is something else."""
     try:
-        numbers = np.array([float(word) for word in words])
+        numbers = np.array([float(word) for word in text.split(maxsplit=count)])
     except ValueError:
         return None
-    return numbers if np.isfinite(numbers).all() else None
+    return numbers if len(numbers) == count and np.isfinite(numbers).all() else None

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from codecs import BOM_UTF8
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,22 +23,19 @@ from framework.geometry import nearest_rigid
 
 LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
 BLOCK = 5  # lines of a frame
-HEADER = "frame frame frame+1"
-LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as the published files have it
-MICROSECONDS = 1e6  # a second, of timestamp.txt
-CUT_OFF = "the file ends before the pose does"
+LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as in the published files
+MICROSECONDS = 1e6  # per second
 
 
 @dataclass(frozen=True)
 class TrajectoryLog:
-    """What a file says of each frame; frames that it does not name are in neither mapping."""
+    """The poses of a file. Frames that it does not contain are in neither mapping."""
 
     poses: Mapping[int, Float64]  # frame from 0 -> T_world_camera (4, 4), exactly rigid
-    unusable: Mapping[int, str]  # frame from 0 -> why: not rigid (tracking was lost), not finite, cut off, two
+    unusable: Mapping[int, str]  # frame from 0 -> reason: not rigid (tracking was lost), not finite, cut off, two
 
 
-@dataclass(frozen=True)
-class _Line:
+class _Line(NamedTuple):
     number: int  # in the file, from 1
     words: list[str]
 
@@ -47,11 +45,13 @@ class _Line:
 
 
 def read_trajectory_log(path: Path) -> TrajectoryLog:
-    """The poses of a trajectory.log. A frame that the end of the file cuts off, or with two poses, is unusable.
+    """Return the poses of a trajectory.log. A frame that is cut off by the file's end, or has two poses, is unusable.
 
-    Raises DataError, naming file and line, when a line elsewhere is not as it should be.
+    Raises DataError, with the file and the line, for an invalid line elsewhere.
     """
-    lines = _read_lines(path)
+    content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
+    numbered = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
+    lines = [line for line in numbered if line.words]
     poses: dict[int, Float64] = {}
     unusable: dict[int, str] = {}
     given: dict[int, tuple[int, Float64]] = {}  # line and matrix of each frame
@@ -59,9 +59,12 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
         header, *rows = lines[first : first + BLOCK]
         at_end = first + BLOCK >= len(lines)
         cut = at_end and not rows  # within the header or behind it
-        if cut and len(header.words) == 1 and _are_digits(header.words):
+        if cut and len(header.words) == 1 and _is_frame(header.words[0]):
             break  # the frame's number may be cut off itself
-        frame = _frame(path, header, least=2 if cut else 3)
+        if not 3 - cut <= len(header.words) <= 3 or not all(map(_is_frame, header.words)):
+            expected = f"expected the header of a frame, frame frame frame+1, found {header.shown}"
+            raise DataError(f"{path}, line {header.number}: {expected}")
+        frame = int(header.words[0])
         matrix = _matrix(path, rows, at_end)
         if frame in given:
             before, first_matrix = given[frame]
@@ -70,7 +73,7 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
                 unusable[frame] = f"it has two poses, in lines {before} and {header.number}"
             continue
         if matrix is None:
-            unusable[frame] = CUT_OFF
+            unusable[frame] = "the file ends before the pose does"
             continue
         given[frame] = header.number, matrix
         try:
@@ -81,10 +84,9 @@ def read_trajectory_log(path: Path) -> TrajectoryLog:
 
 
 def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
-    """Writes T_world_camera (4, 4) of each frame, whole or not at all; `read_trajectory_log` gives the same back.
+    """Write T_world_camera (4, 4) of each frame atomically; reading returns the nearest exactly rigid transforms.
 
-    What is rigid within ROTATION_TOLERANCE but not as exactly as float64 can comes back as the nearest rigid transform.
-    Raises DataError when a frame's number is negative, its pose not rigid, or the disk does not take the file.
+    Raises DataError if a frame's number is negative, its pose not rigid, or the file cannot be written.
     """
     lines = []
     for frame, T_world_camera in sorted(poses.items()):
@@ -98,55 +100,33 @@ def write_trajectory_log(path: Path, poses: Mapping[int, Float64]) -> None:
         temporary.write_text("".join(line + "\n" for line in lines), encoding="ascii")
 
 
-def _read_lines(path: Path) -> list[_Line]:
-    """The lines that hold something."""
-    content = read_bytes(path, MOST_TEXT).removeprefix(BOM_UTF8)
-    lines = (_Line(k, line.decode("latin-1").split()) for k, line in enumerate(content.splitlines(), start=1))
-    return [line for line in lines if line.words]
-
-
-def _frame(path: Path, header: _Line, least: int) -> int:
-    """The frame that a header of at least so many numbers names."""
-    if not least <= len(header.words) <= 3 or not _are_digits(header.words):
-        raise DataError(f"{path}, line {header.number}: expected the header of a frame, {HEADER}, found {header.shown}")
-    return int(header.words[0])
-
-
-def _matrix(path: Path, rows: list[_Line], at_end: bool) -> Float64 | None:
-    """The four rows (4, 4), finite or not; None when the end of the file cuts them off."""
+def _matrix(path: Path, rows: Sequence[_Line], at_end: bool) -> Float64 | None:
+    """The four rows (4, 4), finite or not; None if the end of the file cuts them off."""
     matrix = np.empty((4, 4))
     for k, line in enumerate(rows):
-        numbers = _numbers(line.words)
+        try:
+            numbers = [number(word) for word in line.words]
+        except ValueError:
+            numbers = []
         if len(numbers) == 4:
             matrix[k] = numbers
         elif at_end and k == len(rows) - 1 and len(line.words) <= 4:
             return None
         else:
-            raise DataError(
-                f"{path}, line {line.number}: expected row {k + 1} of a 4x4 matrix, four numbers, found {line.shown}"
-            )
+            expected = f"expected row {k + 1} of a 4x4 matrix, four numbers, found {line.shown}"
+            raise DataError(f"{path}, line {line.number}: {expected}")
     return matrix if len(rows) == 4 else None
 
 
-def _numbers(words: list[str]) -> list[float]:
-    """The words as numbers; empty when one is none."""
-    try:
-        return [number(word) for word in words]
-    except ValueError:
-        return []
-
-
-def _are_digits(words: list[str]) -> bool:
-    """Whether these are numbers of a header."""
-    return all(
-        word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1 for word in words
-    )
+def _is_frame(word: str) -> bool:
+    """True for a number that may be in a header."""
+    return word.isascii() and word.isdigit() and len(word) < 11 and int(word) <= LARGEST_FRAME + 1
 
 
 def read_timestamps(path: Path) -> Mapping[int, float]:
-    """When each image was taken, s, by its number: the time of its depth, which is what is mapped.
+    """Return the time of each image in s by its number: that of its depth.
 
-    Raises DataError, naming file and line, when a line does not hold a number and two times, or has an earlier number.
+    Raises DataError, with the file and the line, if a line is not a number and two times, or repeats a number.
     """
     times: dict[int, float] = {}
     for n, line in enumerate(read_lines(path), start=1):
@@ -156,7 +136,7 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
         try:
             image, _color, depth = int(words[0]), *map(float, words[1:])
         except ValueError as error:
-            expected = f"expected `number colour_us depth_us`, found {line[:SHOWN]!r}"
+            expected = f"expected `number color_us depth_us`, found {line[:SHOWN]!r}"
             raise DataError(f"{path}, line {n}: {expected}") from error
         if not math.isfinite(depth):
             raise DataError(f"{path}, line {n}: the time is not finite")
@@ -167,11 +147,8 @@ def read_timestamps(path: Path) -> Mapping[int, float]:
 
 
 def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mapping[int, float] | None = None) -> None:
-    """Writes the time in s of each image, by its number, whole or not at all.
-
-    `times` are those of depth, and of colour as well where it has none of its own.
-    """
+    """Write the times of depth and color in s of each image, by its number, atomically; None = those of depth."""
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
-        for number, time in times.items():
-            color_time = time if color_times is None else color_times[number]
-            file.write(f"{number} {round(color_time * MICROSECONDS)} {round(time * MICROSECONDS)}\n")
+        for image, time in times.items():
+            color_time = time if color_times is None else color_times[image]
+            file.write(f"{image} {round(color_time * MICROSECONDS)} {round(time * MICROSECONDS)}\n")

@@ -1,7 +1,6 @@
-"""Messages of ROS bags: which there are, when, and the images in them.
+"""Messages of ROS bags, and the images in them.
 
-Message definitions that a bag brings are not used: the library would make code of them. Those of the standard types are
-known.
+Message definitions in a bag are not used, as rosbags would generate code from them. The standard types are known.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 
 TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
 
-COLOR_CHANNELS = {  # of 8 bits, as indices of R, G, B
+COLOR_CHANNELS = {  # of 8 bits: their number, and the indices of R, G, B
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
     "8UC3": (3, (2, 1, 0)),
@@ -37,9 +36,9 @@ COLOR_CHANNELS = {  # of 8 bits, as indices of R, G, B
     "mono8": (1, (0, 0, 0)),
     "8UC1": (1, (0, 0, 0)),
 }
-MILLIMETRES, METRES = ("16UC1", "mono16", "Z16"), ("32FC1",)
+MILLIMETERS, METERS = ("16UC1", "mono16", "Z16"), ("32FC1",)
 COMPRESSED_DEPTH = "compressedDepth"  # in the format of such images, behind the encoding
-DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: a number that nobody uses, quantization A and B
+DEPTH_HEADER = struct.Struct("<iff")  # of compressedDepth: an unused number, quantization A and B
 
 
 @dataclass(frozen=True)
@@ -48,7 +47,7 @@ class Message:
 
     topic: str
     kind: str  # its type
-    stored_at: int  # ns, when it was recorded
+    stored_at: float  # s, when it was recorded
     raw: bytes
 
 
@@ -56,14 +55,14 @@ class RosBag:
     """A ROS 1 bag, or a ROS 2 bag: a folder, an .mcap or a .db3 file."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DataError, naming the bag, when it cannot be read."""
+        """Raises DataError, with the bag, if it cannot be read."""
         self.path = path
         import_optional("rosbags", "reads ROS bags", "ros")
         from rosbags import rosbag1, rosbag2, typesys
 
         self._is_ros1 = path.suffix.lower() == ".bag"
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
-        if TRANSFORMS not in self._types.types:  # rosbags does not know it in ROS 1
+        if TRANSFORMS not in self._types.types:  # rosbags lacks it in ROS 1
             self._types.register(typesys.get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS))
         try:
             self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
@@ -73,37 +72,36 @@ class RosBag:
             raise DataError(f"{path} could not be read: {in_one_line(error)[:SHOWN]}") from error
 
     def topics(self, *kinds: str) -> list[str]:
-        """The topics with messages of these types."""
+        """Return the topics with messages of these types."""
         return sorted(topic for topic, kind in self.kinds.items() if kind in kinds)
 
     def messages(self, topics: Sequence[str]) -> Iterator[Message]:
-        """The messages of some topics in the order of recording. Raises DataError where the bag is damaged."""
+        """Yield the messages of some topics in the order of recording. Raises DataError where the bag is damaged."""
         chosen = [found for found in self._reader.connections if found.topic in topics]
         if not chosen:
             return
         try:
             for connection, stored_at, raw in self._reader.messages(chosen):
-                yield Message(connection.topic, connection.msgtype, stored_at, bytes(raw))
+                yield Message(connection.topic, connection.msgtype, stored_at * NANOSECONDS, bytes(raw))
         except Exception as error:  # of many kinds
             raise DataError(f"{self.path} is damaged: {in_one_line(error)[:SHOWN]}") from error
 
     def first(self, topic: str) -> Any:
-        """The first message of a topic, decoded; None where there is none. Raises DataError."""
+        """Return the first message of a topic, decoded, or None without one. Raises DataError."""
         message = next(self.messages([topic]), None)
         return None if message is None else self.decoded(message)
 
     def decoded(self, message: Message) -> Any:
-        """What a message says. Raises FrameError, naming the topic, when it is damaged."""
+        """Return the content of a message. Raises FrameError, with the topic, if it is damaged."""
         decode = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
         try:
             return decode(message.raw, message.kind)
         except Exception as error:  # of many kinds
-            raise FrameError(
-                f"{self.path}: a message of {message.topic} is damaged: {in_one_line(error)[:SHOWN]}"
-            ) from error
+            reason = in_one_line(error)[:SHOWN]
+            raise FrameError(f"{self.path}: a message of {message.topic} is damaged: {reason}") from error
 
-    def sensed_at(self, message: Message) -> int:
-        """ns, by the message's header, which is its first field: when the device saw what it says."""
+    def sensed_at(self, message: Message) -> float:
+        """Return the time of measurement in s from the message's header, which is its first field."""
         try:
             if self._is_ros1:
                 seconds, nanoseconds = struct.unpack_from("<xxxxII", message.raw)
@@ -112,42 +110,41 @@ class RosBag:
                 seconds, nanoseconds = struct.unpack_from(f"{order}xxxxiI", message.raw)
         except (struct.error, IndexError) as error:
             raise FrameError(f"{self.path}: a message of {message.topic} has no header") from error
-        return int(seconds) * 10**9 + int(nanoseconds)
+        return (int(seconds) * 10**9 + int(nanoseconds)) * NANOSECONDS
 
 
 def color_of(where: str, message: Any) -> UInt8:
-    """(H, W, 3) RGB of an Image or a CompressedImage. Raises FrameError, naming `where`."""
+    """Return the color (H, W, 3), RGB, of an Image or a CompressedImage. Raises FrameError, with `where`."""
     if hasattr(message, "format"):
         return decode_color(where, message.data.tobytes())
     if message.encoding not in COLOR_CHANNELS:
-        raise FrameError(f"{where}: colour must be one of {', '.join(COLOR_CHANNELS)}, found {message.encoding[:60]!r}")
+        raise FrameError(f"{where}: color must be one of {', '.join(COLOR_CHANNELS)}, found {message.encoding[:60]!r}")
     channels, order = COLOR_CHANNELS[message.encoding]
     return np.ascontiguousarray(_pixels(where, message, np.dtype(np.uint8), channels)[..., order])
 
 
 def depth_of(where: str, message: Any, unit: float) -> Float32:
-    """(H, W) m, 0 = no reading, of an Image or a CompressedImage; whole numbers count `unit` m.
+    """Return the depth (H, W) in m, 0 = no reading, of an Image or a CompressedImage.
 
-    Raises FrameError, naming `where`.
+    `unit` is that of whole numbers in m. Raises FrameError, with `where`.
     """
     if hasattr(message, "format"):
         return _compressed_depth(where, message, unit)
     order = ">" if message.is_bigendian else "<"
-    if message.encoding in MILLIMETRES:
+    if message.encoding in MILLIMETERS:
         return _whole(_pixels(where, message, np.dtype(f"{order}u2"), 1)[..., 0], unit)
-    if message.encoding in METRES:
+    if message.encoding in METERS:
         return readings(_pixels(where, message, np.dtype(f"{order}f4"), 1)[..., 0].astype(np.float32))
-    known = ", ".join((*MILLIMETRES, *METRES))
+    known = ", ".join((*MILLIMETERS, *METERS))
     raise FrameError(f"{where}: depth must be one of {known}, found {message.encoding[:60]!r}")
 
 
 def _whole(stored: Array, unit: float) -> Float32:
-    none = np.iinfo(np.uint16).max
-    return np.where(stored == none, 0, stored).astype(np.float32) * np.float32(unit)
+    return np.where(stored == np.iinfo(np.uint16).max, 0, stored).astype(np.float32) * np.float32(unit)
 
 
 def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
-    """A PNG, of compressedDepth behind a header of 12 bytes; that of floats holds quantized inverse depth."""
+    """The depth of a PNG, after a header of 12 bytes in compressedDepth, which quantizes inverse depth of floats."""
     encoding, _, codec = message.format.partition(";")
     data = message.data.tobytes()
     if COMPRESSED_DEPTH not in codec:
@@ -158,20 +155,18 @@ def _compressed_depth(where: str, message: Any, unit: float) -> Float32:
         raise FrameError(f"{where} ends after {len(data)} bytes")
     _, quantization_a, quantization_b = DEPTH_HEADER.unpack_from(data)
     stored = decode_uint16(where, data[DEPTH_HEADER.size :])
-    if encoding.strip() not in METRES:
+    if encoding.strip() not in METERS:
         return _whole(stored, unit)
     with np.errstate(all="ignore"):
         return readings(np.where(stored == 0, 0, quantization_a / (stored.astype(np.float64) - quantization_b)))
 
 
 def _pixels(where: str, message: Any, dtype: np.dtype[Any], channels: int) -> Array:
-    """(H, W, channels) of an Image."""
+    """The pixels (H, W, channels) of an Image."""
     height, width, step = int(message.height), int(message.width), int(message.step)
     row = width * channels * dtype.itemsize
     if not 0 < row <= step or height < 1 or len(message.data) != height * step:
-        raise FrameError(
-            f"{where} is damaged: {width}x{height} px of {message.encoding[:60]!r}, {step} bytes a row, do not make "
-            f"{len(message.data)} bytes"
-        )
+        size = f"{width}x{height} px of {message.encoding[:60]!r}, {step} bytes a row"
+        raise FrameError(f"{where} is damaged: {size}, do not make {len(message.data)} bytes")
     rows = np.asarray(message.data, np.uint8).reshape(height, step)[:, :row]
     return np.ascontiguousarray(rows).view(dtype).reshape(height, width, channels)

@@ -1,4 +1,4 @@
-"""Images turned by quarters, with their camera, pose and lens: phones store them as the sensor lies.
+"""Rotation of images by quarter turns, with their camera, pose and lens, as phones store images in sensor orientation.
 
 A quarter clockwise moves the pixel (u, v) of an image of height H to (H - 1 - v, u), and the point (x, y, z) of the
 camera to (-y, x, z).
@@ -23,18 +23,18 @@ SIDEWAYS = 0.5  # mean length, in [0, 1], of the world's up in the image: less i
 
 @dataclass(frozen=True)
 class Turn:
-    """So many quarters clockwise."""
+    """A rotation by clockwise quarters."""
 
     quarters: int = 0  # 0 to 3
 
     @property
     def R_turned_camera(self) -> Float64:
-        """(3, 3)"""
+        """The rotation (3, 3) from the camera before to the camera after the turn."""
         quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
         return np.linalg.matrix_power(quarter, self.quarters)
 
     def image(self, image: NDArray[Value]) -> NDArray[Value]:
-        """(H, W) or (H, W, 3)"""
+        """Return the rotated image (H, W) or (H, W, 3)."""
         return np.ascontiguousarray(np.rot90(image, -self.quarters))
 
     def camera(self, camera: Camera) -> Camera:
@@ -44,7 +44,7 @@ class Turn:
         return camera
 
     def pose(self, T_world_camera: Float64) -> Float64:
-        """T_world_turned (4, 4)"""
+        """Return T_world_turned (4, 4)."""
         T = T_world_camera.copy()
         T[:3, :3] = T[:3, :3] @ self.R_turned_camera.T
         return T
@@ -56,7 +56,10 @@ class Turn:
 
 
 def upright(ups_camera: Sequence[Float64 | None]) -> Turn | None:
-    """The turn after which up, (3,) in the camera of each frame, None = not known, points up; None = none can tell."""
+    """Return the turn to upright images, or None if it is not known.
+
+    `ups_camera` has up (3,) in the camera of each frame, None = not known.
+    """
     known = [up for up in ups_camera if up is not None]
     if not known:
         return None

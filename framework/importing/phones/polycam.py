@@ -1,15 +1,14 @@
 """Polycam's raw data (developer mode; https://github.com/PolyCam/polyform describes it).
 
-    keyframes/images/1442008525605.jpg          8-bit colour as the sensor lies; the name is a time in microseconds
+    keyframes/images/1442008525605.jpg          8-bit color in sensor orientation; the name is a time in microseconds
     keyframes/cameras/1442008525605.json        fx, fy, cx, cy, width, height and t_00 ... t_23, ARKit's T_world_camera
-    keyframes/corrected_cameras/, corrected_images/     the same with optimised poses and without the lens' distortion,
-                                                        unless the session was too long for that
+    keyframes/corrected_cameras/, corrected_images/     the same with optimized poses and without lens distortion,
+                                                        unless the session was too long
     keyframes/depth/1442008525605.png           uint16 mm, 256x192; corrected_depth/ goes with corrected_images/
-    keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, between them medium (127 by the description, 54
+    keyframes/confidence/1442008525605.png      uint8: 0 low, 255 high, between them medium (127 in the description, 54
                                                 in exports)
 
-What is corrected is taken where it is there. Up is told by the pose as it was recorded: nobody says whether y is up in
-the world of optimised ones.
+Corrected files are preferred. Up comes from the recorded poses: the world's y axis of optimized poses is undocumented.
 """
 
 from __future__ import annotations
@@ -24,26 +23,33 @@ from framework.data import Float64
 from framework.datasets.calibration.camera_json import numbers_of, pinhole, read_json_object
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
-from framework.importing.source import FAIRLY_SURE, SURE, UNSURE, DeviceFrame, Source, arkit_pose, arkit_up, metres
+from framework.importing.source import (
+    FAIRLY_SURE,
+    SURE,
+    UNSURE,
+    DeviceFrame,
+    Format,
+    Source,
+    arkit_pose,
+    arkit_up,
+    meters,
+)
 
-MICROSECONDS = 1e6  # in a second
+MICROSECONDS = 1e6  # per second
 HIGH = 255  # in the images of confidence
 ROWS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
-INTRINSICS = ("fx", "fy", "cx", "cy")
 
 
 def keyframes(path: Path) -> Path:
-    """The folder with the images, where `path` is this folder or the one around it."""
+    """Return the folder with the images: `path` or its subfolder."""
     return path / "keyframes" if (path / "keyframes").is_dir() else path
 
 
-def recognised(path: Path) -> bool:
-    """Whether `path` is a folder of this app."""
+def recognized(path: Path) -> bool:
     return (keyframes(path) / "cameras").is_dir() and (keyframes(path) / "images").is_dir()
 
 
 def open_source(path: Path) -> Source:
-    """The recording in a folder. Raises DataError when no frame has colour, depth and a camera."""
     folder = keyframes(path)
     stems = sorted((entry.stem for entry in (folder / "cameras").glob("*.json") if _is_time(entry.stem)), key=int)
     if not (folder / "depth").is_dir() or not stems:
@@ -57,27 +63,26 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
     color = read_color(folder / f"{'corrected_images' if undistorted else 'images'}/{stem}.jpg")
     corrected, as_recorded = folder / f"corrected_cameras/{stem}.json", folder / f"cameras/{stem}.json"
     posed = corrected if corrected.exists() else as_recorded
-    seen_by = corrected if undistorted and corrected.exists() else as_recorded
-    pose, content = read_json_object(posed), read_json_object(seen_by)
+    camera = corrected if undistorted and corrected.exists() else as_recorded
     corrected_depth = folder / f"corrected_depth/{stem}.png"
     depth = corrected_depth if undistorted and corrected_depth.exists() else folder / f"depth/{stem}.png"
     confidence = folder / f"confidence/{stem}.png"
+    contents = {path: read_json_object(path) for path in {posed, camera, as_recorded}}
     height, width = color.shape[:2]
-    recorded = pose if posed == as_recorded else read_json_object(as_recorded)
     return DeviceFrame(
         name=depth,
         timestamp=int(stem) / MICROSECONDS,
-        camera=pinhole(seen_by, width, height, *numbers_of(seen_by, content, *INTRINSICS)),
+        camera=pinhole(camera, width, height, *numbers_of(camera, contents[camera], "fx", "fy", "cx", "cy")),
         color=color,
-        depth=metres(read_uint16(depth)),
+        depth=meters(read_uint16(depth)),
         confidence=_levels(read_uint8(confidence)) if confidence.exists() else None,
-        T_world_camera=_pose(posed, pose),
-        up=arkit_up(_pose(as_recorded, recorded)),
+        T_world_camera=_pose(posed, contents[posed]),
+        up=arkit_up(_pose(as_recorded, contents[as_recorded])),
     )
 
 
 def _pose(path: Path, content: dict[str, Any]) -> Float64:
-    """T_world_camera (4, 4). Raises DataError, naming the file."""
+    """T_world_camera (4, 4). Raises DataError, with the file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
 
@@ -88,3 +93,6 @@ def _levels(stored: np.typing.NDArray[np.uint8]) -> np.typing.NDArray[np.uint8]:
 
 def _is_time(stem: str) -> bool:
     return stem.isascii() and stem.isdigit() and len(stem) <= 18
+
+
+FORMAT = Format("polycam", "a folder with keyframes/, Polycam's raw data", recognized, open_source)

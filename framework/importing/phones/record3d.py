@@ -1,15 +1,14 @@
 """Record3D (https://record3d.app): its "EXR + RGB" export, and the .r3d file that it records.
 
-    metadata.json           w, h and dw, dh px of colour and depth; K, 3 x 3 in columns, of colour; fps; poses, a list
-                            [qx, qy, qz, qw, x, y, z] a frame; newer: frameTimestamps, s, and perFrameIntrinsicCoeffs,
-                            [fx, fy, cx, cy] a frame
-    rgb/0.jpg, depth/0.exr  8-bit colour; depth in m, half or single floats in the one channel R
+    metadata.json           w, h and dw, dh px of color and depth; K, 3 x 3 in columns, of color; fps; poses, a list
+                            [qx, qy, qz, qw, x, y, z] per frame; newer: frameTimestamps, s, and
+                            perFrameIntrinsicCoeffs, [fx, fy, cx, cy] per frame
+    rgb/0.jpg, depth/0.exr  8-bit color; depth in m, half or single floats in the one channel R
 
 An .r3d file is a zip: metadata (the same JSON), rgbd/0.jpg, rgbd/0.depth (float32, m) and rgbd/0.conf (uint8, 0 to 2,
-only with a LiDAR), the last two compressed by LZFSE. Images stand upright in both, and poses are T_world_camera of the
-upright camera in ARKit's axes: in a real export, which looks down at a door handle, they say 50 degrees down. Older
-versions began with the identity and do not tell up, newer ones have `arframe.camera.transform`, by the app's author in
-marek-simonik/record3d, issues 27 and 64: up is told where the first pose is turned.
+only with a LiDAR), the last two compressed by LZFSE. Images are upright in both, and poses are T_world_camera of the
+upright camera in ARKit's axes. Older versions began with the identity, without known up; newer ones have
+`arframe.camera.transform` (marek-simonik/record3d, issues 27 and 64): up is known if the first pose is rotated.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -34,49 +33,21 @@ from framework.files.image_files import LARGEST_FILE, decode_color, read_color
 from framework.files.json_file import parse_json
 from framework.files.number_lines import SHOWN
 from framework.files.tum_trajectory import QUATERNION_TOLERANCE
-from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, readings
+from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, readings
 
 CHANNEL = "R"  # of the EXR files
 LZFSE_BLOCK = b"bvx"  # begins each block of compressed data
 BYTES_A_BLOCK = 20_000  # of an image, at least; the compressor ends a block after 40,000 bytes without repetitions
-UNTURNED = 1e-3  # sine of half the angle: nobody holds a phone so exactly along the axes of the world
-MOST_BLOCKS = 8  # beside these: each may unpack to 27 MB, whatever it says
-
-
-class Record3DFiles(Protocol):
-    """The images of a recording, by the number of the frame. Reading raises DataError."""
-
-    def color(self, number: int) -> UInt8:
-        """(H, W, 3) RGB."""
-
-    def depth(self, number: int, shape: tuple[int, int]) -> Float32:
-        """(h, w) m, 0 = no reading."""
-
-    def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
-        """(h, w), 0 to 2; None where the recording has none."""
-
-    def name(self, number: int) -> str:
-        """For messages."""
-
-
-def folder_recognised(path: Path) -> bool:
-    """Whether `path` is a folder with the app's EXR + RGB export."""
-    return (path / "metadata.json").is_file() and (path / "rgb").is_dir() and (path / "depth").is_dir()
+UNTURNED = 1e-3  # sine of half the angle: a hand-held phone is never so exactly along the axes of the world
+MOST_BLOCKS = 8  # more than these: each may unpack to 27 MB, whatever it claims
 
 
 def open_folder(path: Path) -> Source:
-    """The recording in a folder. Raises DataError, naming the file, when it is none that can be read."""
     _load_openexr()
     return _source(path / "metadata.json", read_json_object(path / "metadata.json"), ExrFolder(path))
 
 
-def file_recognised(path: Path) -> bool:
-    """Whether `path` is a file that the app recorded."""
-    return path.suffix.lower() == ".r3d" and path.is_file()
-
-
 def open_file(path: Path) -> Source:
-    """The recording in a file. Raises DataError, naming it, when it is none that can be read."""
     _load_lzfse()
     files = R3dFile(path)
     where = f"{path}: metadata"
@@ -88,29 +59,33 @@ def open_file(path: Path) -> Source:
 
 @dataclass(frozen=True)
 class ExrFolder:
-    """The images of an export."""
+    """The images of an export, by the number of the frame. Reading raises DataError."""
 
     folder: Path
 
     def color(self, number: int) -> UInt8:
+        """Return color (H, W, 3), RGB."""
         return read_color(self.folder / f"rgb/{number}.jpg")
 
     def depth(self, number: int, shape: tuple[int, int]) -> Float32:
+        """Return depth (h, w) in m, 0 = no reading."""
         path = self.folder / f"depth/{number}.exr"
         return readings(_read_exr(path, read_bytes(path, LARGEST_FILE), shape))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
+        """Return the confidence (h, w) of depth, 0 to 2; None = not known."""
         return None
 
     def name(self, number: int) -> str:
+        """Return the file of a frame, for messages."""
         return str(self.folder / f"depth/{number}.exr")
 
 
 class R3dFile:
-    """The images of an .r3d file."""
+    """The images of an .r3d file, by the number of the frame. Reading raises DataError."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DataError, naming the file, when it is no zip."""
+        """Raises DataError, with the file, if it is no zip."""
         self.path = path
         try:
             self._zip = zipfile.ZipFile(path)
@@ -119,34 +94,37 @@ class R3dFile:
         self._members = set(self._zip.namelist())
 
     def color(self, number: int) -> UInt8:
+        """Return color (H, W, 3), RGB."""
         name = f"rgbd/{number}.jpg"
         return decode_color(f"{self.path}: {name}", self.read(name, LARGEST_FILE))
 
     def depth(self, number: int, shape: tuple[int, int]) -> Float32:
+        """Return depth (h, w) in m, 0 = no reading."""
         return readings(self._unpacked(f"rgbd/{number}.depth", "<f4", shape).astype(np.float32))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
+        """Return the confidence (h, w) of depth, 0 to 2; None = not known."""
         name = f"rgbd/{number}.conf"
         return np.asarray(self._unpacked(name, "u1", shape), np.uint8) if name in self._members else None
 
     def name(self, number: int) -> str:
+        """Return the place of a frame, for messages."""
         return f"{self.path}: rgbd/{number}.depth"
 
     def read(self, name: str, most: int) -> bytes:
-        """What a member holds. Raises DataError, naming it, when it cannot be read or says it has more than `most`."""
+        """Return the content of a member. Raises DataError if it cannot be read or claims more than `most` bytes."""
         try:
             info = self._zip.getinfo(name)
             if info.file_size > most:
-                raise DataError(
-                    f"{self.path}: {name} has {info.file_size} bytes, more than the {most} that it can have"
-                )
+                found = f"{self.path}: {name} has {info.file_size} bytes"
+                raise DataError(f"{found}, more than the {most} that it can have")
             return self._zip.read(info)
         except KeyError as error:
             raise FrameError(f"{self.path} has no {name}") from error
         except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, EOFError, ValueError, RuntimeError) as error:
+            if isinstance(error, NotImplementedError):
+                raise FrameError(f"{self.path}: {name} is compressed in a way that is not known: {error}") from error
             raise FrameError(f"{self.path}: {name} is damaged: {in_one_line(error)[:SHOWN]}") from error
-        except NotImplementedError as error:
-            raise FrameError(f"{self.path}: {name} is compressed in a way that is not known: {error}") from error
 
     def _unpacked(self, name: str, dtype: str, shape: tuple[int, int]) -> np.typing.NDArray[np.generic]:
         size = math.prod(shape) * np.dtype(dtype).itemsize
@@ -163,7 +141,7 @@ class R3dFile:
         return np.frombuffer(raw, dtype).reshape(shape)
 
 
-def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles) -> Source:
+def _source(where: Path | str, content: Mapping[str, Any], files: ExrFolder | R3dFile) -> Source:
     poses = content.get("poses")
     if not isinstance(poses, list) or not poses:
         raise DataError(f"{where}: poses must be a list of poses, found {str(poses)[:60]}")
@@ -171,7 +149,7 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
     cameras = [pinhole(where, *size, *of_frame) for of_frame in _intrinsics(where, content, len(poses))]
     shape = _depth_shape(where, content, cameras[0])
     times = _times(where, content, len(poses))
-    tells_up = not _is_unturned(poses[0])
+    knows_up = _is_turned(poses[0])
 
     def read(k: int) -> DeviceFrame:
         T_world_camera = _pose(f"{where}: pose {k}", poses[k])
@@ -183,7 +161,7 @@ def _source(where: Path | str, content: Mapping[str, Any], files: Record3DFiles)
             depth=files.depth(k, shape),
             confidence=files.confidence(k, shape),
             T_world_camera=T_world_camera,
-            up=arkit_up(T_world_camera) if tells_up else None,
+            up=arkit_up(T_world_camera) if knows_up else None,
         )
 
     return Source("Record3D", [partial(read, k) for k in range(len(poses))], len(poses), posed=True)
@@ -200,17 +178,17 @@ def _pose(where: str, values: Any) -> Float64:
     return arkit_pose(where, T_world_arkit)
 
 
-def _is_unturned(pose: Any) -> bool:
-    """Whether a stored pose has the rotation of the identity, or is none."""
+def _is_turned(pose: Any) -> bool:
+    """True for a valid stored pose with a rotation."""
     try:
         quat_xyzw = number_list("pose", pose, 7)[:4]
     except DataError:
-        return True
-    return bool(np.linalg.norm(quat_xyzw[:3]) < UNTURNED)
+        return False
+    return bool(np.linalg.norm(quat_xyzw[:3]) >= UNTURNED)
 
 
 def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> list[tuple[float, ...]]:
-    """fx, fy, cx, cy of each frame's colour image."""
+    """The intrinsics fx, fy, cx, cy of each frame's color image."""
     own = content.get("perFrameIntrinsicCoeffs")
     if isinstance(own, list) and len(own) == count:
         return [tuple(number_list(f"{where}: perFrameIntrinsicCoeffs", values, 4)) for values in own]
@@ -219,7 +197,7 @@ def _intrinsics(where: Path | str, content: Mapping[str, Any], count: int) -> li
 
 
 def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[float]:
-    """s, of each frame; by the frame rate in recordings of before the app stored them."""
+    """The time of each frame in s, by the frame rate in older recordings."""
     if "frameTimestamps" in content:
         return number_list(f"{where}: frameTimestamps", content.get("frameTimestamps"), count)
     [rate] = numbers_of(where, content, "fps")
@@ -229,16 +207,15 @@ def _times(where: Path | str, content: Mapping[str, Any], count: int) -> list[fl
 
 
 def _depth_shape(where: Path | str, content: Mapping[str, Any], camera: Camera) -> tuple[int, int]:
-    """(h, w) px of depth. Before the app stored it, depth came from the camera at the front, in colour's size."""
+    """The size (h, w) of depth in px. Older versions do not store it: depth has color's size there."""
     if "dw" not in content:
         return camera.shape
     width, height = numbers_of(where, content, "dw", "dh")
-    of_depth = pinhole(where, width, height, camera.fx, camera.fy, 0, 0)
-    return of_depth.shape
+    return pinhole(where, width, height, camera.fx, camera.fy, 0, 0).shape
 
 
 def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDArray[np.floating]:
-    """(h, w) of the one channel. The header is looked at first: it says how much memory the rest takes."""
+    """The one channel (h, w). The header is checked first, as it determines how much memory the rest needs."""
     OpenEXR = _load_openexr()
     try:
         header = OpenEXR.File(io.BytesIO(data), header_only=True).header()
@@ -248,10 +225,8 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
     except Exception as error:  # of many kinds
         raise FrameError(f"{path} is damaged: {in_one_line(error)[:SHOWN]}") from error
     if found != shape or names != [CHANNEL] or math.prod(shape) > MOST_PIXELS:
-        raise FrameError(
-            f"{path} has {found[1]}x{found[0]} px of {', '.join(names)[:60]}, "
-            f"expected {shape[1]}x{shape[0]} of {CHANNEL}"
-        )
+        expected = f"expected {shape[1]}x{shape[0]} of {CHANNEL}"
+        raise FrameError(f"{path} has {found[1]}x{found[0]} px of {', '.join(names)[:60]}, {expected}")
     try:
         image = OpenEXR.File(io.BytesIO(data), separate_channels=True).channels()[CHANNEL].pixels
     except Exception as error:
@@ -267,3 +242,16 @@ def _load_openexr() -> Any:
 
 def _load_lzfse() -> Any:
     return import_optional("lzfse", "unpacks Record3D's .r3d files", "phone")
+
+
+def _is_export(path: Path) -> bool:
+    return (path / "metadata.json").is_file() and (path / "rgb").is_dir() and (path / "depth").is_dir()
+
+
+def _is_r3d(path: Path) -> bool:
+    return path.suffix.lower() == ".r3d" and path.is_file()
+
+
+EXPORT = "a folder with metadata.json, rgb/ and depth/, Record3D's EXR + RGB export"
+FOLDER_FORMAT = Format("record3d_exr", EXPORT, _is_export, open_folder)
+FILE_FORMAT = Format("record3d", "an .r3d file of Record3D", _is_r3d, open_file)

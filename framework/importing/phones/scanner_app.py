@@ -1,8 +1,8 @@
 """3D Scanner App by Laan Labs (https://3dscannerapp.com), its export "All Data" of a low resolution scan.
 
-frame_00000.json        intrinsics, 3 x 3 in rows, of colour; cameraPoseARFrame, 4 x 4 in rows, ARKit's
+frame_00000.json        intrinsics, 3 x 3 in rows, of color; cameraPoseARFrame, 4 x 4 in rows, ARKit's
                         T_world_camera; time, s
-frame_00000.jpg         8-bit colour as the sensor lies, only of some frames
+frame_00000.jpg         8-bit color in sensor orientation, only of some frames
 depth_00000.png         uint16 mm, 256x192
 conf_00000.png          uint8 0 to 2, ARKit's, optional
 """
@@ -19,27 +19,24 @@ from framework.datasets.calibration.camera_json import number_list, numbers_of, 
 from framework.datasets.frames.sequence_reader import FRAME_RATE
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
-from framework.importing.source import DeviceFrame, Source, arkit_pose, arkit_up, metres
+from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
 
 _FRAME = re.compile(r"frame_([0-9]{5,9})\.json")
 
 
-def recognised(path: Path) -> bool:
-    """Whether `path` is a folder of this app."""
+def recognized(path: Path) -> bool:
     return path.is_dir() and any(_FRAME.fullmatch(entry.name) for entry in path.iterdir())
 
 
 def open_source(path: Path) -> Source:
-    """The recording in a folder. Raises DataError when no frame has colour, depth and a camera."""
     digits = sorted(match[1] for entry in path.iterdir() if (match := _FRAME.fullmatch(entry.name)))
-    whole = [number for number in digits if (path / f"frame_{number}.jpg").exists()]
-    whole = [number for number in whole if (path / f"depth_{number}.png").exists()]
-    if not whole:
+    complete = [n for n in digits if (path / f"frame_{n}.jpg").exists() and (path / f"depth_{n}.png").exists()]
+    if not complete:
         raise DataError(
             f"{path} has no frame with a frame_00000.jpg and a depth_00000.png; in the app, choose a low resolution "
             'scan, which keeps depth, and export "All Data"'
         )
-    frames = [partial(_read, path, number) for number in whole]
+    frames = [partial(_read, path, number) for number in complete]
     return Source("3D Scanner App", frames, len(frames), posed=True)
 
 
@@ -57,8 +54,11 @@ def _read(folder: Path, number: str) -> DeviceFrame:
         timestamp=numbers_of(path, content, "time")[0] if "time" in content else int(number) / FRAME_RATE,
         camera=pinhole(path, width, height, fx, fy, cx, cy),
         color=color,
-        depth=metres(read_uint16(folder / f"depth_{number}.png")),
+        depth=meters(read_uint16(folder / f"depth_{number}.png")),
         confidence=read_uint8(confidence) if confidence.exists() else None,
         T_world_camera=T_world_camera,
         up=arkit_up(T_world_camera),
     )
+
+
+FORMAT = Format("scanner_app", 'a folder with frame_00000.json, "All Data" of 3D Scanner App', recognized, open_source)

@@ -1,14 +1,13 @@
 """Stray Scanner (https://github.com/strayrobots/scanner, docs/format.md): iPhones and iPads with LiDAR.
 
-    rgb.mp4                 HEVC, 1920x1440, as the sensor lies: a phone held upright shows the room on its side
-    depth/000000.png        uint16 mm, 256x192, one a frame of the video
+    rgb.mp4                 HEVC, 1920x1440, in sensor orientation: rotated if the phone was held upright
+    depth/000000.png        uint16 mm, 256x192, one per frame of the video
     confidence/000000.png   uint8 0 to 2, ARKit's
     camera_matrix.csv       3 x 3 intrinsics of the video
     odometry.csv            timestamp, frame, x, y, z, qx, qy, qz, qw, and of newer versions fx, fy, cx, cy
 
-The app turns ARKit's camera about its x axis before it writes (q_WA * q_AC in its OdometryEncoder), so that poses are
-T_world_camera in our axes. A real recording agrees: there its accelerometer has gravity 0.20 along the view, and these
-poses say 0.24; in ARKit's axes they would say -0.24.
+The app rotates ARKit's camera about its x axis before it writes (q_WA * q_AC in its OdometryEncoder), so that poses are
+T_world_camera in our axes. The accelerometer of a real recording agrees.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from framework.files.atomic_write import check_regular
 from framework.files.image_files import read_uint8, read_uint16
 from framework.files.number_lines import SHOWN, numbers, read_lines
 from framework.files.tum_trajectory import TumLine
-from framework.importing.source import DeviceFrame, Source, arkit_up, metres
+from framework.importing.source import DeviceFrame, Format, Source, arkit_up, meters
 
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")  # the first columns of odometry.csv
 INTRINSICS = ("fx", "fy", "cx", "cy")  # the next ones, of newer versions
@@ -46,13 +45,11 @@ class OdometryRow:
     camera: Camera  # of the video in this frame
 
 
-def recognised(path: Path) -> bool:
-    """Whether `path` is a folder of this app."""
+def recognized(path: Path) -> bool:
     return (path / "odometry.csv").is_file() and (path / "camera_matrix.csv").is_file()
 
 
 def open_source(path: Path) -> Source:
-    """The recording in a folder. Raises DataError, naming the file, when it is none that can be read."""
     video = Video(path / "rgb.mp4")
     rows = _read_odometry(path / "odometry.csv", _read_camera(path / "camera_matrix.csv", video))
     confident = (path / "confidence").is_dir()
@@ -69,7 +66,7 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
         timestamp=row.line.timestamp,
         camera=row.camera,
         color=video.frame(row.frame),
-        depth=metres(read_uint16(folder / "depth" / name)),
+        depth=meters(read_uint16(folder / "depth" / name)),
         confidence=read_uint8(folder / "confidence" / name) if confident else None,
         T_world_camera=T_world_camera,
         up=arkit_up(T_world_camera),
@@ -77,24 +74,24 @@ def _read(folder: Path, row: OdometryRow | DataError, video: Video, confident: b
 
 
 def _read_odometry(path: Path, camera: Camera) -> list[OdometryRow | DataError]:
-    """Each frame's row, or what is wrong with it; `camera` is that of rows without intrinsics."""
+    """Each frame's row, or its error; `camera` is that of rows without intrinsics."""
     lines = read_lines(path)
     header = [word.strip() for word in lines[0].split(",")] if lines else []
     if tuple(header[: len(POSE)]) != POSE:
         raise DataError(f"{path} must begin with the line {', '.join(POSE)}, found {', '.join(header)[:100]!r}")
-    if tuple(header[len(POSE) : len(POSE) + len(INTRINSICS)]) != INTRINSICS:
-        lines = [",".join(line.split(",")[: len(POSE)]) for line in lines]
-    numbered = [(n, line.split(",")) for n, line in enumerate(lines[1:], start=2) if line.strip()]
-    return [_row_or_fault(path, n, words, camera) for n, words in numbered]
+    has_intrinsics = tuple(header[len(POSE) : len(POSE) + len(INTRINSICS)]) == INTRINSICS
+    last = len(POSE) + len(INTRINSICS) if has_intrinsics else len(POSE)
+    numbered = [(n, line.split(",")[:last]) for n, line in enumerate(lines[1:], start=2) if line.strip()]
+    return [_row_or_error(path, n, words, camera) for n, words in numbered]
 
 
-def _row_or_fault(path: Path, number: int, words: list[str], camera: Camera) -> OdometryRow | DataError:
+def _row_or_error(path: Path, number: int, words: list[str], camera: Camera) -> OdometryRow | DataError:
     where = f"{path}, line {number}"
     try:
         timestamp, frame, *pose = numbers(where, words[: len(POSE)], len(POSE), ", ".join(POSE))
         if not 0 <= frame <= LAST_FRAME or frame != int(frame):
             raise DataError(f"{where}: a frame is a whole number, found {words[1].strip()[:SHOWN]!r}")
-        own = [word for word in words[len(POSE) : len(POSE) + len(INTRINSICS)] if word.strip()]
+        own = [word for word in words[len(POSE) :] if word.strip()]
         if own:
             values = numbers(where, own, len(INTRINSICS), ", ".join(INTRINSICS))
             camera = pinhole(where, camera.width, camera.height, *values)
@@ -114,10 +111,10 @@ def _read_camera(path: Path, video: Video) -> Camera:
 
 
 class Video:
-    """Reads frames as they are stored: a phone's note to turn them is not followed, as depth has none."""
+    """Reads frames in sensor orientation, as depth has it, without the rotation that a phone notes."""
 
     def __init__(self, path: Path) -> None:
-        """Raises DataError, naming the file, when it is no video that can be decoded."""
+        """Raises DataError, with the file, if it cannot be decoded."""
         check_regular(path)
         with path.open("rb") as file:
             if not file.read(KIND_AT + len(KIND)).endswith(KIND):
@@ -137,7 +134,7 @@ class Video:
         self._next = 0
 
     def frame(self, number: int) -> UInt8:
-        """(H, W, 3) RGB of a frame, counted from 0 and asked for in order. Raises FrameError when there is none."""
+        """Return color (H, W, 3), RGB, of a frame from 0. Frames must be read in order. Raises FrameError."""
         if number < self._next - 1:
             raise FrameError(f"{self.path}: frame {number} comes after frame {self._next - 1}")
         while self._next <= number:
@@ -148,3 +145,7 @@ class Video:
         if not decoded:
             raise FrameError(f"{self.path}: frame {number} could not be decoded")
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), np.uint8)
+
+
+NEEDS = "a folder with odometry.csv, camera_matrix.csv, rgb.mp4 and depth/"
+FORMAT = Format("stray_scanner", NEEDS, recognized, open_source)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from framework.checking.finding import Verdict
+from framework.checking import Verdict
 from framework.checking.matched_pairs import MatchedPair
 from framework.checking.pose_fit import fit, judge, motion_of, readings
 from framework.data import Camera, Float64, Frame

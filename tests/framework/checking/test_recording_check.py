@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from framework.checking.finding import Finding, Verdict
+from framework.checking import Finding, Verdict
 from framework.checking.recording_check import check, warn_of_poses
 from framework.data import Float64, Frame
 from framework.datasets.frames.conventions import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
@@ -176,7 +176,7 @@ def test_poses_of_another_walk_fit_in_no_axes(tmp_path: Path) -> None:
 
 @dataclass
 class MovedDepth(RGBDSequence):
-    """The desk with depth zoomed and moved by an affine map (2, 3), as from a camera beside that of the colours."""
+    """The desk with depth zoomed and moved by an affine map (2, 3), as from a camera beside that of the colors."""
 
     moved: Float64
 
@@ -196,7 +196,7 @@ class MovedDepth(RGBDSequence):
 def test_depth_that_is_not_registered_is_told(zoom: float, x: float, y: float) -> None:
     moved = cv2.getRotationMatrix2D((319.5, 239.5), 0, zoom)
     moved[:, 2] += (x, y)
-    [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).faults if fault.subject == "colour and depth"]
+    [fault] = [fault for fault in check(MovedDepth(moved), FARTHEST).faults if fault.subject == "color and depth"]
     assert "not registered" in fault.text
     if zoom == 1:
         found_x, found_y = (float(number) for number in re.findall(r"([+-][0-9.]+) %", fault.text))
@@ -204,7 +204,7 @@ def test_depth_that_is_not_registered_is_told(zoom: float, x: float, y: float) -
         assert found_y == pytest.approx(-100 * y / 640, abs=0.4)
 
 
-def test_half_a_frame_of_motion_between_colour_and_depth_is_no_fault() -> None:
+def test_half_a_frame_of_motion_between_color_and_depth_is_no_fault() -> None:
     """The desk begins with a turn of 20 px a frame, and a Kinect does not take both at the same moment."""
     [told] = [
         finding for finding in check(replace(DESK, stop=6), FARTHEST).findings if finding.subject.startswith("col")
@@ -239,8 +239,8 @@ def verdicts(sequence: RGBDSequence) -> dict[str, Verdict]:
 
 def test_a_single_frame_and_frames_without_poses_can_be_checked() -> None:
     fine = dict.fromkeys(("depth", "poses", "sharpness"), Verdict.FINE)
-    assert verdicts(Part(1)) == fine | dict.fromkeys(("motion", "colour and depth"), Verdict.UNKNOWN)
-    assert verdicts(Part(20)) == fine | dict.fromkeys(("motion", "colour and depth"), Verdict.FINE)
+    assert verdicts(Part(1)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.UNKNOWN)
+    assert verdicts(Part(20)) == fine | dict.fromkeys(("motion", "color and depth"), Verdict.FINE)
 
 
 def test_what_is_seen_in_single_frames() -> None:
@@ -260,7 +260,7 @@ def test_what_is_seen_in_single_frames() -> None:
 
     assert verdicts(Part(8, blurred))["sharpness"] is Verdict.NOTE
     assert verdicts(Part(8, gray))["motion"] is Verdict.NOTE
-    assert verdicts(Part(8, gray))["colour and depth"] is Verdict.UNKNOWN
+    assert verdicts(Part(8, gray))["color and depth"] is Verdict.UNKNOWN
     assert verdicts(Part(8, nothing))["depth"] is Verdict.FAULT
     assert verdicts(Part(8, sparse))["depth"] is Verdict.NOTE
 
@@ -275,7 +275,7 @@ def test_frames_that_cannot_be_read_are_told() -> None:
         raise FrameError("torn")
 
     assert verdicts(Part(30, unreadable))["frames"] is Verdict.NOTE
-    with pytest.raises(DataError, match="can be read; the first: torn"):
+    with pytest.raises(DataError, match="frames can be read; the first: torn"):
         check(Part(8, none), FARTHEST)
 
 
@@ -285,5 +285,5 @@ def test_a_run_warns_of_what_a_glance_shows(tmp_path: Path, caplog: pytest.LogCa
     warn_of_poses(Part(20))
     assert not caplog.text
     warn_of_poses(RgbdFolder(write_damaged(tmp_path / "damaged", DESK, pose=inverse)))
-    assert "poses: at a glance, they are T_camera_world" in caplog.text
-    assert "`python -m framework check` looks closer" in caplog.text
+    assert "poses: they are T_camera_world" in caplog.text
+    assert "run `instancemap check`" in caplog.text

@@ -20,7 +20,7 @@ from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.datasets.scenenn.oni import read_frames
 from framework.datasets.scenenn.oni_records import Stream, read_contents
 from framework.datasets.seven_scenes import BASELINE, COLOR_CAMERA, SevenScenes, register
-from framework.datasets.tum_rgbd import CAMERAS, Intrinsics, TumRgbd
+from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics, TumRgbd
 from framework.errors import DataError, FrameError
 from framework.interfaces import PoseTracker, RGBDSequence
 from framework.pipeline import Pipeline
@@ -38,7 +38,7 @@ VGA = (480, 640)
 KINECT = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)  # OpenNI's
 KITCHEN = "redkitchen/seq-01"
 FREIBURG1_RPY = "rgbd_dataset_freiburg1_rpy"
-GAP = (1305031244.897635, 1305031244.997688)  # s, of the colour images that have a depth image and no pose
+GAP = (1305031244.897635, 1305031244.997688)  # s, of the color images that have a depth image and no pose
 
 
 @pytest.fixture(scope="module")
@@ -231,7 +231,7 @@ def given_poses(tracker: PoseTracker, sequence: RGBDSequence) -> RunResult:
 def test_tum_of_which_most_images_are_missing(originals: Path) -> None:
     sequence = TumRgbd(originals / "tum_rgbd", scene=FREIBURG1_RPY, undistort=False)
     assert (len(sequence), sequence.name) == (694, FREIBURG1_RPY)
-    assert sequence.camera == CAMERAS[Intrinsics.FREIBURG1]
+    assert sequence.camera == PUBLISHED[Intrinsics.FREIBURG1].camera
     there = [k for k, recorded in enumerate(sequence.contents.frames) if Path(recorded.images.color_name).exists()]
     assert there == [99, 100, 101, 102, 103, 104]
     frame, folder = sequence[99], originals / "tum_rgbd" / FREIBURG1_RPY

@@ -222,7 +222,7 @@ def test_a_bad_camera_value_is_named(folder, changes):
 
 @pytest.mark.parametrize("scale", [0, -1000, 0.001, 1e7])
 def test_a_depth_scale_that_cannot_be(folder, scale):
-    told = r"depth_scale must be in \[1, 1e\+06\], as metres = value / depth_scale \(1000 for millimetres\), found"
+    told = r"depth_scale must be in \[1, 1e\+06\], as meters = value / depth_scale \(1000 for millimeters\), found"
     change_camera(folder, depth_scale=scale)
     with pytest.raises(DataError, match=rf"camera\.json: {told} {scale:g}".replace("+07", r"\+07")):
         RgbdFolder(folder)
@@ -480,7 +480,7 @@ def test_the_truth_of_replica():
     assert {truth.class_names[i] for i in np.unique(truth.instance_ids) if i} >= {"bed", None}
 
 
-def test_a_lens_is_undone_in_colour_depth_and_instances_alike(folder):
+def test_a_lens_is_undone_in_color_depth_and_instances_alike(folder):
     change_camera(folder, distortion=[0.3, 0, 0, 0.01, 0])
     K, lens = np.array([[20.0, 0, 11.5], [0, 21.0, 7.5], [0, 0, 1]]), np.array([0.3, 0, 0, 0.01, 0])
     u, v = cv2.initUndistortRectifyMap(K, lens, None, K, (WIDTH, HEIGHT), cv2.CV_32FC1)

@@ -76,8 +76,8 @@ def test_it_runs_through_the_pipeline(folder: Path) -> None:
         np.testing.assert_allclose(z[seen], 2, atol=1e-5)
 
 
-def test_registered_depth_is_where_the_colour_camera_sees_it() -> None:
-    """Each reading's own point, projected into the colour camera, lies within half a pixel of where it went."""
+def test_registered_depth_is_where_the_color_camera_sees_it() -> None:
+    """Each reading's own point, projected into the color camera, lies within half a pixel of where it went."""
     raw = np.zeros(DEPTH_CAMERA.shape, np.uint16)
     raw[20::40, 20::40] = 800 + 10 * np.arange(12 * 16).reshape(12, 16)  # far apart, all different
     registered = register(raw)

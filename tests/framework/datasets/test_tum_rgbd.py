@@ -14,12 +14,12 @@ from scipy.spatial.transform import Rotation, Slerp
 
 from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion
-from framework.datasets.tum_rgbd import CAMERAS, Intrinsics, TumRgbd, associate
+from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics, TumRgbd, associate
 from framework.errors import ConfigError, DataError
 from tests.support.recordings.recordings import fault_of, mapped, opened, write_color, write_depth
 
 START = 1305031102.175304  # s
-DEPTH_DELAY = 0.0151  # s, of each depth image after its colour image
+DEPTH_DELAY = 0.0151  # s, of each depth image after its color image
 FRAMES = 3
 HEADER = "# {}\n# file: 'rgbd_dataset_freiburg1_xyz.bag'\n# timestamp {}\n"
 
@@ -63,7 +63,7 @@ def test_a_frame_holds_what_the_files_hold(folder: Path) -> None:
     assert (frame.depth[inside] == 2).all()  # 5000 units a metre
     assert frame.T_world_camera is not None
     np.testing.assert_allclose(frame.T_world_camera[:3, 3], [2 / 30, 0, 0], atol=1e-4)  # times have four digits
-    assert frame.camera == CAMERAS[Intrinsics.FREIBURG1]
+    assert frame.camera == PUBLISHED[Intrinsics.FREIBURG1].camera
 
 
 def test_it_runs_through_the_pipeline(folder: Path) -> None:
@@ -81,7 +81,7 @@ def test_the_published_distortion_is_undone(folder: Path) -> None:
     board = np.kron(np.indices((15, 20)).sum(axis=0) % 2, np.full((32, 32), 200)).astype(np.uint8)
     path = next((folder / "rgb").glob("*.png"))
     cv2.imwrite(str(path), np.stack([board] * 3, axis=-1))
-    K, lens = CAMERAS[Intrinsics.FREIBURG1].K, np.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
+    K, lens = PUBLISHED[Intrinsics.FREIBURG1].camera.K, np.array([0.2624, -0.9531, -0.0054, 0.0026, 1.1633])
     k = [color_time(k) for k in range(FRAMES)].index(float(path.stem))
     expected = cv2.undistort(np.stack([board] * 3, axis=-1), K, lens)
     found = TumRgbd(folder)[k].color.astype(int)
@@ -93,8 +93,8 @@ def test_the_published_distortion_is_undone(folder: Path) -> None:
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_the_folders_name_gives_the_camera(folder: Path, number: int) -> None:
     renamed = folder.rename(folder.parent / f"rgbd_dataset_freiburg{number}_long_office")
-    assert TumRgbd(renamed).camera == CAMERAS[Intrinsics[f"FREIBURG{number}"]]
-    assert TumRgbd(renamed, intrinsics=Intrinsics.ROS_DEFAULT).camera == CAMERAS[Intrinsics.ROS_DEFAULT]
+    assert TumRgbd(renamed).camera == PUBLISHED[Intrinsics[f"FREIBURG{number}"]].camera
+    assert TumRgbd(renamed, intrinsics=Intrinsics.ROS_DEFAULT).camera == PUBLISHED[Intrinsics.ROS_DEFAULT].camera
 
 
 def test_another_name_asks_for_the_camera(folder: Path) -> None:
@@ -102,7 +102,7 @@ def test_another_name_asks_for_the_camera(folder: Path) -> None:
     with pytest.raises(ConfigError, match=r"dataset\.intrinsics: the folder's name my_desk"):
         TumRgbd(mine)
     sequence = opened("tum_rgbd", f"dataset.root={mine}", "dataset.intrinsics=FREIBURG3")
-    assert sequence.camera == CAMERAS[Intrinsics.FREIBURG3]
+    assert sequence.camera == PUBLISHED[Intrinsics.FREIBURG3].camera
 
 
 OWN = {"width": 640, "height": 480, "fx": 600.0, "fy": 601.0, "cx": 310.0, "cy": 250.0, "depth_scale": 1000.0}
@@ -131,16 +131,16 @@ def test_its_lens_is_undone_and_what_is_wrong_with_its_camera_is_said(folder: Pa
 
 def test_the_published_camera_wins_over_a_file(folder: Path) -> None:
     (folder / "camera.json").write_text("no JSON")
-    assert TumRgbd(folder).camera == CAMERAS[Intrinsics.FREIBURG1]
+    assert TumRgbd(folder).camera == PUBLISHED[Intrinsics.FREIBURG1].camera
     mine = folder.rename(folder.parent / "my_desk")
-    assert TumRgbd(mine, intrinsics=Intrinsics.FREIBURG3).camera == CAMERAS[Intrinsics.FREIBURG3]
+    assert TumRgbd(mine, intrinsics=Intrinsics.FREIBURG3).camera == PUBLISHED[Intrinsics.FREIBURG3].camera
 
 
 # Association
 
 
 def test_the_closest_pair_comes_first_and_each_image_is_used_once() -> None:
-    """Depth 0.015 is nearest to both colour images: the closer one gets it, and the other what is left."""
+    """Depth 0.015 is nearest to both color images: the closer one gets it, and the other what is left."""
     assert associate([0.0, 0.02], [0.015, 0.19], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, 0.035], 0.02) == [(1, 0)]
     assert associate([0.0, 0.02], [0.015, -0.01], 0.02) == [(0, 1), (1, 0)]
@@ -163,13 +163,13 @@ def test_associate_agrees_with_all_pairs_by_brute_force() -> None:
     assert len(expected) > 20
 
 
-def test_colour_images_without_depth_are_left_out_and_counted(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_color_images_without_depth_are_left_out_and_counted(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     color = [color_time(k) for k in range(FRAMES)]
     write_lists(folder, color, [color[0] + DEPTH_DELAY, color[2] + DEPTH_DELAY])
     with caplog.at_level(logging.INFO):
         sequence = TumRgbd(folder)
     assert [frame.timestamp for frame in sequence] == [color[0], color[2]]
-    assert "1 of 3 colour images have no depth image" in caplog.text
+    assert "1 of 3 color images have no depth image" in caplog.text
 
 
 def test_of_images_with_one_timestamp_the_first_is_taken(folder: Path, caplog: pytest.LogCaptureFixture) -> None:

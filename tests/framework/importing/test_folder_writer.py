@@ -83,7 +83,7 @@ def test_what_was_interrupted_has_no_camera(tmp_path: Path) -> None:
     ("changed", "said"),
     [
         ({"timestamp": float("nan")}, "the timestamp is not finite"),
-        ({"color": np.zeros((48, 60, 3), np.uint8)}, "colour is 60x48, the camera's is 64x48"),
+        ({"color": np.zeros((48, 60, 3), np.uint8)}, "color is 60x48, the camera's is 64x48"),
         ({"depth": np.zeros((1, 16), np.float32)}, "depth is 16x1 px, too small"),
         ({"confidence": np.zeros((12, 15), np.uint8)}, r"confidence has the shape \(12, 15\)"),
     ],

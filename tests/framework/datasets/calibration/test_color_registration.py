@@ -1,4 +1,4 @@
-"""Colour moved between two cameras at one place: exact on images whose values are known everywhere."""
+"""Color moved between two cameras at one place: exact on images whose values are known everywhere."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ DEPTH = Camera(640 // 8, 480 // 8, 577.9 / 8, 576.5 / 8, 39.6, 29.4)
 
 
 def ramp(camera: Camera) -> np.ndarray:
-    """The direction in which each pixel looks, as colour: x / z and y / z, scaled."""
+    """The direction in which each pixel looks, as color: x / z and y / z, scaled."""
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
     return np.stack([128 + 200 * x, 128 + 200 * y, np.full_like(x, 77)], axis=-1)
 
 
-def test_each_pixel_has_the_colour_of_the_direction_in_which_it_looks() -> None:
+def test_each_pixel_has_the_color_of_the_direction_in_which_it_looks() -> None:
     image, registration = np.round(ramp(COLOR)).astype(np.uint8), ColorRegistration(COLOR, DEPTH)
     found, negative = registration.apply(image), registration.apply(255 - image)
     assert np.abs(found[2:-2, 2:-2] - ramp(DEPTH)[2:-2, 2:-2]).max() < 1.2  # of 255; a shift by one pixel is 2.8
@@ -41,7 +41,7 @@ def test_a_pixel_is_the_mean_of_what_it_covers() -> None:
     assert np.abs(ColorRegistration(double, single).apply(image) - blocks).max() <= 0.5
 
 
-def test_where_no_colour_was_seen_the_nearest_is_repeated() -> None:
+def test_where_no_color_was_seen_the_nearest_is_repeated() -> None:
     wide = Camera(32, 24, 10.0, 10.0, 15.5, 11.5)
     narrow = Camera(32, 24, 20.0, 20.0, 15.5, 11.5)
     image = np.zeros((24, 32, 3), np.uint8)

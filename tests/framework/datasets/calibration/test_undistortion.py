@@ -10,7 +10,7 @@ import pytest
 
 from framework.data import Camera
 from framework.datasets.calibration.undistortion import Distortion, Undistortion
-from framework.datasets.tum_rgbd import CAMERAS, DISTORTIONS, Intrinsics
+from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics
 from framework.errors import DataError
 from framework.geometry import exp_se3
 from tests.support.scenes.analytic_scene import CAMERA, room
@@ -20,7 +20,7 @@ LENS = Distortion(k1=0.2624, k2=-0.9531, p1=-0.0054, p2=0.0026, k3=1.1633)  # fr
 
 @pytest.mark.parametrize("intrinsics", [Intrinsics.FREIBURG1, Intrinsics.FREIBURG2])
 def test_pixels_are_taken_from_where_opencv_takes_them(intrinsics: Intrinsics) -> None:
-    camera, lens = CAMERAS[intrinsics], DISTORTIONS[intrinsics]
+    camera, lens = PUBLISHED[intrinsics].camera, PUBLISHED[intrinsics].distortion
     assert lens is not None
     size = (camera.width, camera.height)
     u, v = cv2.initUndistortRectifyMap(camera.K, np.array(astuple(lens)), None, camera.K, size, cv2.CV_32FC1)
@@ -30,7 +30,7 @@ def test_pixels_are_taken_from_where_opencv_takes_them(intrinsics: Intrinsics) -
 
 
 def recorded(camera: Camera, lens: Distortion, T_world_camera: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(depth, colour) that a camera with this lens records: the ray of each pixel by inversion of the lens."""
+    """(depth, color) that a camera with this lens records: the ray of each pixel by inversion of the lens."""
     wide = Camera(3 * camera.width, 3 * camera.height, 2 * camera.fx, 2 * camera.fy, 239.5, 179.5)
     depth, color, _ = room().render(wide, T_world_camera)
     pixels = np.stack(np.meshgrid(np.arange(camera.width), np.arange(camera.height)), axis=-1).astype(np.float64)

@@ -64,7 +64,7 @@ def sent(video: LiveVideo, frames: int) -> Generator[Frame]:
             yield reader()
 
 
-def test_frames_are_the_cameras_registered_to_colour(brand: Brand, device: FakeCamera) -> None:
+def test_frames_are_the_cameras_registered_to_color(brand: Brand, device: FakeCamera) -> None:
     found = list(sent(brand.video(), 3))
     assert [frame.index for frame in found] == [0, 1, 2]
     for frame, true in zip(found, CornerRoom(), strict=False):

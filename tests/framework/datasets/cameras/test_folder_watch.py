@@ -181,7 +181,7 @@ def test_other_files_are_no_frames(folder: Path, caplog: pytest.LogCaptureFixtur
 def test_images_of_another_size_are_of_no_use(folder: Path) -> None:
     (folder / "camera.json").write_text(json.dumps(CALIBRATION | {"depth_scale": 1000, "width": 97}))
     write(folder, 0)
-    assert str(*Watched(folder).look()).endswith("says 97x72; colour, depth and camera must agree")
+    assert str(*Watched(folder).look()).endswith("says 97x72; color, depth and camera must agree")
 
 
 @pytest.mark.parametrize("half", [False, True])

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from framework.data import Float64
 from framework.datasets.frames.conventions import CameraAxes, DepthReading, PoseKind, PoseReading, QuaternionOrder
-from framework.datasets.frames.stored_frames import RecordedFrame, StoredImages
+from framework.datasets.frames.sequence_reader import RecordedFrame, StoredImages, delay_depth, delay_poses
 from framework.datasets.tum_rgbd import TumRgbd
 from framework.errors import ConfigError, FrameError
 from framework.geometry import inverse
@@ -80,8 +80,8 @@ def images(k: int) -> StoredImages:
 
 
 @pytest.mark.parametrize("delay", [-2, 0, 1])
-def test_a_delay_pairs_colour_with_the_depth_that_belongs_to_it(delay: int) -> None:
-    frames = DepthReading(depth_delay=delay).frames([RecordedFrame(images(k), k / 30) for k in range(5)])
+def test_a_delay_pairs_color_with_the_depth_that_belongs_to_it(delay: int) -> None:
+    frames = delay_depth([RecordedFrame(images(k), k / 30) for k in range(5)], delay)
     for k, frame in enumerate(frames):
         if 0 <= k + delay < 5:
             assert not frame.fault
@@ -96,7 +96,7 @@ def test_a_delay_pairs_colour_with_the_depth_that_belongs_to_it(delay: int) -> N
 def test_a_delay_gives_images_the_pose_that_belongs_to_them(delay: int) -> None:
     stored = [RecordedFrame(images(k), k / 30, some_pose(k), up=np.array([0.0, -1.0, 0.0])) for k in range(5)]
     stored[3] = RecordedFrame(images(3), 3 / 30, fault="line 3 is no pose")
-    for k, frame in enumerate(PoseReading(pose_delay=delay).frames(stored)):
+    for k, frame in enumerate(delay_poses(stored, delay)):
         assert (frame.images.color()[0, 0, 0], frame.timestamp) == (k, k / 30)
         if not 0 <= k + delay < 5:
             assert frame.fault == f"no pose is {delay} frames away"

@@ -170,14 +170,14 @@ def test_without_poses_none_are_known(tmp_path: Path) -> None:
     assert ScanNet(tmp_path, SCENE)[0].T_world_camera is None
 
 
-def test_colour_of_another_size_is_refused(tmp_path: Path, write: Writer) -> None:
+def test_color_of_another_size_is_refused(tmp_path: Path, write: Writer) -> None:
     frames = shots()
     frames[1].color = frames[1].color[:-1]
     write(tmp_path / SCENE, frames)
-    assert "is 65x48, but the colour camera's images are 65x49" in fault_of(ScanNet(tmp_path, SCENE), 1)
+    assert "is 65x48, but the color camera's images are 65x49" in fault_of(ScanNet(tmp_path, SCENE), 1)
 
 
-def test_colour_that_was_exported_smaller_has_the_intrinsics_of_the_published_size(tmp_path: Path) -> None:
+def test_color_that_was_exported_smaller_has_the_intrinsics_of_the_published_size(tmp_path: Path) -> None:
     write_exported(tmp_path / SCENE, shots(1))
     published = np.array([[1170.188, 0, 647.75, 0], [0, 1170.188, 483.75, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
     np.savetxt(tmp_path / SCENE / "intrinsic/intrinsic_color.txt", published, fmt="%f")
@@ -207,7 +207,7 @@ def test_two_cameras_apart_are_told_with_the_shift_in_pixels(tmp_path: Path, cap
     write_sens(path, shots(1), color_extrinsics=extrinsics)
     ScanNet(tmp_path, SCENE)
     assert "100 mm and 0.00 degrees apart" in caplog.text
-    assert "colour is shifted by up to 1 px 2 m away" in caplog.text
+    assert "color is shifted by up to 1 px 2 m away" in caplog.text
     caplog.clear()
     extrinsics[0, 3] = 0.01
     write_sens(path, shots(1), color_extrinsics=extrinsics)

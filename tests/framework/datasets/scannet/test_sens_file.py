@@ -83,13 +83,13 @@ def test_a_file_that_ends_within_its_header_is_refused(path: Path, length: int) 
         (27, struct.pack("<f", -1), "byte 27: .*fx, fy must be positive"),
         (27 + 4, struct.pack("<f", 0.5), "byte 27: expected intrinsics"),
         (27 + 2 * 64, struct.pack("<f", np.inf), "byte 155: .*fx, fy must be positive"),
-        (SIZES, struct.pack("<i", -1), f"byte {SIZES}: expected a compression of colour: 0, 1 or 2, found -1"),
-        (SIZES + 4, struct.pack("<i", 7), f"byte {SIZES + 4}: expected a compression of depth: 0 or 1, found 7"),
+        (SIZES, struct.pack("<i", -1), f"byte {SIZES}: expected a compression of color .* found -1"),
+        (SIZES + 4, struct.pack("<i", 7), f"byte {SIZES + 4}: expected a compression of depth .* found 7"),
         (SIZES + 4, struct.pack("<i", OCCIPITAL), f"byte {SIZES + 4}: depth is compressed by Occipital's"),
-        (SIZES + 8, struct.pack("<I", 2**32 - 1), f"byte {SIZES + 8}: colour images of 4294967295x49"),
+        (SIZES + 8, struct.pack("<I", 2**32 - 1), f"byte {SIZES + 8}: color images of 4294967295x49"),
         (SIZES + 20, struct.pack("<I", 0), f"byte {SIZES + 8}: depth images of 32x0"),
-        (SIZES + 24, struct.pack("<f", 0), f"byte {SIZES + 24}: the depth units a metre"),
-        (SIZES + 24, struct.pack("<f", np.nan), f"byte {SIZES + 24}: the depth units a metre"),
+        (SIZES + 24, struct.pack("<f", 0), f"byte {SIZES + 24}: .*depth units per meter"),
+        (SIZES + 24, struct.pack("<f", np.nan), f"byte {SIZES + 24}: .*depth units per meter"),
         (SIZES + 28, struct.pack("<Q", 2**64 - 1), f"byte {SIZES + 28}: 18446744073709551615 frames cannot be"),
         (SIZES + 28, struct.pack("<Q", MOST_FRAMES), f"byte {SIZES + 28}: {MOST_FRAMES} frames cannot be"),
         (SIZES + 28, struct.pack("<Q", 0), "holds no frame: its header says 0"),
@@ -155,9 +155,9 @@ def test_depth_that_is_no_depth_is_the_fault_of_its_frame(path: Path, depth: byt
 
 
 @pytest.mark.parametrize("color", [b"", b"\xff\xd8\xff", b"no image at all"])
-def test_colour_that_is_no_image_is_the_fault_of_its_frame(path: Path, color: bytes) -> None:
+def test_color_that_is_no_image_is_the_fault_of_its_frame(path: Path, color: bytes) -> None:
     [frame] = opened(path, sens([Shot(color, shots(1)[0].depth)])).frames
-    with pytest.raises(FrameError, match="colour of frame 0 at byte"):
+    with pytest.raises(FrameError, match="color of frame 0 at byte"):
         frame.color()
 
 

@@ -162,6 +162,6 @@ def test_a_stream_that_stays_alone_does_not_fill_the_memory():
     assert times_of(pair([*alone, image(Stream.COLOR, 0)])) == [(0, 1)]
 
 
-def test_colour_and_depth_of_different_sizes_are_refused():
+def test_color_and_depth_of_different_sizes_are_refused():
     with pytest.raises(DataError, match="color is 6x4 and depth 3x2; they must have the same size"):
         list(pair([image(Stream.DEPTH, 0), image(Stream.COLOR, 0, (4, 6, 3))]))

@@ -124,7 +124,7 @@ def test_frames_far_from_all_poses_are_left_out(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["bgr8", "rgba8", "bgra8", "mono8"])
-def test_encodings_of_colour(tmp_path: Path, encoding: str) -> None:
+def test_encodings_of_color(tmp_path: Path, encoding: str) -> None:
     bag = BagWriter()
     color, depth = seen(0)
     stored = {
@@ -172,7 +172,7 @@ def test_encodings_of_depth(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["jpeg", "png"])
-def test_compressed_colour(tmp_path: Path, kind: str) -> None:
+def test_compressed_color(tmp_path: Path, kind: str) -> None:
     bag = BagWriter(ros1=True)
     for k in range(COUNT):
         color, depth = seen(k)
@@ -309,7 +309,7 @@ def test_what_is_given_is_taken(tmp_path: Path) -> None:
     assert len(RgbdFolder(tmp_path / "out")) == 1
 
 
-def test_registered_depth_and_uncompressed_colour_come_first(tmp_path: Path) -> None:
+def test_registered_depth_and_uncompressed_color_come_first(tmp_path: Path) -> None:
     bag = BagWriter()
     add_camera_of_ros(bag)
     color, depth = seen(0)

@@ -67,7 +67,7 @@ def test_optimised_poses_of_polycam_without_such_images(tmp_path: Path) -> None:
     check_imported(tmp_path / "out", FRAMES, tells_up=False)
 
 
-def test_frames_of_the_scanner_app_without_colour_are_none(tmp_path: Path) -> None:
+def test_frames_of_the_scanner_app_without_color_are_none(tmp_path: Path) -> None:
     write_scanner_app(tmp_path / "export", FRAMES)
     (tmp_path / "export/frame_00001.jpg").unlink()
     assert open_source(tmp_path / "export").count == 3

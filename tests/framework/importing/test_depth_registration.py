@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from framework.data import Camera
-from framework.importing.depth.depth_registration import FINEST, DepthRegistration
+from framework.importing.depth_resampling import FINEST, DepthRegistration
 from tests.support.recordings.phone_exports import T_COLOR_DEPTH
 from tests.support.scenes.corner_room import look
 

@@ -1,4 +1,4 @@
-"""Coarse depth brought to colour's pixels: exact on planes, never between two surfaces."""
+"""Coarse depth brought to color's pixels: exact on planes, never between two surfaces."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.importing.depth.depth_upsampling import upsampled
-from framework.importing.depth.depth_upsampling_kernels import COLOR_SIGMA, ONE_SURFACE
+from framework.importing.depth_resampling import upsampled
+from framework.importing.depth_resampling_kernels import COLOR_SIGMA, ONE_SURFACE
 from tests.support.scenes.corner_room import look
 
 COLOR = Camera(320, 240, 300.0, 300.0, 157.0, 118.0)
@@ -74,7 +74,7 @@ def test_planes_are_exact_and_nothing_lies_between_two_surfaces(factor: float) -
     assert (np.abs(found - truth) > 0.05).mean() < 0.02 / factor
 
 
-def test_colour_says_which_of_two_surfaces_a_pixel_is_of() -> None:
+def test_color_says_which_of_two_surfaces_a_pixel_is_of() -> None:
     """A step amid a coarse pixel: the nearest reading would be wrong by up to half of it."""
     camera = Camera(40, 40, 40.0, 40.0, 19.5, 19.5)
     truth = np.where(np.arange(40) < 22, 1.0, 2.0)[None].repeat(40, axis=0)
@@ -96,7 +96,7 @@ def test_a_hole_stays_a_hole() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 
-def test_depth_of_colours_size_stays_as_it_is() -> None:
+def test_depth_of_colors_size_stays_as_it_is() -> None:
     depth = np.random.default_rng(0).choice([0, 1, 2, 2.01, 3.5], (240, 320)).astype(np.float32)
     np.testing.assert_allclose(upsampled(depth, ONE, COLOR, COLOR, ONE), depth, rtol=1e-6)
 

@@ -1,0 +1,56 @@
+"""Resampling of depth to the pixels of a color image, from another camera or a coarser image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from framework.data import Camera, Float32, Float64, UInt8
+from framework.importing.depth_resampling_kernels import move_readings, upsample
+
+FINEST = 0.9  # of the depth camera's focal length in px: at its own, rounding would leave lines without readings
+
+
+@dataclass(frozen=True)
+class DepthRegistration:
+    """Registration of depth to a color camera at another place: the nearest reading in each pixel."""
+
+    depth: Camera
+    color: Camera
+    T_color_depth: Float64  # (4, 4)
+
+    @property
+    def target(self) -> Camera:
+        """The color camera, at the resolution of the depth camera."""
+        return self.color.scaled(min(1.0, FINEST * min(self.depth.fx / self.color.fx, self.depth.fy / self.color.fy)))
+
+    def apply(self, depth: Float32) -> Float32:
+        """Return depth (H, W) in m of `target` from depth (h, w) in m of the depth camera, 0 = no reading."""
+        registered = np.zeros(self.target.shape, np.float32)
+        move_readings(depth, self.depth.K, self.target.K, self.T_color_depth, registered)
+        return registered
+
+
+def upsampled(depth: Float32, color: UInt8, camera: Camera, target: Camera, target_color: UInt8) -> Float32:
+    """Return depth (H, W) in m of the camera `target` from depth (h, w) in m of the whole image of `camera`.
+
+    `color` and `target_color` are the images (., ., 3) of the two cameras, which have the same pose. Where the four
+    readings around a pixel are of one surface, their inverses are interpolated, which is exact for a plane. Elsewhere
+    the pixel takes one of the four, that with the nearest and most similar color (the weights of joint bilateral
+    upsampling, Kopf et al., SIGGRAPH 2007), so that no reading lies between two surfaces. A hole stays a hole.
+    """
+    height, width = depth.shape
+    guide = np.asarray(cv2.resize(color, (width, height), interpolation=cv2.INTER_AREA), np.uint8)
+    u = _coordinates(target.width, target.fx, target.cx, camera.fx, camera.cx, width / camera.width)
+    v = _coordinates(target.height, target.fy, target.cy, camera.fy, camera.cy, height / camera.height)
+    found = np.zeros(target.shape, np.float32)
+    upsample(depth, guide, u, v, target_color, found)
+    return found
+
+
+def _coordinates(size: int, f_target: float, c_target: float, f: float, c: float, scale: float) -> Float64:
+    """The positions (size,) in the depth image of the pixels of a target's row or column."""
+    in_color = (np.arange(size) - c_target) * (f / f_target) + c
+    return np.asarray((in_color + 0.5) * scale - 0.5, np.float64)
