@@ -99,6 +99,7 @@ class Detector(ABC):
 
     classes: tuple[str, ...]  # names of the columns of class_probabilities; set by the constructor
     concurrent: bool = False  # whether threads may call `detect` at the same time; each call uses about one core
+    domain: str = ""  # the only `RGBDVideo.domain` that the detector is for; "" = any
 
     @abstractmethod
     def detect(self, frame: Frame) -> Detections:

@@ -23,6 +23,15 @@ def check_bounds(plugin: object, **bounds: tuple[float, float]) -> None:
         require(low <= value <= high, f"{type(plugin).__name__}.{name}", value, f"in [{low:g}, {high:g}]")
 
 
+def check_intervals(stage: str, plugin: object, **intervals: str) -> None:
+    """Raise ConfigError unless each named parameter lies in its interval, such as "(0, 1]". NaN never does."""
+    for name, interval in intervals.items():
+        low, high = map(float, interval[1:-1].split(","))
+        value = getattr(plugin, name)
+        inside = low <= value <= high and (value > low or interval[0] == "[") and (value < high or interval[-1] == "]")
+        require(inside, f"{stage}.{name}", value, f"in {interval}")
+
+
 def require(holds: bool, name: str, value: object, allowed: str) -> None:
     """Raises ConfigError unless the condition holds, in one line like "detector.nms must be in (0, 1], found 2"."""
     if not holds:

@@ -1,6 +1,6 @@
-"""Box candidates: what the outputs of the usual box detectors mean, and which candidates survive.
+"""Box candidates: the output layouts of common box detectors, and the selection of the best candidates.
 
-All boxes are x1 y1 x2 y2 in px of the network's input, in borders: 0 is the left border of the first pixel.
+Boxes are x1 y1 x2 y2 px of the network's input, as borders: 0 is the left border of the first pixel.
 """
 
 from __future__ import annotations
@@ -12,22 +12,21 @@ from enum import Enum
 import numpy as np
 
 from framework.data import Float32, Int32
-from framework.detection.masks.boxes import LARGEST_LOG_SCALE
-from framework.detection.masks.nms import suppress_boxes
+from framework.detection.masks.boxes import LARGEST_LOG_SCALE, suppress_boxes
 from framework.errors import DataError
 
 YOLOX_STRIDES = (8, 16, 32)  # px per cell, in the order of the output's rows
 
 
 class OutputLayout(Enum):
-    """What a box detector's outputs are: K candidates, C classes, optionally an axis of length 1 in front."""
+    """The outputs of a box detector: K candidates, C classes, optionally with a leading axis of length 1."""
 
     yolox = "yolox"  # (K, 5 + C): dx, dy, log w, log h in cells; objectness; C class scores
-    yolo = "yolo"  # (4 + C, K) or (K, 4 + C): centre x, y, width, height in px; C class scores (Ultralytics, from v8)
+    yolo = "yolo"  # (4 + C, K) or (K, 4 + C): center x, y, width, height in px; C class scores (Ultralytics, from v8)
     yolo_objectness = "yolo_objectness"  # (K, 5 + C) or (5 + C, K): objectness before the class scores (YOLOv5, v7)
     ssd_tensorflow = "ssd_tensorflow"  # boxes (K, 4) y1 x1 y2 x2 in 0..1; scores, and labels or scores by class
-    ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; the same
-    ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; the same
+    ssd_torchvision = "ssd_torchvision"  # boxes (K, 4) x1 y1 x2 y2 in px; scores, and labels or scores by class
+    ssd_unit = "ssd_unit"  # boxes (K, 4) x1 y1 x2 y2 in 0..1; scores, and labels or scores by class
 
 
 @dataclass(frozen=True)
@@ -35,12 +34,12 @@ class Candidates:
     """K boxes with a score for each of C classes; a candidate's own score is the largest of them."""
 
     boxes: Float32  # (K, 4) px
-    class_scores: Float32  # (K, C) in [0, 1]; the objectness is multiplied in
+    class_scores: Float32  # (K, C) in [0, 1], multiplied by the objectness
 
     def best(self, threshold: float, nms: float, limit: int) -> Int32:
-        """The indices of the at most `limit` candidates that score above `threshold` and that survive, best first.
+        """Return the indices of at most `limit` candidates with scores above `threshold`, best first.
 
-        A candidate falls to a better one of the same best class when their IoU is above `nms`.
+        `nms`: IoU above which a candidate is suppressed by a better one of the same best class.
         """
         scores = self.class_scores.max(axis=1)
         x1, y1, x2, y2 = self.boxes.T
@@ -51,23 +50,30 @@ class Candidates:
 
 
 def decode(layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int) -> Candidates:
-    """The candidates in a network's `outputs` by name, for an input of `shape` (height, width) px and C classes.
+    """Return the candidates in a network's `outputs` by name, for an input of `shape` (height, width) px and C classes.
 
-    Raises DataError when the outputs do not have the layout.
+    Raises DataError if the outputs do not have the layout.
     """
-    if layout is OutputLayout.yolox:
-        candidates = _decode_yolox(rows_of(only(outputs), 5 + classes), shape)
-    elif layout is OutputLayout.yolo:
-        candidates = decode_yolo(rows_of(only(outputs), 4 + classes, "yolo_objectness"), objectness=False)
-    elif layout is OutputLayout.yolo_objectness:
-        candidates = decode_yolo(rows_of(only(outputs), 5 + classes, "yolo"), objectness=True)
-    else:
-        candidates = _decode_ssd(layout, outputs, shape, classes)
-    return candidates
+    if layout not in (OutputLayout.yolox, OutputLayout.yolo, OutputLayout.yolo_objectness):
+        return _decode_ssd(layout, outputs, shape, classes)
+    if len(outputs) != 1:
+        raise DataError(f"the network must have one output, found {described(outputs)}: choose another detector.layout")
+    (output,) = outputs.values()
+    if layout is OutputLayout.yolo:
+        rows = _rows(output, 4 + classes, "yolo_objectness")
+        return _checked(corners(rows[:, :4]), rows[:, 4:])
+    rows = _rows(output, 5 + classes, "yolo" if layout is OutputLayout.yolo_objectness else "")
+    boxes = rows[:, :4] if layout is OutputLayout.yolo_objectness else _yolox_boxes(rows, shape)
+    return _checked(corners(boxes), rows[:, 4:5] * rows[:, 5:])
+
+
+def _checked(boxes: Float32, class_scores: Float32) -> Candidates:
+    check_scores(class_scores)
+    return Candidates(boxes, class_scores)
 
 
 def check_scores(class_scores: Float32) -> None:
-    """Raises DataError unless all are in [0, 1]: a network that leaves the sigmoid or softmax to its user."""
+    """Raise DataError unless all scores are in [0, 1]; some networks are exported without sigmoid or softmax."""
     if class_scores.size and (class_scores.min() < -1e-3 or class_scores.max() > 1 + 1e-3):
         raise DataError(
             f"the network's scores must be in [0, 1], found {class_scores.min():.3g} to {class_scores.max():.3g}:"
@@ -75,20 +81,13 @@ def check_scores(class_scores: Float32) -> None:
         )
 
 
-def only(outputs: Mapping[str, Float32]) -> Float32:
-    """The one output that there is. Raises DataError when there are more."""
-    if len(outputs) != 1:
-        raise DataError(f"the network must have one output, found {described(outputs)}: choose another detector.layout")
-    return next(iter(outputs.values()))
-
-
 def described(outputs: Mapping[str, Float32]) -> str:
-    """The names and shapes of outputs, for messages."""
+    """Return the names and shapes of outputs, for messages."""
     return ", ".join(f"{name} {array.shape}" for name, array in outputs.items())
 
 
-def rows_of(output: Float32, columns: int, other_layout: str = "") -> Float32:
-    """The candidates (K, columns) of an output (1, K, columns) or (1, columns, K); the axis in front may be absent."""
+def _rows(output: Float32, columns: int, other_layout: str) -> Float32:
+    """Return the candidates (K, columns) of an output (K, columns) or (columns, K), with or without a leading axis."""
     table = output[0] if output.ndim == 3 and output.shape[0] == 1 else output
     if table.ndim == 2 and table.shape[1] == columns:
         return table
@@ -102,20 +101,16 @@ def rows_of(output: Float32, columns: int, other_layout: str = "") -> Float32:
 
 
 def corners(boxes: Float32) -> Float32:
-    """Boxes (K, 4) given as centre x, y, width, height as x1 y1 x2 y2."""
+    """Return boxes (K, 4) of center x, y, width, height as x1 y1 x2 y2."""
     half = boxes[:, 2:] / 2
     return np.concatenate([boxes[:, :2] - half, boxes[:, :2] + half], axis=1)
 
 
-def decode_yolo(rows: Float32, objectness: bool) -> Candidates:
-    """Rows (K, 4 + C) of a box, centre x, y, width, height in px, and class scores; (K, 5 + C) with an objectness."""
-    class_scores = rows[:, 4:5] * rows[:, 5:] if objectness else rows[:, 4:]
-    check_scores(class_scores)
-    return Candidates(corners(rows[:, :4]), class_scores)
+def _yolox_boxes(rows: Float32, shape: tuple[int, int]) -> Float32:
+    """Return boxes (K, 4) of center x, y, width, height in px.
 
-
-def _decode_yolox(rows: Float32, shape: tuple[int, int]) -> Candidates:
-    """Source: Ge et al., "YOLOX", 2021; github.com/Megvii-BaseDetection/YOLOX, yolox/utils/demo_utils.py."""
+    Source: Ge et al., "YOLOX", 2021; github.com/Megvii-BaseDetection/YOLOX, yolox/utils/demo_utils.py.
+    """
     cells, strides = [], []
     for stride in YOLOX_STRIDES:
         y, x = np.indices((shape[0] // stride, shape[1] // stride), np.float32).reshape(2, -1)
@@ -129,17 +124,15 @@ def _decode_yolox(rows: Float32, shape: tuple[int, int]) -> Candidates:
         )
     centers = (rows[:, :2] + cell) * stride_of
     sizes = np.exp(np.minimum(rows[:, 2:4], np.float32(LARGEST_LOG_SCALE))) * stride_of
-    class_scores = rows[:, 4:5] * rows[:, 5:]
-    check_scores(class_scores)
-    return Candidates(corners(np.concatenate([centers, sizes], axis=1)), class_scores)
+    return np.concatenate([centers, sizes], axis=1)
 
 
 def _decode_ssd(
     layout: OutputLayout, outputs: Mapping[str, Float32], shape: tuple[int, int], classes: int
 ) -> Candidates:
-    """Boxes, and scores by class where the network has them, else a score and a label for each box.
+    """Return boxes with scores by class if the network has them, else with a score and a label for each box.
 
-    Outputs are known by their names, as in TensorFlow's object detection API (detection_boxes, detection_classes,
+    Outputs are identified by name, as in TensorFlow's object detection API (detection_boxes, detection_classes,
     detection_scores, detection_multiclass_scores) and torchvision's models.detection (boxes, labels, scores). Label 0
     and the first of C + 1 scores are the background.
     """
@@ -152,31 +145,30 @@ def _decode_ssd(
         by_class = [t for name, t in tables.items() if "score" in name and t.shape[1:] in ((classes,), (classes + 1,))]
         scores = [t for name, t in tables.items() if "score" in name and t.ndim == 1]
         labels = [t for name, t in tables.items() if ("label" in name or "class" in name) and t.ndim == 1]
-        xyxy = boxes[0].reshape(-1, 4)
         if len(by_class) == 1:
-            return _ssd_candidates(layout, xyxy, by_class[0][:, -classes:], shape)
+            return _checked(_ssd_boxes(layout, boxes[0], shape), by_class[0][:, -classes:])
         if not by_class and len(scores) == len(labels) == 1:
-            return _ssd_candidates(layout, xyxy, _spread(scores[0], labels[0], classes), shape)
+            return _checked(_ssd_boxes(layout, boxes[0], shape), _spread(scores[0], labels[0], classes))
     raise DataError(
         f"a network of the layout {layout.value} with {classes} classes must have outputs named boxes (K, 4), and"
         f" either scores (K, {classes} or {classes + 1}), or scores (K,) and labels (K,); found {described(outputs)}"
     )
 
 
-def _ssd_candidates(layout: OutputLayout, boxes: Float32, class_scores: Float32, shape: tuple[int, int]) -> Candidates:
-    check_scores(class_scores)
+def _ssd_boxes(layout: OutputLayout, boxes: Float32, shape: tuple[int, int]) -> Float32:
+    boxes = boxes.reshape(-1, 4)
     if layout is OutputLayout.ssd_tensorflow:
         boxes = boxes[:, [1, 0, 3, 2]]
     if layout is not OutputLayout.ssd_torchvision:
         boxes = boxes * np.array([shape[1], shape[0]] * 2, np.float32)
-    return Candidates(boxes, class_scores)
+    return boxes
 
 
 def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
-    """Scores by class (K, C) from one score and one label (K,), from 1, each.
+    """Return scores by class (K, C) from one score and one label, from 1, for each of K boxes.
 
-    What the score leaves to 1 is shared evenly among the other classes, but none of them gets more than the label,
-    which stays the best. Rows of the background, and of score 0 as padding, are all 0.
+    1 - score is distributed evenly over the other classes, but none of them exceeds the label. Rows of the background
+    and of score 0 (padding) are 0.
     """
     column = np.rint(labels).astype(np.int64) - 1
     used = (column != -1) & (scores > 0)
@@ -193,10 +185,10 @@ def _spread(scores: Float32, labels: Float32, classes: int) -> Float32:
 
 
 def spread_rest(one_hot: Float32, scores: Float32, spread: float) -> Float32:
-    """Rows (N, C) of 0 and 1 with what the scores (N,) lack to 1 taken from the label and given evenly to the others.
+    """Return class distributions (N, C) from one-hot labels and scores (N,).
 
-    The label gets 1 - spread * (1 - score), but not less than its even share. spread in [0, 1]: with 1 the label's
-    probability is its score, with 0 the label is certain.
+    The label gets 1 - spread * (1 - score), but at least 1 / C, and the other classes get equal parts of the rest.
+    spread in [0, 1]: with 1 the label's probability is its score, with 0 the label is certain.
     """
     c = one_hot.shape[1]
     if c == 1:

@@ -1,43 +1,24 @@
-"""What pictures a network is for: what knows rendered rooms alone finds nonsense in photographs, and is sure of it."""
+"""Image domains: a detector trained on rendered rooms is confidently wrong in photographs."""
 
 from __future__ import annotations
 
 import logging
-from typing import Protocol, runtime_checkable
 
 from framework.interfaces import Detector, RGBDVideo
 
 log = logging.getLogger(__name__)
 
 RENDERED_ROOMS = "rendered rooms"
-"""The domain of what `framework.synthetic` makes."""
-
-OF_PHOTOGRAPHS = "maskrcnn2go"
-"""The detector that is advised instead, the default of what is recorded."""
-
-
-@runtime_checkable
-class OfADomain(Protocol):
-    """A detector that is good for pictures of some kind only."""
-
-    domain: str  # what `RGBDVideo.domain` must be; "" = whatever it is
-
-
-def domain_of(detector: Detector) -> str:
-    """The domain that a detector has, "" where it has none."""
-    return detector.domain if isinstance(detector, OfADomain) else ""
+"""The domain of images from `framework.synthetic`."""
 
 
 def warn_outside_domain(detector: Detector, video: RGBDVideo | None) -> None:
-    """Says so in the log, in one line, when a detector sees what it is not for. `video`: None = it is not known."""
-    domain = domain_of(detector)
-    if domain in ("", video.domain if video else ""):
+    """Log a warning if the detector is not for the images of `video`; None = unknown images."""
+    if detector.domain in ("", video.domain if video else ""):
         return
-    pictures = f"the pictures of {video.name} are" if video else "your frames are"
     log.warning(
-        "the detector was trained on %s alone, and nothing says that %s such: what it finds there may be nonsense, "
-        "however sure it is; use detector=%s",
-        domain,
-        pictures,
-        OF_PHOTOGRAPHS,
+        "the detector was trained on %s only; results on %s may be unreliable even at high confidence; "
+        "use detector=maskrcnn2go",
+        detector.domain,
+        video.name if video else "your frames",
     )

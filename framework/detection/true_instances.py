@@ -1,4 +1,4 @@
-"""The true instances of a frame, as detectors would return them."""
+"""The true instances of a frame."""
 
 from __future__ import annotations
 
@@ -13,26 +13,25 @@ from framework.errors import DataError
 
 @dataclass(frozen=True)
 class TrueInstances:
-    """The N instances of known class that are visible in a frame, largest first, equal ones by id."""
+    """The N visible instances of known class, largest first, equal ones by id."""
 
     ids: Int32  # (N,)
     class_ids: Int32  # (N,) index into the detector's classes
     masks: Bool  # (N, H, W)
-    areas: Int32  # (N,) px
 
     def __len__(self) -> int:
         return len(self.ids)
 
 
 def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) -> TrueInstances:
-    """The instances of `frame` whose class is known and that are at least `min_pixels` large.
+    """Return the instances of `frame` with a known class and at least `min_pixels`.
 
-    Raises DataError when the sequence has no instance ground truth, or names a class that is not in `classes`.
+    Raises DataError if the sequence has no instance ground truth, or has a class that is not in `classes`.
     """
     if frame.truth is None:
         raise DataError(
             f"frame {frame.index} has no instance ground truth, which this detector needs:"
-            " set dataset.frame_ground_truth=true where the dataset has a labelled mesh (scenenn, scannet),"
+            " set dataset.frame_ground_truth=true where the dataset has a labeled mesh (scenenn, scannet),"
             " or choose another dataset or detector"
         )
     index = {name: k for k, name in enumerate(classes)}
@@ -43,12 +42,9 @@ def true_instances(frame: Frame, classes: Sequence[str], min_pixels: int = 1) ->
 
     found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
     chosen = np.array([i in names for i in found.tolist()], np.bool_) & (areas >= min_pixels)
-    found, areas = found[chosen], areas[chosen]
-    order = np.argsort(-areas, kind="stable")
-    found, areas = found[order], areas[order]
+    found = found[chosen][np.argsort(-areas[chosen], kind="stable")]
     return TrueInstances(
         ids=found.astype(np.int32),
         class_ids=np.array([index[names[i]] for i in found.tolist()], np.int32),
         masks=frame.truth.instance_ids == found[:, None, None],
-        areas=areas.astype(np.int32),
     )

@@ -46,7 +46,7 @@ def published() -> Iterator[Check]:
     for name, network in PUBLISHED.items():
         size = _size(network.file)
         expected = f", {network.megabytes} MB" if network.megabytes else ""
-        detail = f"not downloaded{expected}, {network.licence}{offline}"
+        detail = f"not downloaded{expected}, {network.license}{offline}"
         if size:
             detail = f"{size / 1e6:.0f} MB in {anonymous(network.file.parent)}"
         yield Check.of(name, size > 0, detail, f"instancemap detector=mask_rcnn detector.weights={name}")

@@ -1,4 +1,4 @@
-"""A map as its users ask it: which objects there are, where, and what a camera sees of them."""
+"""Queries of a map: its objects, their positions, and views."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from framework.mapping.gravity import floor_height
 
 
 class Map:
-    """The questions to a map, of whatever fuser; several threads may ask at once."""
+    """Thread-safe queries of a map of any fuser."""
 
-    scene: SceneMap  # what answers them
-    lock: threading.RLock  # held while one is answered, or a frame is mapped
+    scene: SceneMap
+    lock: threading.RLock  # held during a query and while a frame is mapped
 
     def __init__(self, scene: SceneMap) -> None:
         self.scene = scene
@@ -36,13 +36,13 @@ class Map:
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """The names that objects can have; empty while nothing is mapped."""
+        """The class names; empty before the first frame."""
         return self.scene.classes
 
     def instances(self, class_: str | None = None) -> Mapping[int, Instance]:
-        """The objects found so far, by id; of one class, those that are most likely of it.
+        """Return the objects by id; with `class_`, those whose most likely class it is.
 
-        Raises DataError for a class that the map does not know.
+        Raises DataError for an unknown class.
         """
         with self.lock:
             found = self.scene.instances()
@@ -55,27 +55,26 @@ class Map:
             return {key: instance for key, instance in found.items() if self.name(instance) == class_}
 
     def name(self, instance: Instance) -> str:
-        """The name of the class that an object most likely is of; "object" where the map knows no classes."""
+        """Return the name of an object's most likely class; "object" in a map without classes."""
         probabilities = instance.class_probabilities
         return self.classes[int(probabilities.argmax())] if len(probabilities) else "object"
 
     def nearest(self, point: Sequence[float] | Float64, class_: str | None = None) -> Instance | None:
-        """The object whose surface comes nearest to a point (3,) m of the world, None where there is none."""
-        where = np.asarray(point, np.float64)
-        if where.shape != (3,) or not np.isfinite(where).all():
-            raise DataError(f"a point is three finite numbers, metres in the world, found {point!r:.60}")
+        """Return the object with the surface nearest to a point (3,) m of the world, None without objects."""
+        target = np.asarray(point, np.float64)
+        if target.shape != (3,) or not np.isfinite(target).all():
+            raise DataError(f"a point is three finite numbers, meters in the world, found {point!r:.60}")
         with self.lock:
             found = self.instances(class_)
             vertices = self.scene.mesh().vertices if found else np.zeros((0, 3), np.float32)
 
             def distance(instance: Instance) -> float:
-                apart = np.linalg.norm(vertices[instance.vertices] - where, axis=1)
-                return float(apart.min(initial=np.inf))
+                return float(np.linalg.norm(vertices[instance.vertices] - target, axis=1).min(initial=np.inf))
 
             return min(found.values(), key=distance, default=None)
 
     def view(self, camera: Camera, T_world_camera: Float64) -> View:
-        """What `camera` would see of the map from there. It shows no id that `instances` does not know."""
+        """Return the view of the map from a pose, with ids of `instances` only."""
         with self.lock:
             view = self.scene.render(camera, T_world_camera)
             unknown = ~np.isin(view.instance_ids, [0, *self.scene.instances()])
@@ -86,36 +85,33 @@ class Map:
         )
 
     def at_pixel(self, u: int, v: int, camera: Camera, T_world_camera: Float64) -> Instance | None:
-        """The object that `camera` would see at pixel (u, v) from there, None where it would see none.
-
-        Raises DataError for a pixel outside the image.
-        """
+        """Return the object at pixel (u, v) of the view from a pose, or None. Raises DataError outside the image."""
         if not (0 <= u < camera.width and 0 <= v < camera.height):
             raise DataError(f"the pixel ({u}, {v}) is not in the image of {camera.width}x{camera.height}")
         with self.lock:
-            seen = int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)])
-            return self.scene.instances().get(seen)
+            return self.scene.instances().get(int(self.view(camera, T_world_camera).instance_ids[int(v), int(u)]))
 
     def up(self) -> Float64 | None:
-        """The unit vector (3,) against gravity in the world, by a sensor where frames have `up`, else by floor, walls
-        and how the camera was held; boxes (`obb`) stand along it. None where the map does not tell.
+        """Return the unit vector (3,) against gravity in the world, along which boxes (`obb`) stand; None if unknown.
+
+        It comes from a sensor if frames have `up`, else from floor, walls and the camera's orientation.
         """
         with self.lock:
             return self.scene.gravity().up
 
     def up_source(self) -> str:
-        """What tells `up`: "sensor" or "surfaces"; "" where nothing does."""
+        """Return the source of `up`: "sensor", "surfaces", or "" if unknown."""
         with self.lock:
             return self.scene.gravity().source
 
     def floor(self) -> float | None:
-        """m along `up`, how high the floor is: a point is `point @ up - floor` above it. None where it was not seen."""
+        """Return the floor's height, m along `up`: a point is `point @ up - floor` above it. None if not seen."""
         with self.lock:
             up, mesh = self.scene.gravity().up, self.scene.mesh()
             return None if up is None else floor_height(mesh.vertices, mesh.triangles, up)
 
     def mesh(self, instance: Instance | int | None = None) -> InstanceMesh:
-        """The surface of the whole map, or of one object. Raises DataError for one that there is not."""
+        """Return the surface of the map or of one object. Raises DataError for an unknown object."""
         with self.lock:
             whole = self.scene.mesh()
             if instance is None:
@@ -127,6 +123,6 @@ class Map:
             return whole.of(found)
 
     def save(self, path: Path | str) -> None:
-        """Writes the map to one file, whole or not at all; `load_map` reads it."""
+        """Write the map to one file atomically; `load_map` reads it."""
         with self.lock:
             self.scene.save(path)

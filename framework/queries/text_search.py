@@ -1,4 +1,4 @@
-"""Which objects of a map somebody means: by the embeddings of their pictures, or by class names and colours."""
+"""Text search for objects of a map, by image embeddings or by class names and colors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from framework.vocabulary.color_names import COLOR_NAMES, fits, nearest_names
 from framework.vocabulary.text_queries import object_words
 
 BY = ("embeddings", "names")
-LEAST_MATCH = 0.1  # of names: below, an object is hardly what was asked for
+LEAST_MATCH = 0.1  # smallest similarity by names
 LONGEST_QUERY = 1000  # characters
 NAME_IT = "name it by --model, from Python by model="
 WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instancemap[transformers])"
@@ -25,31 +25,31 @@ WITH_EMBEDDINGS = "detector=with_embeddings (CLIP or SigLIP: pip install instanc
 
 @dataclass(frozen=True)
 class Match:
-    """An object that may be meant."""
+    """An object that matches a query."""
 
     instance: Instance
-    name: str  # of its likeliest class
-    similarity: float  # by embeddings the cosine, in [-1, 1]; by names in [0, 1]: how probable class and colour are
-    color: str  # what most of its surface is called, in the light that it was seen in: "brown"
+    name: str  # of its most likely class
+    similarity: float  # by embeddings: cosine in [-1, 1]; by names: probability of class and color in [0, 1]
+    color: str  # name of the most frequent color of its surface as observed: "brown"
     centroid: Float64  # (3,) m, of its vertices
 
 
 @dataclass(frozen=True)
 class QueryResult:
-    """The objects of a map that words may mean."""
+    """The objects of a map that match a text query."""
 
-    by: str  # what they were found by: "embeddings" of their pictures, or "names" of classes and colours
-    space: str  # the model that the map's embeddings are of, and its version; "" = it has no embeddings
-    objects: tuple[Match, ...]  # best first; by embeddings all that have one, by names those that are meant
+    by: str  # "embeddings" of images, or "names" of classes and colors
+    space: str  # model and version of the map's embeddings; "" = the map has none
+    objects: tuple[Match, ...]  # best first; by embeddings all that have one, by names the matching ones
 
 
 @dataclass(frozen=True)
 class TextQuery:
-    """What somebody looks for in a map. Raises ConfigError for what is no question."""
+    """A text query. Raises ConfigError for invalid values."""
 
     words: str
-    by: str | None = None  # of BY; None = embeddings where the map has any, or a model is named, else names
-    model: str | None = None  # that embeds the words: a folder, a file or an id; None = that of the run's detector
+    by: str | None = None  # of BY; None = embeddings if the map has any or a model is named, else names
+    model: str | None = None  # that embeds the words: folder, file or id; None = that of the run's detector
 
     def __post_init__(self) -> None:
         if not isinstance(self.words, str) or not 0 < len(self.words.strip()) <= LONGEST_QUERY:
@@ -62,35 +62,34 @@ class TextQuery:
             raise ConfigError(f"a model is of embeddings, and by names none is asked: found {self.model!r:.60}")
 
 
-def search(scene: Map, question: TextQuery, run: Path | None = None) -> QueryResult:
-    """The objects that the question means; `run` is the directory of the map's run, None = it is of none.
+def search(scene: Map, query: TextQuery, run: Path | None = None) -> QueryResult:
+    """Return the objects that match a query; `run`: directory of the map's run, if any.
 
-    Raises DataError for words that nothing is called, and where the embeddings that are asked for are not there or are
-    of another model.
+    Raises DataError for unknown words, and if the embeddings are missing or of another model.
     """
     space = scene.scene.embedding_space
-    by = question.by or ("embeddings" if space or question.model is not None else "names")
+    by = query.by or ("embeddings" if space or query.model is not None else "names")
     if by == "names":
-        return QueryResult(by, space, tuple(by_names(scene, question.words)))
+        return QueryResult(by, space, tuple(by_names(scene, query.words)))
     if not space:
         raise DataError(f"{run or 'this map'} has no embeddings: run with {WITH_EMBEDDINGS}, or ask by names")
-    return QueryResult(by, space, tuple(by_embedding(scene, _embedded(question, space, run))))
+    return QueryResult(by, space, tuple(by_embedding(scene, _embedded(query, space, run))))
 
 
-def _embedded(question: TextQuery, space: str, run: Path | None) -> Float32:
-    """The question's words (D,) in a map's space."""
+def _embedded(query: TextQuery, space: str, run: Path | None) -> Float32:
+    """Return the embedding (D,) of the query in the map's space."""
     from framework.detection.hub.image_text import ImageTextModel
 
-    name, revision = _model_of(run) if question.model is None else (question.model, "main")
+    name, revision = _model_of(run) if query.model is None else (query.model, "main")
     opened = ImageTextModel(name, revision, "cpu", half_precision=False)
     if opened.space != space:
         found = f"the embeddings of {run or 'this map'} are of {space}, and {name} is {opened.space}"
         raise DataError(f"{found}: the words need that very model, {NAME_IT}")
-    return opened.embed_text(question.words)
+    return opened.embed_text(query.words)
 
 
 def _model_of(run: Path | None) -> tuple[str, str]:
-    """The model and the revision that a run's detector was made with. Raises DataError where its config has none."""
+    """Return model and revision of a run's detector. Raises DataError if its config has none."""
     if run is None:
         raise DataError(f"a map does not say of which model its embeddings are: {NAME_IT}, or ask by its run")
     node = read_yaml(run / CONFIG).get("detector") if is_there(run / CONFIG) else None
@@ -100,9 +99,9 @@ def _model_of(run: Path | None) -> tuple[str, str]:
 
 
 def by_embedding(scene: Map, text: Float32) -> list[Match]:
-    """The objects by the cosine of the angle between their embedding and that of a text (D,), the nearest first.
+    """Return the objects with an embedding by its cosine with that of a text (D,), the largest first.
 
-    Objects without an embedding are left out. Raises DataError where the map's have another length.
+    Raises DataError if the map's embeddings have another length.
     """
     with scene.lock:
         known = {k: i.embedding for k, i in scene.instances().items() if i.embedding is not None}
@@ -112,10 +111,9 @@ def by_embedding(scene: Map, text: Float32) -> list[Match]:
 
 
 def by_names(scene: Map, query: str) -> list[Match]:
-    """The objects by how probably they are of a class that the query names, times how well a colour that it names fits
-    their surface, without those that are not meant at all. Those that fit alike are ranked by their confidence.
+    """Return the objects by the probability of the query's classes times the fit of its colors, then by confidence.
 
-    Raises DataError for a query with a word that is neither, or with none that is.
+    Raises DataError for a query with an unknown word, or without a class or color.
     """
     with scene.lock:
         words = object_words(query, scene.classes)
@@ -123,7 +121,7 @@ def by_names(scene: Map, query: str) -> list[Match]:
             unknown = ", ".join(map(repr, words.unknown or [query]))
             there = ", ".join(sorted({scene.name(instance) for instance in scene.instances().values()}))
             raise DataError(
-                f"no class of this map and no colour is called {unknown}; its objects are {there or 'none'}; colours "
+                f"no class of this map and no color is called {unknown}; its objects are {there or 'none'}; colors "
                 f"are {', '.join(COLOR_NAMES)}"
             )
         columns = [scene.classes.index(name) for name in words.classes]
@@ -132,23 +130,23 @@ def by_names(scene: Map, query: str) -> list[Match]:
             of_class = float(instance.class_probabilities[columns].sum()) if columns else 1.0
             match = of_class * (color_fit(mesh, instance, words.colors) if words.colors else 1.0)
             if match >= LEAST_MATCH:
-                matches[k] = round(match, 2)  # less tells nothing
+                matches[k] = round(match, 2)  # finer differences are not significant
         return _found(scene, matches)
 
 
 def color_fit(mesh: InstanceMesh, instance: Instance, colors: Sequence[str]) -> float:
-    """How well these colours fit an object, in [0, 1]: the mean over its vertices, by the colour that fits best."""
-    colors_there = _colors(mesh, instance)
-    return max((float(fits(colors_there, name).mean()) for name in colors), default=0.0) if len(colors_there) else 0.0
+    """Return the fit of the best of these colors to an object, in [0, 1]: the mean over its vertices."""
+    observed = _colors(mesh, instance)
+    return max((float(fits(observed, name).mean()) for name in colors), default=0.0) if len(observed) else 0.0
 
 
 def _colors(mesh: InstanceMesh, instance: Instance) -> Float32:
-    """(M, 3) sRGB in [0, 1] of an object's vertices."""
+    """Return the colors (M, 3) sRGB in [0, 1] of an object's vertices."""
     return np.asarray(mesh.colors[instance.vertices].astype(np.float32) / np.float32(255), np.float32)
 
 
 def _found(scene: Map, similarities: dict[int, float]) -> list[Match]:
-    """The objects with these similarities by id, best first; of equals, the more trusted one."""
+    """Return the objects with these similarities by id, best first, then by confidence."""
     instances, mesh = scene.instances(), scene.mesh()
     return [
         Match(

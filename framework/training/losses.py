@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN
+from framework.detection.mask_rcnn.network import DELTA_WEIGHTS, MaskRCNN, propose
 from framework.detection.mask_rcnn.roi_align import roi_align
 
 BETA = 1.0 / 9.0  # where the smooth L1 loss becomes linear
@@ -59,7 +59,7 @@ def losses(
         terms = _anchor_losses(anchors, objectness[i], deltas[i], true, generator)
         scores, moves = (output[i].detach().cpu().numpy() for output in (objectness, deltas))
         with torch.no_grad():
-            proposals = network.propose(of_levels, scores, moves, shape, budget.before_nms, budget.after_nms)
+            proposals = propose(of_levels, scores, moves, shape, budget.before_nms, budget.after_nms)
         boxes = torch.cat([torch.from_numpy(proposals).to(images.device), true.boxes])
         of_images.append(terms | _proposal_losses(network, of_image, boxes, true, budget.proposals, generator))
     names = ("objectness", "anchors", "classes", "boxes", "masks")

@@ -1,4 +1,4 @@
-"""The names that people have for colours: English's basic colour terms (Berlin and Kay 1969), and beige."""
+"""Color names: the basic color terms of English (Berlin and Kay 1969), and beige."""
 
 from __future__ import annotations
 
@@ -22,41 +22,37 @@ _SAMPLES: dict[str, tuple[tuple[int, int, int], ...]] = {
     "pink": ((235, 130, 170), (160, 107, 128), (232, 182, 190)),
     "brown": ((110, 70, 40), (142, 94, 58), (158, 84, 48), (94, 66, 51), (60, 38, 24), (183, 140, 96)),
     "beige": ((216, 196, 160), (204, 189, 163), (220, 186, 138)),
-}  # sRGB, 0..255: what stands for each name, strong, muted and dark
+}  # sRGB, 0..255: samples of each name, saturated, muted and dark
 
 COLOR_NAMES = tuple(_SAMPLES)
-"""The names, in no particular order."""
-
-CONFUSED = 12.0  # units of CIELAB: colours so near to each other are called either, in changing light
-
+CONFUSED = 12.0  # units of CIELAB: distance of colors that get either name, in changing light
 OTHER_SPELLINGS = {"grey": "gray", "violet": "purple", "turquoise": "blue", "teal": "blue", "navy": "blue"}
-"""Other words for them."""
 
 
 def lab(srgb: Float32) -> Float32:
-    """CIELAB (N, 3) of sRGB colours (N, 3) in [0, 1]: distances there are about as large as they look."""
+    """Return CIELAB (N, 3), in which distances are about perceptual, of sRGB colors (N, 3) in [0, 1]."""
     return np.asarray(cv2.cvtColor(srgb.reshape(1, -1, 3).astype(np.float32), cv2.COLOR_RGB2LAB)[0], np.float32)
 
 
 def nearest_names(srgb: Float32) -> Int32:
-    """For each sRGB colour (N, 3) in [0, 1], the index in COLOR_NAMES of the name whose sample is nearest."""
-    away = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
-    return np.asarray(_NAME_OF_SAMPLE[away.argmin(axis=1)], np.int32)
+    """Return the index (N,) in COLOR_NAMES of the nearest sample to sRGB colors (N, 3) in [0, 1]."""
+    distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
+    return np.asarray(_NAME_OF_SAMPLE[distances.argmin(axis=1)], np.int32)
 
 
 def fits(srgb: Float32, name: str) -> Float32:
-    """(N,) in [0, 1]: how well a name of COLOR_NAMES fits sRGB colours (N, 3) in [0, 1].
+    """Return the fit (N,) in [0, 1] of a name of COLOR_NAMES to sRGB colors (N, 3) in [0, 1].
 
-    1 where it is the nearest one; from there it falls, as a Gaussian, with how much farther away it is than that.
+    A Gaussian of the additional distance to this name compared with the nearest name, for which the fit is 1.
     """
-    away = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
-    farther = away[:, COLOR_NAMES.index(name) == _NAME_OF_SAMPLE].min(axis=1) - away.min(axis=1)
-    return np.asarray(np.exp(-0.5 * (farther / CONFUSED) ** 2), np.float32)
+    distances = np.linalg.norm(lab(srgb)[:, None] - _samples_lab()[None], axis=2)
+    additional = distances[:, COLOR_NAMES.index(name) == _NAME_OF_SAMPLE].min(axis=1) - distances.min(axis=1)
+    return np.asarray(np.exp(-0.5 * (additional / CONFUSED) ** 2), np.float32)
 
 
 @cache
 def _samples_lab() -> Float32:
-    """CIELAB (S, 3) of all samples; not made where this is imported, as OpenCV takes its time for the first picture."""
+    """Return CIELAB (S, 3) of all samples; not at import, because OpenCV's first conversion is slow."""
     samples = [sample for samples in _SAMPLES.values() for sample in samples]
     return lab(np.array(samples, np.float32) / np.float32(255))
 

@@ -1,4 +1,4 @@
-"""The upper bound: what a detector without any error would return."""
+"""Ground truth as detections: the upper bound for detectors."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class GroundTruthDetector(Detector):
-    """One detection for each visible instance of known class: its exact mask, score 1, all probability on its class.
+    """Returns each visible instance of known class with its exact mask, score 1 and a certain class.
 
-    Raises DataError on a sequence without instance ground truth.
+    Raises DataError for a sequence without instance ground truth.
     """
 
-    min_pixels: int = 64  # px >= 1, smaller instances are not detected: about what a real detector can still see
+    min_pixels: int = 64  # px >= 1, smallest detected instance: about the limit of real detectors
 
     def __post_init__(self) -> None:
         require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")

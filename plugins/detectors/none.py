@@ -11,7 +11,7 @@ from framework.vocabulary.label_spaces import COCO
 
 @dataclass
 class NoDetections(Detector):
-    """Finds nothing: the map is geometry only, and the cost of everything but the instances can be measured."""
+    """Returns nothing: the map is geometry only, to measure the cost of everything except instances."""
 
     def __post_init__(self) -> None:
         self.classes = COCO

@@ -1,4 +1,4 @@
-"""The detections of any other program, from files."""
+"""Detections of any other program, from files."""
 
 from __future__ import annotations
 
@@ -25,30 +25,28 @@ from framework.vocabulary.label_spaces import read_labels, to_coco
 
 log = logging.getLogger(__name__)
 
-FRAMES_IN_DOUBT = 30  # frames in a row, from the first, without an entry: time to tell the user
+FRAMES_IN_DOUBT = 30  # first frames without an entry until a warning
 
 
 @dataclass
 class Precomputed(Detector):
-    """Returns what a COCO result file or a folder of masks has for the frame's number.
+    """Returns the detections of a COCO result file or a folder of masks for the frame's number.
 
-    `python -m framework detect` writes such a file, and so does any program that COCO's evaluation accepts; a folder
-    has NNNNNN.png with 16-bit instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Either may
-    give `class_probabilities`, over its own labels. Labels become COCO's names as `label_spaces.yaml` says, and a
-    detection whose best label means none of them is dropped.
+    `instancemap detect` and programs for COCO's evaluation write such files. A folder has NNNNNN.png with 16-bit
+    instance ids and NNNNNN.json with [{"id", "class", "score"}] for frame NNNNNN. Both may have `class_probabilities`
+    over their own labels. `label_spaces.yaml` maps labels to COCO names; detections whose best label has none are
+    dropped. A label with only a score s gets the probability 1 - class_spread * (1 - s), at least 1 / classes, and the
+    other classes get equal parts of the rest.
 
-    Where there is only a label and a score s, the label gets the probability 1 - spread * (1 - s), but not less than
-    its even share, and the other classes share the rest evenly. With spread 1 that is s; with 0 the label is certain.
-
-    A frame without an entry has no detections. Raises DataError when the last frame that has one is over and there was
-    none: then the file belongs to another sequence.
+    A frame without an entry has no detections. Raises DataError, because the file belongs to another sequence, if none
+    of the frames up to its last one had an entry.
     """
 
     path: Path  # JSON file or folder
-    labels: str = "coco"  # a label space, or a text file with one name a line: that of the file
-    category_ids: CategoryIds = CategoryIds.COCO_91  # what category_id counts, where there is no category_name
-    score_threshold: float = 0.0  # in [0, 1]: detections below are dropped
-    class_spread: float = 1.0  # in [0, 1]: how much of what a score lacks to 1 goes to the other classes
+    labels: str = "coco"  # of the file: a label space, or a text file with one name per line
+    category_ids: CategoryIds = CategoryIds.COCO_91  # numbering of category_id, used without category_name
+    score_threshold: float = 0.0  # in [0, 1]; detections below are dropped
+    class_spread: float = 1.0  # in [0, 1], fraction of 1 - score for the other classes
 
     reads = ("index", "camera")
 
@@ -77,12 +75,12 @@ class Precomputed(Detector):
             if is_known and one.score >= self.score_threshold:
                 self._of_frame[one.frame].append((one, row))
         for of_frame in self._of_frame.values():
-            of_frame.sort(key=lambda pair: -pair[0].score)  # stable: equal ones stay in the file's order
+            of_frame.sort(key=lambda pair: -pair[0].score)  # stable: equal scores keep the order of the file
         self._matched = False
         self._asked: set[int] = set()
 
     def fingerprint(self) -> str:
-        """Also the labels, which may come from a file."""
+        """Include the labels, which may come from a file."""
         return hashlib.sha256(repr((fingerprint(self), self._labels)).encode()).hexdigest()
 
     def detect(self, frame: Frame) -> Detections:
@@ -102,7 +100,7 @@ class Precomputed(Detector):
         )
 
     def _distributions(self, stored: Sequence[StoredDetection]) -> tuple[Float32, Bool]:
-        """(N, C) over COCO's names, and (N,) whether the best label means one; sets `classes`."""
+        """Return (N, C) over COCO names, and (N,) whether the best label means one; set `classes`."""
         index = {name: k for k, name in enumerate(self._labels)}
         one_hot = np.eye(len(index), dtype=np.float32)
         given = np.stack([one_hot[index[one.label]] if one.probabilities is None else one.probabilities
@@ -112,7 +110,7 @@ class Precomputed(Detector):
         self.classes = mapping.classes
         rows, known = mapping.apply(given)
         if self.classes == self._labels:
-            rows = given  # to the bit: normalising could change the last digit
+            rows = given  # normalizing could change the last digit
         scores = np.array([one.score for one in stored])
         rows[only_label] = spread_rest(rows[only_label], scores[only_label], self.class_spread)
         return rows, known
@@ -133,5 +131,5 @@ class Precomputed(Detector):
 def _mask(stored: StoredDetection, frame: Frame) -> Bool:
     try:
         return stored.segmentation.mask(frame.camera.shape)
-    except DataError as error:
+    except DataError as error:  # a FrameError skips the frame
         raise type(error)(f"{stored.where}: frame {frame.index}: {error}") from error

@@ -1,4 +1,4 @@
-"""A detector of chosen quality: the ground truth, degraded by a seeded model of the errors that real detectors make."""
+"""A detector of adjustable quality: the ground truth, degraded by a seeded model of the errors of real detectors."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from enum import IntEnum
 import cv2
 import numpy as np
 
-from framework.config.validation import MOST_DETECTIONS, require
+from framework.config.validation import MOST_DETECTIONS, check_intervals, require
 from framework.data import Bool, Detections, Float32, Float64, Frame, Int32
 from framework.detection.masks.binary_masks import paste_masks, tight_boxes
-from framework.detection.masks.contact_kernels import contacts
-from framework.detection.recurring_false_positives import ghost_places
+from framework.detection.masks.binary_masks_kernels import contacts
+from framework.detection.recurring_false_positives import false_positive_cells
 from framework.detection.true_instances import TrueInstances, true_instances
 from framework.interfaces import Detector
 from framework.vocabulary.label_spaces import COCO
@@ -27,23 +27,36 @@ LOOKALIKES = (
     ("knife", "fork", "spoon", "scissors", "toothbrush"), ("car", "truck", "bus", "train"), ("bicycle", "motorcycle"),
 )
 # fmt: on
-"""COCO classes that are taken for each other, chosen from what detectors are seen to confuse indoors."""
-TAKEN_FOR = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
-"""What is none of COCO's classes is taken for one of these."""
-LOOKALIKE_SHARE = 0.8  # of the probability lost by the true class; the rest is spread over all other classes
-EVEN_SHARE = 0.01  # of each distribution that is the model's mean: like a softmax, it has no zeros
-FALSE_SIZES = (24.0, 160.0)  # px, sides of false detections, drawn evenly on a logarithmic scale
-LARGEST_CLUTTER = 0.25  # of the image: larger things, walls as a rule, are not taken for objects as a whole
-LARGEST_ATTACHED = 2.0  # times the object's size: larger things are not taken for a part of it
-GHOST_SIZES = (0.2, 1.2)  # m, sides of false detections at places of the room, drawn evenly on a logarithmic scale
-SHARES = (
-    *("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate", "split_rate"),
-    *("confusion_consistency", "recurring_fraction"),
-)
+"""COCO classes that detectors confuse indoors."""
+
+CLUTTER_CLASSES = tuple(dict.fromkeys(name for group in LOOKALIKES for name in group))
+"""Classes of detections on things that have no COCO class."""
+
+LOOKALIKE_SHARE = 0.8  # fraction of the probability lost by the true class; the other classes get the rest
+EVEN_SHARE = 0.01  # weight of the model's mean in each distribution, which therefore has no zeros, like a softmax
+FALSE_SIZES = (24.0, 160.0)  # px, sides of false detections, log-uniform
+RECURRING_SIZES = (0.2, 1.2)  # m, sides of recurring false detections, log-uniform
+LARGEST_CLUTTER = 0.25  # fraction of the image; larger things, usually walls, are not detected as objects
+LARGEST_ATTACHED = 2.0  # ratio to the object's size; larger things are not detected as a part of it
+INTERVALS = {
+    **dict.fromkeys(("clutter_rate", "attach_rate", "merge_rate", "miss_rate", "truncated_miss_rate"), "[0, 1]"),
+    **dict.fromkeys(("split_rate", "confusion_consistency", "recurring_fraction"), "[0, 1]"),
+    **dict.fromkeys(("small_side", "miss_spread", "shift", "boundary_noise", "score_concentration"), "[0, inf)"),
+    **dict.fromkeys(("confusion", "score_threshold"), "[0, 1)"),
+    "seed": "[0, inf)",
+    "min_pixels": "[1, inf)",
+    "bleed": "[-1000, 1000]",
+    "boundary_scale": "[2, inf)",
+    "confusion_concentration": "(0, inf)",
+    "score_scale": "(0, 1]",
+    "false_positives": f"[0, {MOST_DETECTIONS}]",
+    "false_positive_score": "(0, 1)",
+}
+"""The bounds of the parameters."""
 
 
 class Draw(IntEnum):
-    """What a random number is for. Each has its own stream: changing one error leaves the others' draws alone."""
+    """The purpose of a random number, each with its own stream: changing one error does not change others' draws."""
 
     MERGE = 0
     MISS = 1
@@ -56,85 +69,66 @@ class Draw(IntEnum):
     ATTACH = 8
     CLUTTER = 9
     DETECTABILITY = 10
-    GHOST = 11
+    RECURRING = 11
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """An object, or a part of one, on its way to a detection."""
+    """An object or a part of one that becomes a detection."""
 
-    instance: int  # its id in the ground truth; what is nothing has a negative one
-    part: int  # 0, or 1 for the second half of a split object
+    instance: int  # id in the ground truth; negative for a false detection
+    part: int  # 0; 1 for the second half of a split object
     class_id: int
     mask: Bool  # (H, W)
-    true_mask: Bool  # (H, W) of the instance, which a perfect detector would return; empty for a false detection
+    true_mask: Bool  # (H, W) of the instance; empty for a false detection
 
 
 @dataclass
 class SimulatedDetector(Detector):
     """The ground truth with the errors of a mid-quality detector, each one a parameter; all at 0 = the ground truth.
 
-    In this order: things of unknown class are taken for objects (`clutter_rate`); an object comes back with a thing
-    that touches it, as a sink with its cupboard (`attach_rate`); touching neighbours come back under one mask
-    (`merge_rate`); objects are missed, the more so the smaller (`small_side`) or when cut by the image's border, some
-    objects nearly always and others never (`miss_spread`); objects come back in two halves (`split_rate`); masks are
-    shifted, bleed over the border, wobble smoothly along it and pass through a coarse grid; the class becomes a
-    distribution around a confusion kernel of lookalikes, the same one in many of an object's frames
-    (`confusion_consistency`); the score follows the mask's quality and the class's certainty; false detections appear,
-    some of them at the same places of the room again and again (`recurring_fraction`, where poses are known). What an
-    object or a place has of its own does not average out over a video, as the errors of real detectors do not. Every
-    number is drawn from (seed, purpose, frame, instance): the order of calls does not matter, and changing one error
-    leaves the draws of the others alone. Raises DataError without ground truth.
+    In this order: things of unknown class are detected as objects (`clutter_rate`); an object includes a touching
+    thing, such as a sink its cupboard (`attach_rate`); touching objects share one mask (`merge_rate`); objects are
+    missed, more often if small (`small_side`) or cut by the image border, some nearly always and others never
+    (`miss_spread`); objects are split in two (`split_rate`); masks are shifted, bleed over the border, wobble along it
+    and are resampled on a coarse grid; the class becomes a distribution around a confusion kernel of similar classes,
+    often the same one for an object (`confusion_consistency`); the score follows mask quality and class certainty;
+    false detections appear, some repeatedly at the same locations (`recurring_fraction`, if poses are known).
+
+    Errors of an object or location do not average out over a video, as with real detectors. Every number is drawn from
+    (seed, purpose, frame, instance), independent of the order of calls. Raises DataError without ground truth.
     """
 
     seed: int = 0  # >= 0
     min_pixels: int = 64  # px >= 1, smaller instances are never detected
-    clutter_rate: float = 0.0  # in [0, 1], share of the things of unknown class that are taken for objects
-    attach_rate: float = 0.0  # in [0, 1], share of the pairs object, thing that touches it, that come back as one
-    merge_rate: float = 0.1  # in [0, 1], probability that a touching pair comes back as one
+    clutter_rate: float = 0.0  # in [0, 1], fraction of the things of unknown class that are detected as objects
+    attach_rate: float = 0.0  # in [0, 1], fraction of touching pairs of object and thing that share a mask
+    merge_rate: float = 0.1  # in [0, 1], probability that two touching objects share a mask
     miss_rate: float = 0.1  # in [0, 1], probability to miss a large, whole object
-    small_side: float = 24.0  # px >= 0, at this side 1/e of the objects are missed; 0 = size is no matter
-    truncated_miss_rate: float = 0.15  # in [0, 1], more for an object at the image's border
+    small_side: float = 24.0  # px >= 0, side at which 1/e of the objects are missed; 0 = independent of size
+    truncated_miss_rate: float = 0.15  # in [0, 1], additional probability to miss an object at the image border
     miss_spread: float = 0.0  # >= 0, standard deviation over objects of the logit of being seen
-    split_rate: float = 0.05  # in [0, 1], probability that an object comes back in two halves
+    split_rate: float = 0.05  # in [0, 1], probability that an object is split in two
     shift: float = 1.5  # px >= 0, standard deviation along x and y
-    bleed: float = 2.0  # px, how far masks reach over the border; negative = they fall short
+    bleed: float = 2.0  # px, distance of masks beyond the object's border; negative = inside
     boundary_noise: float = 2.5  # px >= 0, standard deviation of the border's wobble
-    boundary_scale: float = 12.0  # px >= 2, how far along the border a wobble reaches
-    mask_grid: int = 28  # cells a side >= 4 of the network's mask, 0 = full resolution
-    confusion: float = 0.25  # in [0, 1), mean probability that goes to wrong classes
+    boundary_scale: float = 12.0  # px >= 2, correlation length of the wobble
+    mask_grid: int = 28  # cells >= 4 per side of the network's mask; 0 = full resolution
+    confusion: float = 0.25  # in [0, 1), mean probability of wrong classes
     confusion_concentration: float = 3.0  # > 0, of the Dirichlet: small = confident, often wrong
-    confusion_consistency: float = 0.5  # in [0, 1], share of frames that give an object one and the same distribution
+    confusion_consistency: float = 0.5  # in [0, 1], fraction of an object's frames with the same distribution
     score_scale: float = 1.0  # in (0, 1], of the mean score: quality x certainty x this
     score_concentration: float = 20.0  # >= 0, of the Beta around the mean; 0 = no noise
     score_threshold: float = 0.1  # in [0, 1), detections below are dropped
-    false_positives: float = 0.5  # >= 0, mean number an image
+    false_positives: float = 0.5  # >= 0, mean number per image
     false_positive_score: float = 0.25  # in (0, 1), mean
-    recurring_fraction: float = 0.0  # in [0, 1], of the false positives: at places of the room, of one class each
+    recurring_fraction: float = 0.0  # in [0, 1], fraction of false positives at fixed locations with fixed classes
 
     def __post_init__(self) -> None:
         require(self.seed >= 0, "detector.seed", self.seed, "at least 0")
-        require(self.min_pixels >= 1, "detector.min_pixels", self.min_pixels, "at least 1 px")
-        for name in SHARES:
-            value = getattr(self, name)
-            require(0 <= value <= 1, f"detector.{name}", value, "in [0, 1]")
-        for name in ("small_side", "miss_spread", "shift", "boundary_noise", "score_concentration", "false_positives"):
-            value = getattr(self, name)
-            require(0 <= value < np.inf, f"detector.{name}", value, "at least 0")
-        for name in ("confusion", "score_threshold"):
-            value = getattr(self, name)
-            require(0 <= value < 1, f"detector.{name}", value, "in [0, 1)")
-        require(self.false_positives <= MOST_DETECTIONS, "detector.false_positives", self.false_positives,
-                f"at most {MOST_DETECTIONS}")  # fmt: skip
-        require(abs(self.bleed) <= 1000, "detector.bleed", self.bleed, "a number of px, at most 1000")
-        require(2 <= self.boundary_scale < np.inf, "detector.boundary_scale", self.boundary_scale, "at least 2 px")
+        check_intervals("detector", self, **INTERVALS)
         grid = self.mask_grid
         require(grid == 0 or 4 <= grid <= 4096, "detector.mask_grid", grid, "0 or at least 4 and at most 4096")
-        require(0 < self.score_scale <= 1, "detector.score_scale", self.score_scale, "in (0, 1]")
-        concentration = self.confusion_concentration
-        require(0 < concentration < np.inf, "detector.confusion_concentration", concentration, "positive")
-        mean = self.false_positive_score
-        require(0 < mean < 1, "detector.false_positive_score", mean, "in (0, 1)")
         self.classes = COCO
         self._kernel = confusion_kernel(self.classes, self.confusion)
 
@@ -169,17 +163,17 @@ class SimulatedDetector(Detector):
         return np.random.default_rng([self.seed, int(draw), *(k & 0xFFFFFFFF for k in key)])
 
     def _clutter(self, things: Mapping[int, Bool]) -> list[Candidate]:
-        """The things of unknown class that are taken for objects: in all frames the same ones, of the same class."""
+        """Return the things of unknown class that are detected as objects, the same in all frames."""
         candidates = []
         for instance, mask in things.items():
             random = self._random(Draw.CLUTTER, instance)
             if random.random() < self.clutter_rate and np.count_nonzero(mask) <= LARGEST_CLUTTER * mask.size:
-                class_id = self.classes.index(TAKEN_FOR[random.integers(len(TAKEN_FOR))])
+                class_id = self.classes.index(CLUTTER_CLASSES[random.integers(len(CLUTTER_CLASSES))])
                 candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
         return candidates
 
     def _things(self, frame: Frame) -> dict[int, Bool]:
-        """The masks of what has no known class, by id; none smaller than `min_pixels`."""
+        """Return the masks of at least `min_pixels` of things of unknown class, by id."""
         assert frame.truth is not None
         names = frame.truth.class_names
         found, areas = np.unique(frame.truth.instance_ids, return_counts=True)
@@ -187,13 +181,13 @@ class SimulatedDetector(Detector):
         return {i: frame.truth.instance_ids == i for i in chosen}
 
     def _attached(self, truth: TrueInstances, things: Mapping[int, Bool], pairs: list[list[int]]) -> list[Candidate]:
-        """The instances, largest first, some of them with things that touch them."""
+        """Return the instances, largest first, some of them with touching things."""
         candidates = {
             i: Candidate(i, 0, c, mask, mask)
             for i, c, mask in zip(truth.ids.tolist(), truth.class_ids.tolist(), truth.masks, strict=True)
         }
-        for first, second in pairs:
-            for instance, thing in ((first, second), (second, first)):
+        for a, b in pairs:
+            for instance, thing in ((a, b), (b, a)):
                 if instance not in candidates or thing not in things:
                     continue
                 if self._random(Draw.ATTACH, instance, thing).random() >= self.attach_rate:
@@ -204,9 +198,9 @@ class SimulatedDetector(Detector):
         return list(candidates.values())
 
     def _merge(self, instances: list[Candidate], pairs: list[list[int]], frame: Frame) -> list[Candidate]:
-        """The instances, touching pairs put together under the larger one's name; each merges at most once."""
+        """Return the instances with touching pairs merged into the larger one; each merges at most once."""
         candidates = {candidate.instance: candidate for candidate in instances}
-        rank = {i: k for k, i in enumerate(candidates)}  # the largest first
+        rank = {i: k for k, i in enumerate(candidates)}  # 0 = the largest
         taken: set[int] = set()
         for pair in pairs:
             if not taken.isdisjoint(pair) or not rank.keys() >= set(pair):
@@ -232,7 +226,7 @@ class SimulatedDetector(Detector):
         return bool(self._random(Draw.MISS, frame.index, candidate.instance).random() < p)
 
     def _split(self, candidate: Candidate, frame: Frame) -> list[Candidate]:
-        """The object, or its two halves along a random line through its middle."""
+        """Return the object, or its two parts along a random line through its centroid."""
         random = self._random(Draw.SPLIT, frame.index, candidate.instance)
         if random.random() >= self.split_rate:
             return [candidate]
@@ -247,7 +241,7 @@ class SimulatedDetector(Detector):
         return halves
 
     def _reshape(self, candidate: Candidate, frame: Frame) -> Candidate:
-        """The mask as a network would draw it: moved, bleeding, wobbling, coarse."""
+        """Return the candidate with a mask as from a network: shifted, bleeding, wobbling, coarse."""
         if not candidate.mask.any():
             return candidate
         random = self._random(Draw.SHAPE, frame.index, candidate.instance, candidate.part)
@@ -255,26 +249,21 @@ class SimulatedDetector(Detector):
         x1, y1, x2, y2 = tight_boxes(candidate.mask[None])[0].astype(int)
         height, width = candidate.mask.shape
         inner = candidate.mask[y1 : y2 + 1, x1 : x2 + 1]
-        # What the image's border cuts off goes on outside, or masks would shrink away from that border.
+        # objects continue outside the image, because otherwise masks would shrink away from its border
         top, bottom, left, right = (margin * (gap > 0) for gap in (y1, height - 1 - y2, x1, width - 1 - x2))
         crop = np.pad(inner.astype(np.uint8), ((top, bottom), (left, right)))
         rest = ((margin - top, margin - bottom), (margin - left, margin - right))
         crop = np.pad(crop, rest, mode="edge")
         distance = signed_distance(crop)
         dx, dy = random.normal(0, 1, 2) * self.shift
-        moved = cv2.warpAffine(
-            distance,
-            np.array([[1, 0, dx], [0, 1, dy]]),
-            crop.shape[::-1],
-            flags=cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
+        shift, flags = np.array([[1, 0, dx], [0, 1, dy]]), cv2.INTER_LINEAR
+        moved = cv2.warpAffine(distance, shift, crop.shape[::-1], flags=flags, borderMode=cv2.BORDER_REPLICATE)
         wobble = smooth_field(random, crop.shape, self.boundary_scale)
         shape = moved + np.float32(self.bleed) + np.float32(self.boundary_noise) * wobble > 0
         return replace(candidate, mask=self._coarsen(_placed(shape, x1 - margin, y1 - margin, (height, width))))
 
     def _coarsen(self, mask: Bool) -> Bool:
-        """The mask after a grid of `mask_grid` cells a side over its box, as networks predict it."""
+        """Return the mask resampled on a grid of `mask_grid` cells per side over its box, as networks predict it."""
         if self.mask_grid == 0 or not mask.any():
             return mask
         x1, y1, x2, y2 = tight_boxes(mask[None])[0].astype(int)
@@ -284,34 +273,34 @@ class SimulatedDetector(Detector):
         return np.asarray(paste_masks(grid[None], borders, (mask.shape[0], mask.shape[1]))[0], np.bool_)
 
     def _false_positives(self, frame: Frame) -> list[Candidate]:
-        """Ellipses with a wobbling border: of any class anywhere in the image, or of one class at a place of the room.
+        """Return ellipses with a wobbling border, of any class at any pixel, or of one class at a fixed location.
 
-        Of the places in sight the same ones come first in all frames.
+        Visible locations have the same order in all frames.
         """
         random = self._random(Draw.FALSE_POSITIVES, frame.index)
         height, width = frame.camera.shape
         count = int(random.poisson(self.false_positives))
-        is_ghost = self._random(Draw.GHOST, frame.index).random(count) < self.recurring_fraction
-        places = ghost_places(frame, self.seed, int(is_ghost.sum()))
+        recurs = self._random(Draw.RECURRING, frame.index).random(count) < self.recurring_fraction
+        cells = false_positive_cells(frame, self.seed, int(recurs.sum()))
         candidates = []
         for k in range(count):
             a, b = np.exp(random.uniform(np.log(FALSE_SIZES[0]), np.log(FALSE_SIZES[1]), 2)) / 2
             x, y = random.uniform(0, width), random.uniform(0, height)
             wobble = smooth_field(random, (height, width), self.boundary_scale)
             instance, class_id = -1 - k, int(random.integers(len(self.classes)))
-            if is_ghost[k] and places:
-                place = places.pop(0)
-                own = self._random(Draw.GHOST, place.key)
-                scale = frame.camera.fx / place.z
-                a, b = np.exp(own.uniform(np.log(GHOST_SIZES[0]), np.log(GHOST_SIZES[1]), 2)) / 2 * scale
-                x, y, instance = place.u, place.v, -place.key
-                class_id = self.classes.index(TAKEN_FOR[own.integers(len(TAKEN_FOR))])
+            if recurs[k] and cells:
+                cell = cells.pop(0)
+                own = self._random(Draw.RECURRING, cell.key)
+                scale = frame.camera.fx / cell.z
+                a, b = np.exp(own.uniform(np.log(RECURRING_SIZES[0]), np.log(RECURRING_SIZES[1]), 2)) / 2 * scale
+                x, y, instance = cell.u, cell.v, -cell.key
+                class_id = self.classes.index(CLUTTER_CLASSES[own.integers(len(CLUTTER_CLASSES))])
             mask = self._coarsen(ellipse(x, y, a, b, wobble * (self.boundary_noise / min(a, b))))
             candidates.append(Candidate(instance, 0, class_id, mask, np.zeros_like(mask)))
         return candidates
 
     def _classify(self, candidate: Candidate, frame: Frame) -> Float64:
-        """(C,) a distribution whose mean over frames and objects is the true class's row of the confusion kernel."""
+        """Return a distribution (C,) whose mean over frames and objects is the true class's row of the kernel."""
         mean = self._kernel[candidate.class_id]
         random = self._random(Draw.CLASS, frame.index, candidate.instance, candidate.part)
         if random.random() < self.confusion_consistency:
@@ -320,7 +309,7 @@ class SimulatedDetector(Detector):
         return np.asarray((1 - EVEN_SHARE) * drawn + EVEN_SHARE * mean, np.float64)
 
     def _score(self, candidate: Candidate, probabilities: Float64, frame: Frame) -> float:
-        """Beta around the mask's IoU with its instance times the probability of the most likely class, scaled."""
+        """Return a Beta draw around the mask's IoU with its instance times the largest probability, scaled."""
         mean = self.false_positive_score
         if candidate.true_mask.any():
             union = np.count_nonzero(candidate.mask | candidate.true_mask)
@@ -333,7 +322,7 @@ class SimulatedDetector(Detector):
 
 
 def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
-    """(C, C): row t is the mean distribution of an object of class t, 1 - `confusion` of it on t itself."""
+    """Return (C, C): row t is the mean distribution of an object of class t, with 1 - `confusion` on t itself."""
     index = {name: k for k, name in enumerate(classes)}
     alike = np.zeros((len(classes), len(classes)), np.bool_)
     for group in LOOKALIKES:
@@ -348,21 +337,21 @@ def confusion_kernel(classes: tuple[str, ...], confusion: float) -> Float64:
 
 
 def touching_pairs(frame: Frame) -> Int32:
-    """The pairs (M, 2) of instance ids, the smaller id first, that share a border without a step in depth."""
+    """Return the pairs (M, 2) of instance ids, smaller id first, that share a border without a depth step."""
     assert frame.truth is not None
     return np.asarray(np.unique(contacts(frame.truth.instance_ids, frame.depth), axis=0), np.int32)
 
 
 def signed_distance(mask: np.ndarray[tuple[int, ...], np.dtype[np.uint8]]) -> Float32:
-    """The distance (H, W) px of pixel centres to the border of the mask (H, W) of 0 and 1, positive inside."""
+    """Return distances (H, W) px of pixel centers to the border of a mask (H, W) of 0 and 1, positive inside."""
     inside = cv2.distanceTransform(mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside = cv2.distanceTransform(1 - mask, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     return np.asarray(np.where(mask > 0, inside - 0.5, 0.5 - outside), np.float32)
 
 
 def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: float) -> Float32:
-    """Gaussian noise (H, W) of zero mean, unit variance and correlation length `scale` px."""
-    sigma, margin = 2.0, 6  # cells of a coarse grid, on which blurring is cheap
+    """Return Gaussian noise (H, W) of zero mean, unit variance and correlation length `scale` px."""
+    sigma, margin = 2.0, 6  # cells of a coarse grid, where blurring is fast
     rows, columns = (int(np.ceil(side * sigma / scale)) + 2 for side in shape)
     white = random.standard_normal((rows + 2 * margin, columns + 2 * margin)).astype(np.float32)
     blurred = cv2.GaussianBlur(white, (2 * margin + 1, 2 * margin + 1), sigma)
@@ -373,13 +362,13 @@ def smooth_field(random: np.random.Generator, shape: tuple[int, ...], scale: flo
 
 
 def _dirichlet(random: np.random.Generator, alpha: Float64) -> Float64:
-    """(C,) a draw from the Dirichlet; a single positive alpha gives that class all."""
+    """Return a Dirichlet draw (C,); with a single positive alpha that class is certain."""
     weights = random.gamma(alpha)
     return np.asarray(weights / weights.sum(), np.float64) if weights.sum() > 0 else alpha / alpha.sum()
 
 
 def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
-    """The mask (H, W) of the ellipse about (x, y) with half axes a, b (px), which shrinks by `wobble` (H, W) radii."""
+    """Return the mask (H, W) of an ellipse at (x, y), half axes a, b (px), shrunk by `wobble` (H, W) radii."""
     mask = np.zeros(wobble.shape, np.bool_)
     reach = max(0.0, 1.0 - float(wobble.min()))  # radii, at most
     window = tuple(
@@ -393,7 +382,7 @@ def ellipse(x: float, y: float, a: float, b: float, wobble: Float32) -> Bool:
 
 
 def _placed(crop: Bool, x: int, y: int, shape: tuple[int, int]) -> Bool:
-    """The image (H, W) that is False but for `crop`, whose first pixel is at (x, y), possibly outside."""
+    """Return an empty mask (H, W) with `crop` at (x, y), which may be outside."""
     image = np.zeros(shape, np.bool_)
     height, width = shape
     top, left = max(0, -y), max(0, -x)

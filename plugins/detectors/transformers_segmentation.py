@@ -1,11 +1,11 @@
-"""Networks of Hugging Face transformers that predict one mask and one class for each of a set of queries."""
+"""Networks of Hugging Face transformers that predict a mask and a class distribution for each of a set of queries."""
 
 from __future__ import annotations
 
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,54 +13,43 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, check_count, require
+from framework.config.validation import LONGEST_SIDE, MOST_DETECTIONS, check_count, check_intervals, require
 from framework.data import Detections, Float32, Frame, UInt8
-from framework.detection.hub.hub_model import PREPROCESSING, find_model
+from framework.detection.hub.hub_model import PREPROCESSING, commit_of, find_model, imported_transformers, read_part
 from framework.detection.masks.binary_masks import without_duplicates
 from framework.detection.runtimes.device import torch_device
 from framework.detection.stored.fingerprint import fingerprint
-from framework.errors import ConfigError, DataError, in_one_line
+from framework.errors import DataError, errors_of
 from framework.files.json_file import read_json
 from framework.interfaces import Detector
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS, to_coco
 
-IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # what the files leave out by default
-RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers, as the files have them
-PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # of a class that nobody named, or of a gap in the numbers
+IMAGENET_MEAN, IMAGENET_STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # if a file has none
+RESAMPLING = {2: "bilinear", 3: "bicubic"}  # Pillow's numbers
+PLACEHOLDER = re.compile(r"LABEL_\d+|N/A", re.IGNORECASE)  # name of an unnamed class or unused number
 
 
 @dataclass(frozen=True)
 class Family:
-    """What the architectures of one kind have in common."""
+    """The conventions of a family of architectures."""
 
-    auto_class: str  # of transformers, that loads them
+    auto_class: str  # of transformers
     logits: str  # the output with the classes' logits, (1, Q, C or C + 1)
     masks: str  # the output with the masks' logits, (1, Q, h, w)
-    any_size: bool  # they take images of any size
-    mask_quality: bool  # their published score counts how sure a mask is of its own pixels
+    any_size: bool  # whether they take images of any size
+    mask_quality: bool  # whether the published score includes the mean probability of the mask's pixels
 
 
-_MASK_FORMER = Family(
-    "AutoModelForUniversalSegmentation",
-    "class_queries_logits",
-    "masks_queries_logits",
-    any_size=True,
-    mask_quality=True,
-)
-_EOMT = Family(
-    "AutoModelForUniversalSegmentation",
-    "class_queries_logits",
-    "masks_queries_logits",
-    any_size=False,
-    mask_quality=True,
-)
+UNIVERSAL, INSTANCE = "AutoModelForUniversalSegmentation", "AutoModelForInstanceSegmentation"
+_MASK_FORMER = Family(UNIVERSAL, "class_queries_logits", "masks_queries_logits", any_size=True, mask_quality=True)
+_EOMT = replace(_MASK_FORMER, any_size=False)
 FAMILIES = {
     "mask2former": _MASK_FORMER,
     "maskformer": _MASK_FORMER,
     "eomt": _EOMT,
     "eomt_dinov3": _EOMT,
-    "detr": Family("AutoModelForUniversalSegmentation", "logits", "pred_masks", any_size=True, mask_quality=False),
-    "rf_detr": Family("AutoModelForInstanceSegmentation", "logits", "pred_masks", any_size=False, mask_quality=False),
+    "detr": Family(UNIVERSAL, "logits", "pred_masks", any_size=True, mask_quality=False),
+    "rf_detr": Family(INSTANCE, "logits", "pred_masks", any_size=False, mask_quality=False),
 }
 """By the `model_type` in a model's config.json."""
 
@@ -69,62 +58,50 @@ FAMILIES = {
 class TransformersSegmentation(Detector):
     """Mask2Former, MaskFormer, EoMT, RF-DETR-Seg or DETR by model id or local folder; needs the extra `transformers`.
 
-    A model id that is not in the cache of huggingface_hub is downloaded into it; with HF_HUB_OFFLINE=1 it never is.
-    Choose a checkpoint for instance or panoptic segmentation: one for semantic segmentation has one mask for all chairs
-    of an image. The classes are those COCO names that the model's labels mean (framework/vocabulary/label_spaces.yaml);
-    what it takes for a wall or another label without such a name is no detection.
+    A model id that is not in the cache of huggingface_hub is downloaded, unless HF_HUB_OFFLINE=1. Use checkpoints for
+    instance or panoptic segmentation: semantic ones have one mask for all chairs of an image. Labels are mapped to COCO
+    names (framework/vocabulary/label_spaces.yaml); detections of other labels, such as walls, are dropped.
 
-    A detection's class probabilities are the softmax over the labels' logits without the no-object one. For a head of
-    softmaxes that is its distribution given that there is an object; for a head of independent sigmoids p_c it is their
-    distribution given that exactly one of the labels is true: P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c), and
-    that is exp(logit_c). Its score is the probability of its best label, for softmaxes with the no-object share
-    counted; the MaskFormers and EoMT multiply it by the mean probability of the mask's pixels, as published.
+    The class distribution of a detection is the softmax over the labels' logits without no-object. For a softmax head,
+    that is its distribution given an object; for independent sigmoids p_c, it is their distribution given that exactly
+    one label is true: P(c) ~ p_c prod_{j != c} (1 - p_j) ~ p_c / (1 - p_c) = exp(logit_c). The score is the probability
+    of the best label, for softmaxes including no-object; the MaskFormers and EoMT multiply it by the mean probability
+    of the mask's pixels, as published.
     """
 
     model: str = "facebook/mask2former-swin-tiny-coco-instance"  # id on huggingface.co, or a folder
     revision: str = "main"  # branch, tag or commit of a model id
-    score_threshold: float = 0.1  # in [0, 1): low, for weak detections may still update instances that exist
-    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask falls to a better one of any class; 1 = off
-    max_detections: int = 100  # >= 1, an image: the queries with the best class
+    score_threshold: float = 0.1  # in [0, 1); low, because weak detections can still update existing instances
+    agnostic_nms: float = 0.6  # IoU in (0, 1] above which a mask is suppressed by a better one of any class; 1 = off
+    max_detections: int = 100  # >= 1, per image: the queries with the best class
     short_side: int = 0  # px, to which images are resized; 0 = as published
-    long_side: int = 0  # px >= short_side, bound on the other side; 0 where short_side is
+    long_side: int = 0  # px >= short_side, bound on the other side; 0 if short_side is 0
     mask_threshold: float = 0.5  # in (0, 1), probability above which a pixel is inside
     half_precision: bool = True  # half precision on CUDA
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
+    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
     reads = ("color",)
 
     def __post_init__(self) -> None:
-        require(0 <= self.score_threshold < 1, "detector.score_threshold", self.score_threshold, "in [0, 1)")
-        require(0 < self.agnostic_nms <= 1, "detector.agnostic_nms", self.agnostic_nms, "in (0, 1]")
+        check_intervals("detector", self, score_threshold="[0, 1)", agnostic_nms="(0, 1]", mask_threshold="(0, 1)")
         check_count("detector.max_detections", self.max_detections, MOST_DETECTIONS)
-        require(0 < self.mask_threshold < 1, "detector.mask_threshold", self.mask_threshold, "in (0, 1)")
-        require(
-            self.short_side == 0 or self.short_side >= 32,
-            "detector.short_side",
-            self.short_side,
-            "0 (as published) or at least 32 px",
-        )
-        require(
-            self.short_side <= self.long_side <= LONGEST_SIDE if self.short_side else self.long_side == 0,
-            "detector.long_side",
-            self.long_side,
-            f"at least {self.short_side} px and at most {LONGEST_SIDE}"
-            if self.short_side
-            else "0 where short_side is 0",
-        )
+        short, long = self.short_side, self.long_side
+        require(short == 0 or short >= 32, "detector.short_side", short, "0 (as published) or at least 32 px")
+        allowed = f"at least {short} px and at most {LONGEST_SIDE}" if short else "0 if short_side is 0"
+        require(short <= long <= (LONGEST_SIDE if short else 0), "detector.long_side", long, allowed)
         self._device = torch_device(self.device)
         checkpoint = Checkpoint(self.model, self.revision)
         self._family = checkpoint.family
-        self._preprocessing = checkpoint.read_preprocessing()
-        if self.short_side:
-            require(
-                self._family.any_size, "detector.short_side", self.short_side, "0, for this model takes one size only"
-            )
-            self._preprocessing = self._preprocessing.at(self.short_side, self.long_side)
+        path = checkpoint.folder / PREPROCESSING
+        with errors_of("detector.model"):
+            self._preprocessing = Preprocessing.parse(read_json(path), str(path))
+        if short:
+            require(self._family.any_size, "detector.short_side", short, "0, because this model takes one size only")
+            size = {"shortest_edge": short, "longest_edge": long}
+            self._preprocessing = replace(self._preprocessing, size=size)
         self._mapping = to_coco(checkpoint.labels)
         self.classes = self._mapping.classes
         self._network = checkpoint.read_network().to(self._device)
-        self._commit = checkpoint.commit
+        self._commit = commit_of(checkpoint.folder)
 
     def fingerprint(self) -> str:
         return f"{fingerprint(self)} {self._commit}"
@@ -150,7 +127,7 @@ class TransformersSegmentation(Detector):
         return without_duplicates(masks, scores, class_probabilities[candidates], self.classes, self.agnostic_nms)
 
     def _predict(self, pixels: Tensor) -> tuple[Float32, Tensor]:
-        """The queries' class logits (Q, C or C + 1), and their mask logits (Q, h, w) float32 on the device."""
+        """Return the queries' class logits (Q, C or C + 1) and mask logits (Q, h, w), float32 on the device."""
         half = self.half_precision and self._device.type == "cuda"
         with torch.autocast(self._device.type, torch.float16, enabled=half):
             output = self._network(pixel_values=pixels)
@@ -162,9 +139,9 @@ class TransformersSegmentation(Detector):
 
 
 def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]:
-    """Distributions over the labels (Q, C), and the probability (Q,) of the best label.
+    """Return distributions over the labels (Q, C), and the probability (Q,) of the best label.
 
-    logits (Q, K). K = C + 1: softmaxes, the last for no object. K = C: independent sigmoids. See the detector.
+    logits (Q, K). K = C + 1: softmaxes, the last for no-object. K = C: independent sigmoids. See the detector.
     """
     if logits.shape[1] not in (labels, labels + 1):
         raise DataError(f"detector.model: {logits.shape[1]} class logits do not fit the config's {labels} labels")
@@ -180,35 +157,35 @@ def class_distributions(logits: Float32, labels: int) -> tuple[Float32, Float32]
 
 
 def resample_masks(grids: Tensor, covered: tuple[float, float], shape: tuple[int, int]) -> Tensor:
-    """Mask logits (N, h, w) over the network's input, bilinearly at the pixels of an image of `shape`: (N, H, W).
+    """Interpolate mask logits (N, h, w) over the network's input at the pixels of an image of `shape`: (N, H, W).
 
-    `covered`: the share of the input's height and width that the image takes, from the upper left; the rest is padding.
+    `covered`: fractions of the input's height and width that the image takes from the upper left; the rest is padding.
     """
     axes = [
         (torch.arange(size, device=grids.device, dtype=torch.float32) + 0.5) * (2 * share / size) - 1
         for size, share in zip(shape, covered, strict=True)
     ]
     v, u = torch.meshgrid(*axes, indexing="ij")
-    places = torch.stack([u, v], dim=-1)[None]
-    return functional.grid_sample(grids[None], places, padding_mode="border", align_corners=False)[0]
+    positions = torch.stack([u, v], dim=-1)[None]
+    return functional.grid_sample(grids[None], positions, padding_mode="border", align_corners=False)[0]
 
 
 def mean_probability(mask_logits: Tensor, inside: Tensor) -> Float32:
-    """How sure each mask (N, H, W) is of the pixels inside it, (N,); 0 for an empty one."""
+    """Return the mean probability (N,) of the pixels inside each mask (N, H, W); 0 for an empty mask."""
     total = (torch.sigmoid(mask_logits) * inside).sum(dim=(1, 2))
     return np.asarray((total / inside.sum(dim=(1, 2)).clamp(min=1)).cpu().numpy(), np.float32)
 
 
 @dataclass(frozen=True)
 class Preprocessing:
-    """From an image to a network's input, by the numbers of the model's preprocessor_config.json.
+    """Preparation of an image as in the model's preprocessor_config.json.
 
-    Done here and not by transformers' image processors, because those need torchvision, which is often broken.
+    Not by transformers' image processors, which require torchvision.
     """
 
-    size: Mapping[str, int] | None  # as in the file; None = images are not resized
+    size: Mapping[str, int] | None  # as in the file; None = original size
     divisor: int  # sides are rounded up to a multiple
-    pad_to: tuple[int, int] | None  # (height, width), with black on the right and below
+    pad_to: tuple[int, int] | None  # (height, width), with black right and below
     mode: str  # of resampling
     factor: float  # multiplies 0..255
     mean: tuple[float, ...]  # RGB, after multiplication
@@ -216,15 +193,15 @@ class Preprocessing:
 
     @classmethod
     def parse(cls, content: Mapping[str, Any], where: str) -> Preprocessing:
-        """Raises DataError, naming the file `where`, for what is missing or not supported."""
+        """Parse the file `where`. Raises DataError for missing or unsupported settings."""
         if content.get("do_split_image"):
-            raise DataError(f"{where} cuts images in pieces, as for semantic segmentation: choose an instance model")
+            raise DataError(f"{where} splits images, as for semantic segmentation: choose an instance model")
         if content.get("pad_size"):
             raise DataError(f"{where}: pad_size is not supported, found {content['pad_size']}")
         if content.get("resample", 2) not in RESAMPLING:
             raise DataError(f"{where}: resample must be one of {[*RESAMPLING]}, found {content['resample']}")
         size = content.get("size") if content.get("do_resize", True) else None
-        if isinstance(size, int):  # as files were before 2023
+        if isinstance(size, int):  # as in files before 2023
             size = {"shortest_edge": size, "longest_edge": content.get("max_size", size)}
         keys = {key for key, value in (size or {}).items() if value}
         known = ({"shortest_edge", "longest_edge"}, {"max_height", "max_width"}, {"height", "width"})
@@ -237,7 +214,7 @@ class Preprocessing:
         return cls(
             size={key: int(size[key]) for key in keys} if size else None,
             divisor=int(content.get("size_divisor") or content.get("size_divisibility") or 1),
-            # the other processors pad only to the largest image of a batch
+            # other processors pad only to the largest image of a batch
             pad_to=(size["shortest_edge"], size["longest_edge"]) if pads and size else None,
             mode=RESAMPLING[content.get("resample", 2)],
             factor=content.get("rescale_factor", 1 / 255) if content.get("do_rescale", True) else 1.0,
@@ -245,13 +222,8 @@ class Preprocessing:
             std=tuple(content.get("image_std", IMAGENET_STD)) if normalizes else (1.0, 1.0, 1.0),
         )
 
-    def at(self, short_side: int, long_side: int) -> Preprocessing:
-        """The same for images resized to another size."""
-        fields = dict(vars(self), size={"shortest_edge": short_side, "longest_edge": long_side})
-        return Preprocessing(**fields)
-
     def resized(self, shape: tuple[int, int]) -> tuple[int, int]:
-        """The shape (height, width) of an image of `shape` after resizing."""
+        """Return the shape (height, width) of an image of `shape` after resizing."""
         if self.size is None:
             return shape
         height, width = shape
@@ -265,11 +237,11 @@ class Preprocessing:
         return -(-height // self.divisor) * self.divisor, -(-width // self.divisor) * self.divisor
 
     def __call__(self, color: UInt8, device: torch.device) -> tuple[Tensor, tuple[float, float]]:
-        """The input (1, 3, H, W) of an image (h, w, 3), and the share of H and W that the image covers."""
+        """Return the input (1, 3, H, W) of an image (h, w, 3), and the fractions of H and W that the image covers."""
         pixels = torch.from_numpy(color).to(device).permute(2, 0, 1)[None].float()
         height, width = self.resized((color.shape[0], color.shape[1]))
         if (height, width) != color.shape[:2]:
-            # antialiased, as Pillow does it
+            # antialiased, as in Pillow
             pixels = functional.interpolate(pixels, (height, width), mode=self.mode, antialias=True).clamp_(0, 255)
         covered = 1.0, 1.0
         if self.pad_to is not None:
@@ -281,7 +253,7 @@ class Preprocessing:
 
 
 def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int, int]:
-    """The aspect kept, rounded as DETR's transforms round, for the networks were trained with it."""
+    """Return the shape for these sides with the aspect kept, rounded as in DETR's transforms and thus in training."""
     smaller, larger = min(shape), max(shape)
     exact: float = short
     if larger / smaller * short > long:
@@ -292,31 +264,25 @@ def _with_short_side(shape: tuple[int, int], short: int, long: int) -> tuple[int
 
 
 class Checkpoint:
-    """A model on huggingface.co or in a folder. Its faults are one line that says what to do.
-
-    Code that comes with a model is never run.
-    """
+    """A model on huggingface.co or in a folder; code in the model is never run."""
 
     def __init__(self, model: str, revision: str) -> None:
-        try:
-            import transformers
-        except ImportError as error:
-            raise ConfigError(
-                "the package transformers is not installed: pip install instancemap[transformers]"
-            ) from error
-        self._transformers = transformers
+        transformers = imported_transformers()
         self.folder = find_model(model, revision)
-        self.config = self._read("its config.json", transformers.AutoConfig.from_pretrained)
+        self.config = read_part("detector.model", self.folder, "its config.json", transformers.AutoConfig)
         kind = self.config.model_type
         require(kind in FAMILIES, "detector.model", f"{model}, which is {kind}", f"one of {', '.join(FAMILIES)}")
         self.family = FAMILIES[kind]
+        self._auto_class = getattr(transformers, self.family.auto_class)
 
     @property
     def labels(self) -> Sequence[str]:
-        """The names of the model's classes; those that the model leaves without a name are not an object class."""
+        """The names of the model's classes; unnamed classes are NO_CLASS."""
         named = {k: name for k, name in self.config.id2label.items() if not PLACEHOLDER.fullmatch(name)}
         names = [named.get(k, NO_CLASS) for k in range(max(self.config.id2label) + 1)]
-        if self.config.model_type == "rf_detr" and self._is_coco(names):
+        # RF-DETRs trained on COCO use its annotation ids; their configs have no names, or COCO's without the gaps
+        known = {name.lower() for name in names} - {NO_CLASS}
+        if self.config.model_type == "rf_detr" and len(names) == len(COCO_BY_ID) and known in (set(COCO), set()):
             return COCO_BY_ID
         if not named:
             raise DataError(
@@ -324,33 +290,12 @@ class Checkpoint:
             )
         return names
 
-    @staticmethod
-    def _is_coco(names: Sequence[str]) -> bool:
-        """Whether an RF-DETR has the head of those trained on COCO, which counts as COCO's annotations do, with gaps.
-
-        What its config calls the classes does not matter then: it may have no names, or all of COCO's without the gaps.
-        """
-        return len(names) == len(COCO_BY_ID) and {name.lower() for name in names} - {NO_CLASS} in (set(COCO), set())
-
-    @property
-    def commit(self) -> str:
-        """Of a model id, what `revision` named when it was downloaded; empty for a folder of one's own."""
-        return self.folder.name if self.folder.parent.name == "snapshots" else ""
-
-    def read_preprocessing(self) -> Preprocessing:
-        """How the model wants its images."""
-        path = self.folder / PREPROCESSING
-        try:
-            content = read_json(path)
-        except DataError as error:
-            raise DataError(f"detector.model: {error}") from error
-        return Preprocessing.parse(content, str(path))
-
     def read_network(self) -> torch.nn.Module:
-        """The network in float32 on the CPU, for inference. Raises DataError unless the weights fit and fill it."""
-        auto_class = getattr(self._transformers, self.family.auto_class)
-        network, loading = self._read("its weights", auto_class.from_pretrained, output_loading_info=True)
-        # transformers warns only, and leaves them random
+        """Return the network in float32 on the CPU. Raises DataError unless the weights fit and are complete."""
+        network, loading = read_part(
+            "detector.model", self.folder, "its weights", self._auto_class, output_loading_info=True
+        )
+        # transformers only warns, and initializes them randomly
         missing = sorted(set(loading["missing_keys"]) & {name for name, _ in network.named_parameters()})
         if missing:
             raise DataError(
@@ -359,11 +304,3 @@ class Checkpoint:
             )
         module: torch.nn.Module = network.float().eval()
         return module
-
-    def _read(self, what: str, read: Any, **options: Any) -> Any:
-        try:
-            return read(str(self.folder), local_files_only=True, **options)
-        except Exception as error:  # whatever transformers and safetensors raise on foreign files
-            raise DataError(
-                f"detector.model: {what} could not be read from {self.folder}: {in_one_line(error)}"
-            ) from error

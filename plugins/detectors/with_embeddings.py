@@ -1,4 +1,4 @@
-"""Any detector, with embeddings of what it finds: vectors that words can be compared with."""
+"""Any detector with image embeddings of its detections, for text queries."""
 
 from __future__ import annotations
 
@@ -7,32 +7,28 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from framework.config.validation import check_bounds
-from framework.data import Detections, Float32, Frame, UInt8
-from framework.detection.domain import domain_of
+from framework.data import Detections, Frame
 from framework.detection.hub.image_text import ImageTextModel, square_crops
-from framework.detection.stored.cache import FRAME_FIELDS, ReadsFields, identity_of
+from framework.detection.stored.cache import fields_read, identity_of
 from framework.detection.stored.fingerprint import fingerprint
 from framework.interfaces import Detector
 
 
 @dataclass
 class WithEmbeddings(Detector):
-    """Adds to each detection of another detector the embedding of its picture by a model that knows words, too.
+    """Adds the image embedding of a CLIP or SigLIP to each detection of another detector; extra `transformers`."""
 
-    The model is CLIP or SigLIP of Hugging Face transformers (extra `transformers`).
-    """
-
-    detector: Detector  # what finds the objects; detector@detector.detector=NAME chooses another one
+    detector: Detector  # finds the objects; detector@detector.detector=NAME selects another one
     model: str = "google/siglip2-base-patch16-224"  # id on huggingface.co, or a folder
     revision: str = "main"  # branch, tag or commit of a model id
-    frame_interval: int = 1  # frames, >= 1: only those whose number is a multiple are embedded, to save time
-    min_score: float = 0.3  # in [0, 1]: only detections this good are embedded; weaker ones are wrong too often
-    min_pixels: int = 200  # px >= 1, of a mask: less of an object tells little
-    context: float = 1.2  # >= 1, side of the square picture over the longer side of the object's box
-    background_contrast: float = 0.4  # in [0, 1]: contrast that the background keeps: 0 = gray, 1 = all
-    batch_size: int = 16  # pictures at once, >= 1
+    frame_interval: int = 1  # frames, >= 1: only frames whose number is a multiple are embedded
+    min_score: float = 0.3  # in [0, 1], of embedded detections; weaker ones are wrong too often
+    min_pixels: int = 200  # px >= 1, of an embedded mask
+    context: float = 1.2  # >= 1, side of the square crop over the longer side of the object's box
+    background_contrast: float = 0.4  # in [0, 1], remaining contrast of the background: 0 = gray, 1 = unchanged
+    batch_size: int = 16  # crops at once, >= 1
     half_precision: bool = True  # half precision on CUDA
-    device: str = "auto"  # auto, cpu or cuda; auto = cuda where there is one
+    device: str = "auto"  # auto, cpu or cuda; auto = cuda if available
 
     def __post_init__(self) -> None:
         check_bounds(
@@ -45,10 +41,10 @@ class WithEmbeddings(Detector):
             batch_size=(1, 4096),
         )
         self._model = ImageTextModel(self.model, self.revision, self.device, self.half_precision)
-        self.classes = self.detector.classes
-        self.domain = domain_of(self.detector)
-        reads = self.detector.reads if isinstance(self.detector, ReadsFields) else FRAME_FIELDS
-        self.reads = tuple(dict.fromkeys((*reads, "color", *(["index"] if self.frame_interval > 1 else []))))
+        self.classes, self.domain = self.detector.classes, self.detector.domain
+        self.reads = tuple(
+            dict.fromkeys((*fields_read(self.detector), "color", *(["index"] if self.frame_interval > 1 else [])))
+        )
 
     def fingerprint(self) -> str:
         return f"{fingerprint(self)} {identity_of(self.detector)} {self._model.space}"
@@ -62,11 +58,8 @@ class WithEmbeddings(Detector):
         if not len(chosen):
             return found
         crops = square_crops(frame.color, found.masks[chosen], self._model.side, self.context, self.background_contrast)
-        vectors = self._embedded(crops)
+        parts = np.split(crops, range(self.batch_size, len(crops), self.batch_size))
+        vectors = np.concatenate([self._model.embed_crops(part) for part in parts])
         embeddings = np.zeros((len(found), vectors.shape[1]), np.float32)
         embeddings[chosen] = vectors
         return replace(found, embeddings=embeddings, embedding_space=self._model.space)
-
-    def _embedded(self, crops: UInt8) -> Float32:
-        parts = np.split(crops, range(self.batch_size, len(crops), self.batch_size))
-        return np.concatenate([self._model.embed_crops(part) for part in parts])

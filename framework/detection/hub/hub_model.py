@@ -1,4 +1,4 @@
-"""Models of huggingface.co: downloaded once, into the cache that all its programs share, and checked."""
+"""Models of huggingface.co: downloaded once into the cache of huggingface_hub, and checked."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from framework.detection.mask_rcnn.published_weights import OFFLINE
-from framework.detection.runtimes.onnx_network import one_line
-from framework.errors import ConfigError, DataError, in_one_line
+from framework.errors import DataError, import_optional, in_one_line
 from framework.files.atomic_write import check_regular
 from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
@@ -28,35 +27,40 @@ log = logging.getLogger(__name__)
 
 
 def find_model(model: str, revision: str, more: Sequence[str] = ()) -> Path:
-    """The folder of a model: `model` itself, or that of a model id in the cache, downloaded if need be.
+    """Return the folder `model`, or that of a model id in the cache, which is downloaded if missing.
 
-    `more` are files that it needs beside its config, preprocessing and weights: those of its tokenizer.
-    A model id that is in the cache is not asked for again. Needs huggingface_hub, which transformers brings. Raises
-    DataError, with what to do, when there is no such model, it cannot be downloaded, or is not what was published.
+    `more`: files needed in addition to config, preprocessing and weights, such as the tokenizer's. A cached model id is
+    not looked up again. Requires huggingface_hub, which transformers installs. Raises DataError, with the fix, if there
+    is no such model, it cannot be downloaded, or it differs from what was published.
     """
     folder = expanded(Path(model))
     if folder.is_dir():
         for file in filter(Path.exists, (folder / name for name in (CONFIG, PREPROCESSING, WHOLE, INDEX, PICKLED))):
-            check_regular(file)  # transformers would wait for what a pipe says
+            check_regular(file)  # transformers would block on a pipe
         return folder
     cached = _cached(model, revision, more)
     if cached is None:
         _download(model, revision, more)
         cached = _cached(model, revision, more)
     if cached is None:
-        raise DataError(f"detector.model: {model} was downloaded, and is not whole in the cache: try again")
+        raise DataError(f"detector.model: {model} was downloaded, but the cache is not complete: try again")
     return cached
 
 
+def commit_of(folder: Path) -> str:
+    """Return the downloaded commit of a model id's folder; "" for a local folder."""
+    return folder.name if folder.parent.name == "snapshots" else ""
+
+
 def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
-    """The folder of a model id in the cache, if what is needed of it is there."""
+    """Return the folder of a model id in the cache if it has all needed files."""
     from huggingface_hub import try_to_load_from_cache
     from huggingface_hub.errors import HFValidationError
 
     try:
         config = try_to_load_from_cache(model, CONFIG, revision=revision)
     except HFValidationError as error:
-        raise DataError(f"detector.model: {model} is neither a folder nor a model id: {one_line(error)}") from error
+        raise DataError(f"detector.model: {model} is neither a folder nor a model id: {in_one_line(error)}") from error
     if not isinstance(config, str):
         return None
     folder = Path(config).parent
@@ -68,7 +72,7 @@ def _cached(model: str, revision: str, more: Sequence[str]) -> Path | None:
 
 
 def _listed(index: Path) -> list[str]:
-    """The files that a model's weights are divided among."""
+    """Return the weight files in an index."""
     try:
         return [*read_json(index)["weight_map"].values()]
     except (DataError, KeyError, TypeError, AttributeError) as error:
@@ -76,7 +80,7 @@ def _listed(index: Path) -> list[str]:
 
 
 def _weights(names: Collection[str]) -> list[str]:
-    """The files with weights among a model's files, as transformers chooses them; none where there are none."""
+    """Return the weight files among a model's files, chosen as transformers does; empty if it has none."""
     if WHOLE in names:
         return [WHOLE]
     if INDEX in names:
@@ -85,13 +89,13 @@ def _weights(names: Collection[str]) -> list[str]:
 
 
 def _published(more: Sequence[str], names: Collection[str]) -> Sequence[str]:
-    """`more`, with a tokenizer of the older form where a model's files are those."""
+    """Return `more`, with the tokenizer's files in their older form if the model has those."""
     older = more == TOKENIZER and TOKENIZER[0] not in names and {*OLDER_TOKENIZER} <= {*names}
     return OLDER_TOKENIZER if older else more
 
 
 def _download(model: str, revision: str, more: Sequence[str]) -> None:
-    """Fetches what is needed, with progress bars of huggingface_hub, each file whole or not at all."""
+    """Download the needed files with huggingface_hub, which writes each file atomically and shows progress."""
     if variable := forbidden_by():
         raise DataError(
             f"detector.model: {model} is no folder, and {variable} forbids to download it: unset that, or give a local"
@@ -107,36 +111,32 @@ def _download(model: str, revision: str, more: Sequence[str]) -> None:
         if missing := [name for name in wanted if name not in files]:
             raise DataError(f"detector.model: {model} on {constants.ENDPOINT} has no {' and no '.join(missing)}")
         size = sum(files[name].size or 0 for name in wanted)
-        log.info("downloading %s, %.0f MB, licence %s, from %s into %s",
-                 model, size / 1e6, _licence(info), constants.ENDPOINT, constants.HF_HUB_CACHE)  # fmt: skip
+        license_ = next((t.removeprefix("license:") for t in info.tags or () if t.startswith("license:")), "unknown")
+        log.info("downloading %s, %.0f MB, license %s, from %s into %s",
+                 model, size / 1e6, license_, constants.ENDPOINT, constants.HF_HUB_CACHE)  # fmt: skip
         paths = {name: Path(hub.hf_hub_download(model, name, revision=revision)) for name in wanted}
     except DataError:
         raise
-    except Exception as error:  # the hub's client, and the library below it, each have errors of their own
+    except Exception as error:  # huggingface_hub and the HTTP library below it have separate errors
         raise DataError(
             f"detector.model: {model} is no folder, and could not be downloaded from {constants.ENDPOINT}: check the"
-            f" name and the network, or give a local folder; huggingface_hub says: {one_line(error)}"
+            f" name and the network, or give a local folder; huggingface_hub reports: {in_one_line(error)}"
         ) from error
     for name, path in paths.items():
         _check(path, files[name])
 
 
 def forbidden_by() -> str:
-    """The environment variable that forbids downloads; empty where none does."""
+    """Return the environment variable that forbids downloads, or ""."""
     forbidding = [name for name in HUB_OFFLINE if os.environ.get(name, "").upper() in ("1", "ON", "YES", "TRUE")]
     return (forbidding + [OFFLINE] * bool(os.environ.get(OFFLINE)) + [""])[0]
 
 
-def _licence(info: Any) -> str:
-    named = (tag.removeprefix("license:") for tag in info.tags or () if tag.startswith("license:"))
-    return next(named, "not said")
-
-
 def _check(path: Path, published: Any) -> None:
-    """Raises DataError unless a large file has the SHA-256 that huggingface.co lists: its client checks the size."""
+    """Raise DataError unless a large file has its listed SHA-256; huggingface_hub checks only the size."""
     if published.lfs is None or path_hash(path) == published.lfs.sha256:
         return
-    path.resolve().unlink()  # the content, where the cache has links
+    path.resolve().unlink()  # the content, if the cache uses links
     path.unlink(missing_ok=True)
     raise DataError(
         f"detector.model: {path.name} is not what was published: its sha256 is not {published.lfs.sha256}; it was"
@@ -145,17 +145,13 @@ def _check(path: Path, published: Any) -> None:
 
 
 def imported_transformers() -> Any:
-    """The library. Raises ConfigError, naming the extra, where it is not installed."""
-    try:
-        import transformers
-    except ImportError as error:
-        raise ConfigError("the package transformers is not installed: pip install instancemap[transformers]") from error
-    return transformers
+    """Import transformers. Raises ConfigError, naming the extra, if it is not installed."""
+    return import_optional("transformers", "loads models of huggingface.co", "transformers")
 
 
-def read_part(parameter: str, folder: Path, what: str, auto_class: Any) -> Any:
-    """A part of a model in a folder. Raises DataError, naming the parameter, for one that cannot be read."""
+def read_part(parameter: str, folder: Path, what: str, auto_class: Any, **options: Any) -> Any:
+    """Read a part of a model in a folder. Raises DataError, naming the parameter, if it cannot be read."""
     try:
-        return auto_class.from_pretrained(str(folder), local_files_only=True)
-    except Exception as error:  # whatever transformers, tokenizers and safetensors raise on foreign files
+        return auto_class.from_pretrained(str(folder), local_files_only=True, **options)
+    except Exception as error:  # transformers, tokenizers and safetensors raise many types on foreign files
         raise DataError(f"{parameter}: {what} could not be read from {folder}: {in_one_line(error)}") from error

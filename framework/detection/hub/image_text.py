@@ -1,4 +1,4 @@
-"""CLIP and SigLIP, versions 1 and 2, from Hugging Face transformers: image and text embeddings in one space."""
+"""CLIP and SigLIP, versions 1 and 2, of Hugging Face transformers: image and text embeddings in one space."""
 
 from __future__ import annotations
 
@@ -17,28 +17,31 @@ from framework.detection.hub.hub_model import (
     CONFIG,
     PREPROCESSING,
     TOKENIZER,
+    commit_of,
     find_model,
     imported_transformers,
     read_part,
 )
 from framework.detection.masks.binary_masks import tight_boxes
-from framework.detection.runtimes.device import torch_device
+from framework.detection.runtimes.device import ready, torch_device
 from framework.errors import ConfigError, DataError
 from framework.files.hashing import path_hash
 from framework.files.json_file import read_json
 
-CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)  # where a file has none
-LONGEST_SIDE = 1024  # px of a model's pictures
-HASH_DIGITS = 16  # of a local folder's content in the name of its space
+CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
+LONGEST_SIDE = 1024  # px of a model's input
+HASH_DIGITS = 16  # of a local folder's content, in the name of its space
+MOST_TOKENS = 64  # of a text; CLIP takes 77 and SigLIP 64
+GRAY = 128
 
 
 class ImageTextFamily(NamedTuple):
-    """What a kind of model wants."""
+    """The conventions of a family of models."""
 
-    prompt: str  # the words that published figures have around a class's name
-    padding: str  # of texts, as in the training
+    prompt: str  # template around a class name, as in the published evaluation
+    padding: str  # of texts, as in training
     lower: bool  # whether texts are in lower case
-    mean: tuple[float, ...]  # RGB, where the file leaves it out
+    mean: tuple[float, ...]  # RGB, if the preprocessing file has none
     std: tuple[float, ...]
 
 
@@ -47,9 +50,7 @@ FAMILIES = {
     # https://huggingface.co/docs/transformers/model_doc/siglip2: padded to 64 tokens, in lower case
     "siglip": ImageTextFamily("This is a photo of {}.", "max_length", True, (0.5,) * 3, (0.5,) * 3),
 }
-"""By the `model_type` in config.json. SigLIP 2 of a fixed size (siglip2-base-patch16-224) is `siglip` there."""
-
-MOST_TOKENS = 64  # of a text; CLIP takes 77 and SigLIP 64
+"""By the `model_type` in config.json, which is `siglip` also for SigLIP 2 of a fixed size."""
 
 
 class ImageTextModel:
@@ -78,20 +79,19 @@ class ImageTextModel:
         self._family = FAMILIES[config.model_type]
         self.side = int(config.vision_config.image_size)
         if not 16 <= self.side <= LONGEST_SIDE:
-            raise DataError(f"detector.model: {self._folder} takes pictures of {self.side} px; expected 16 to 1024")
+            raise DataError(f"detector.model: {self._folder} takes images of {self.side} px; expected 16 to 1024")
         self._mean, self._std, self._factor = _normalization(self._folder / PREPROCESSING, self._family)
         self._tokenizer = read_part("detector.model", self._folder, "its tokenizer", transformers.AutoTokenizer)
         network = read_part("detector.model", self._folder, "its weights", transformers.AutoModel)
-        self._dtype = torch.float16 if half_precision and self._device.type == "cuda" else torch.float32
-        self._network = network.to(self._device, self._dtype).eval()
+        self._network = ready(network, self._device, half_precision)
         self.space = _space(self._folder, model)
 
     @torch.inference_mode()
     def embed_crops(self, crops: UInt8) -> Float32:
         """Return unit vectors (N, D) of crops (N, side, side, 4): RGB and a mask, which is ignored."""
-        pictures = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
+        images = torch.from_numpy(crops[..., :3]).to(self._device).permute(0, 3, 1, 2).float() * self._factor
         mean, std = (torch.tensor(values, device=self._device)[:, None, None] for values in (self._mean, self._std))
-        pixels = ((pictures - mean) / std).to(self._dtype)
+        pixels = ((images - mean) / std).to(self._network.dtype)
         return self._unit(self._network.get_image_features(pixel_values=pixels))
 
     @torch.inference_mode()
@@ -120,12 +120,11 @@ class ImageTextModel:
 
 
 def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ...], tuple[float, ...], float]:
-    """Mean, standard deviation and the factor before them, by preprocessor_config.json."""
+    """Return mean, standard deviation, and the factor applied before them, from preprocessor_config.json."""
     content = read_json(path)
     if not isinstance(content, Mapping):
         raise DataError(f"detector.model: {path} must hold an object")
-    mean, std = (tuple(content.get(key, value)) for key, value in zip(
-        ("image_mean", "image_std"), (family.mean, family.std), strict=True))  # fmt: skip
+    mean, std = tuple(content.get("image_mean", family.mean)), tuple(content.get("image_std", family.std))
     factor = content.get("rescale_factor", 1 / 255)
     numbers = (*mean, *std, factor)
     if len(numbers) != 7 or not all(isinstance(x, int | float) and np.isfinite(x) for x in numbers) or 0 in std:
@@ -136,37 +135,30 @@ def _normalization(path: Path, family: ImageTextFamily) -> tuple[tuple[float, ..
 
 
 def _space(folder: Path, model: str) -> str:
-    """Of a model id, with the commit that was downloaded; of a folder, with a hash of what it computes with."""
-    if folder.parent.name == "snapshots":
-        return f"{model}@{folder.name}"
+    """Return the model id with the downloaded commit, or the folder's name with a hash of its config and weights."""
+    if commit := commit_of(folder):
+        return f"{model}@{commit}"
     weights = sorted(folder.glob("*.safetensors")) + sorted(folder.glob("pytorch_model*.bin"))
     hashes = "".join(path_hash(path) for path in [folder / CONFIG, *weights])
     return f"{folder.name}@{hashlib.sha256(hashes.encode()).hexdigest()[:HASH_DIGITS]}"
 
 
-GRAY = 128
-
-
 def square_crops(color: UInt8, masks: Bool, side: int, context: float, surroundings: float = 1.0) -> UInt8:
-    """One picture (side, side, 4) for each of the masks (N, H, W) of the image `color` (H, W, 3): RGB, and 255 inside.
+    """Return a crop (side, side, 4) of the image for each of the masks (N, H, W): RGB, and 255 inside the mask.
 
-    A picture is the square around the mask's middle whose side is `context` times the longer side of the mask's box, so
-    that nothing is distorted; what lies beyond the image is black. What is around the object keeps the share
-    `surroundings` of its difference from gray. Shrinking averages. An empty mask gives black.
+    A crop is a square around the center of the mask's box, with `context` times its longer side; pixels beyond the
+    image are black. The background keeps the fraction `surroundings` of its contrast. An empty mask gives black.
     """
     crops = np.zeros((len(masks), side, side, 4), np.uint8)
     for k, box in enumerate(tight_boxes(masks)):
-        if not masks[k].any():
-            continue
-        with_mask = np.dstack([color, masks[k].view(np.uint8) * np.uint8(255)])
-        crops[k] = _square_crop(with_mask, box, side, context, surroundings)
+        if masks[k].any():
+            with_mask = np.dstack([color, masks[k].view(np.uint8) * np.uint8(255)])
+            crops[k] = _square_crop(with_mask, box, side, context, surroundings)
     return crops
 
 
 def _square_crop(image: UInt8, box: Float32, side: int, context: float, surroundings: float) -> UInt8:
-    """The square (side, side, 4) around a box x1 y1 x2 y2 of pixels inside, of an image whose fourth channel is 255
-    on the object.
-    """
+    """Return the crop of an image (H, W, 4), RGB and mask, around the mask's tight box."""
     height, width = image.shape[:2]
     x1, y1, x2, y2 = (int(value) for value in box)
     wide = max(1, round(context * (max(x2 - x1, y2 - y1) + 1)))  # px
@@ -177,11 +169,11 @@ def _square_crop(image: UInt8, box: Float32, side: int, context: float, surround
     if surroundings < 1:
         around = square[..., 3] == 0
         square[around, :3] = np.round(GRAY + surroundings * (square[around, :3].astype(np.float32) - GRAY))
-    shrinks = side < wide
-    return np.asarray(cv2.resize(square, (side, side), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR))
+    interpolation = cv2.INTER_AREA if side < wide else cv2.INTER_LINEAR
+    return np.asarray(cv2.resize(square, (side, side), interpolation=interpolation))
 
 
-def network_pixels(image: UInt8, mean: Sequence[float], std: Sequence[float], device: torch.device) -> torch.Tensor:
-    """The input (1, 3, H, W) of an image (H, W, 3) RGB: shares of 255, less the mean, by the standard deviation."""
+def network_pixels(image: UInt8, mean: Sequence[float], std: Sequence[float], device: torch.device) -> Tensor:
+    """Return the normalized input (1, 3, H, W) of an RGB image (H, W, 3)."""
     pixels = torch.from_numpy(np.ascontiguousarray(image)).to(device).permute(2, 0, 1)[None].float() / 255
     return (pixels - torch.tensor(mean, device=device)[:, None, None]) / torch.tensor(std, device=device)[:, None, None]

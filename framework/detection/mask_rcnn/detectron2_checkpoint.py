@@ -1,8 +1,8 @@
 """detectron2's Mask R-CNN with ResNet-FPN (github.com/facebookresearch/detectron2), as a MaskRCNN.
 
-Its conventions are not torchvision's: images are BGR, their standard deviation is 1; the first convolution of a
-bottleneck has the stride, as in MSRA's networks that it starts from; the background is the last class, and has neither
-deltas nor masks; RoIAlign is the aligned one with a sample for each cell; anchors are not rounded.
+Its conventions differ from torchvision's: images are BGR with a standard deviation of 1; the first convolution of a
+bottleneck has the stride, as in MSRA's networks; the background is the last class, without deltas or masks; RoIAlign
+is aligned, with one sample per cell; anchors are not rounded.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
-from framework.detection.mask_rcnn.network_file import filled
+from framework.detection.mask_rcnn.network_file import filled, required
 from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
 from framework.errors import DataError, in_one_line
 from framework.files.atomic_write import check_regular
@@ -46,32 +46,32 @@ NAMES = (  # detectron2's, ours
     (r"roi_heads\.mask_head\.predictor\.(\w+)", r"roi_heads.mask_predictor.mask_fcn_logits.\1"),
 )
 COUNTED_FROM = {"layer": 1, "inner_blocks": 2, "layer_blocks": 2, "mask_head": 1}
-"""Where detectron2's first number is not ours: res2 is layer1, fpn_lateral2 inner block 0, mask_fcn1 layer 0."""
+"""detectron2's first index: res2 is layer1, fpn_lateral2 is inner block 0, mask_fcn1 is layer 0."""
 
 NOT_WEIGHTS = r"(pixel_mean|pixel_std|.*\.cell_anchors\.\d+|.*\.num_batches_tracked)"
 
 
 def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None) -> MaskRCNN:
-    """The network of a state_dict; `where` it is from begins a DataError's line.
+    """Return the network of a state_dict; `classes`: None = COCO's 80.
 
-    `classes`: their names; without it there must be COCO's 80.
+    Raises DataError, starting with the source `where`, for other networks.
     """
     _check_input(state, where)
     tensors = {_renamed(name, where): tensor for name, tensor in state.items() if not re.fullmatch(NOT_WEIGHTS, name)}
-    found = len(_taken(tensors, "roi_heads.mask_predictor.mask_fcn_logits.bias", where))
+    found = len(required(tensors, "roi_heads.mask_predictor.mask_fcn_logits.bias", where))
     if classes is None and found != len(COCO):
         raise DataError(f"{where}: {found} classes are not COCO's {len(COCO)}: they must be given")
     classes = classes or COCO
     if len(classes) != found:
         raise DataError(f"{where}: the network has {found} classes, {len(classes)} were given")
     stem = "backbone.body.conv1.weight"
-    tensors[stem] = _taken(tensors, stem, where).flip(1)  # BGR to RGB
+    tensors[stem] = required(tensors, stem, where).flip(1)  # BGR to RGB
     _put_background_first(tensors, where)
     architecture = Architecture(
         classes=classes,
         backbone=ResNetShape(_depth(tensors, where), len(tensors[stem]), stride_in_1x1=True),
-        fpn_channels=len(_taken(tensors, "backbone.fpn.inner_blocks.0.0.bias", where)),
-        head_features=len(_taken(tensors, "roi_heads.box_head.fc6.bias", where)),
+        fpn_channels=len(required(tensors, "backbone.fpn.inner_blocks.0.0.bias", where)),
+        head_features=len(required(tensors, "roi_heads.box_head.fc6.bias", where)),
         anchor_sides=_anchor_sides(state, where),
         rounded_anchors=False,
         sampling_ratio=0,
@@ -82,15 +82,10 @@ def from_detectron2(state: Mapping[str, Tensor], where: str, classes: tuple[str,
     return filled(architecture, tensors, where)
 
 
-def is_detectron2(names: Mapping[str, Tensor]) -> bool:
-    """Whether these are the weights of one of detectron2's networks."""
-    return any(name.startswith("backbone.bottom_up.") for name in names)
-
-
 def read_pickle(path: Path) -> dict[str, Tensor]:
-    """The state_dict in one of detectron2's `model_final_*.pkl`, without running code that the file names.
+    """Return the state_dict in a `model_final_*.pkl` of detectron2 without running code from the file.
 
-    Raises DataError when it is damaged, or holds more than arrays.
+    Raises DataError if it is damaged or holds other objects than arrays.
     """
     check_regular(path)
     try:
@@ -108,7 +103,7 @@ def read_pickle(path: Path) -> dict[str, Tensor]:
 
 
 class ArraysOnly(pickle.Unpickler):
-    """Reads what numpy arrays are pickled as, and refuses whatever else a pickle can call."""
+    """Unpickler of numpy arrays that refuses everything else a pickle can call."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (allowed := ALLOWED.get((module.replace("numpy._core", "numpy.core"), name))) is None:
@@ -117,7 +112,7 @@ class ArraysOnly(pickle.Unpickler):
 
 
 def _encoded(text: str, encoding: str) -> bytes:
-    """What Python 3 writes for bytes in the older protocols."""
+    """Return bytes as Python 3 pickles them in older protocols."""
     if encoding != "latin1":
         raise pickle.UnpicklingError(f"it wants to encode as {encoding}")
     return text.encode("latin1")
@@ -146,7 +141,7 @@ def _renamed(name: str, where: str) -> str:
 
 
 def _check_input(state: Mapping[str, Tensor], where: str) -> None:
-    """Older checkpoints say what the image is normalized with; other values mean another backbone, too."""
+    """Check the normalization in older checkpoints; other values also mean another backbone."""
     for name, expected in (("pixel_mean", PIXEL_MEAN[::-1]), ("pixel_std", PIXEL_STD)):
         if name in state and not torch.allclose(state[name].float().flatten(), torch.tensor(expected), atol=1e-2):
             found = [round(value, 3) for value in state[name].flatten().tolist()]
@@ -156,7 +151,7 @@ def _check_input(state: Mapping[str, Tensor], where: str) -> None:
 
 
 def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
-    """From the anchors in older checkpoints, where they are; newer ones have none, and then they are detectron2's."""
+    """Return the sides from the anchors in older checkpoints; newer ones have none, and detectron2's are returned."""
     sides = list(Architecture.anchor_sides)
     for level in range(len(sides)):
         if (anchors := state.get(f"proposal_generator.anchor_generator.cell_anchors.{level}")) is None:
@@ -170,29 +165,20 @@ def _anchor_sides(state: Mapping[str, Tensor], where: str) -> tuple[float, ...]:
 
 
 def _put_background_first(tensors: dict[str, Tensor], where: str) -> None:
-    """detectron2's columns: the classes, then the background, which has neither deltas nor masks. Ours: it is first.
-
-    The background's rows of deltas and masks are zeros, and never read.
-    """
+    """Move the background's column from the end to the front, with unused zeros as its deltas and masks."""
     for kind in ("weight", "bias"):
         name = f"roi_heads.box_predictor.cls_score.{kind}"
-        tensors[name] = _taken(tensors, name, where).roll(1, dims=0)
+        tensors[name] = required(tensors, name, where).roll(1, dims=0)
         for name, rows in (("box_predictor.bbox_pred", 4), ("mask_predictor.mask_fcn_logits", 1)):
-            predictor = _taken(tensors, f"roi_heads.{name}.{kind}", where)
-            nothing = predictor.new_zeros((rows, *predictor.shape[1:]))
-            tensors[f"roi_heads.{name}.{kind}"] = torch.cat([nothing, predictor])
+            predictor = required(tensors, f"roi_heads.{name}.{kind}", where)
+            background = predictor.new_zeros((rows, *predictor.shape[1:]))
+            tensors[f"roi_heads.{name}.{kind}"] = torch.cat([background, predictor])
 
 
 def _depth(tensors: Mapping[str, Tensor], where: str) -> str:
-    """The name of the residual network, by the number of blocks of its third level."""
+    """Return the name of the residual network, by the number of blocks of its third level."""
     blocks = len({name.split(".")[3] for name in tensors if name.startswith("backbone.body.layer3.")})
     for name in WITH_BOTTLENECKS:
         if DEPTHS[name][2] == blocks:
             return name
     raise DataError(f"{where}: there is no residual network here with {blocks} blocks in res4")
-
-
-def _taken(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
-    if name not in tensors:
-        raise DataError(f"{where} lacks the weights {name}: it is no Mask R-CNN with a feature pyramid")
-    return tensors[name]

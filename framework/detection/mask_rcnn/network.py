@@ -2,13 +2,14 @@
 
     image ─► ResNet ─► feature pyramid ─► region proposals ─► boxes and class distributions ─► masks
 
-The network is described by an Architecture, which is stored with its weights; what a user may change between two
-runs (thresholds, the number of proposals) is given to `propose` and `detect`. Boxes are x1 y1 x2 y2 px of the network's
-input, by the newer convention (framework.detection.masks.boxes, extent 0), and class 0 is the background.
+The network is described by an Architecture, which is stored with its weights. Parameters of a run, such as thresholds,
+are given to `propose` and `select`. Boxes are x1 y1 x2 y2 px of the network's input, with extent 0
+(framework.detection.masks.boxes) unless stated otherwise, and class 0 is the background.
 """
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -22,31 +23,32 @@ from torch.nn.utils.fusion import fuse_conv_bn_eval
 from framework.data import Float32, Int32
 from framework.detection.mask_rcnn.resnet import ResNet, ResNetShape
 from framework.detection.mask_rcnn.roi_align import roi_align
-from framework.detection.masks.boxes import anchor_grid, clip, decode
-from framework.detection.masks.nms import suppress_boxes
+from framework.detection.masks.boxes import anchor_grid, clip, decode, suppress_boxes
 
 STRIDES = (4, 8, 16, 32, 64)  # px of the input per cell of a level, P2 to P6
-POOLED_LEVELS = 4  # P2 to P5; P6 only proposes
-BOX_BINS, MASK_BINS = 7, 14  # of RoIAlign, a side
+POOLED_LEVELS = 4  # P2 to P5; P6 is only for proposals
+BOX_BINS, MASK_BINS = 7, 14  # of RoIAlign, per side
 CANONICAL_SIDE, CANONICAL_LEVEL = 224.0, 2  # px: a box of this side is pooled from P4 (Lin et al. 2017, eq. 1)
-DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # the box head's deltas are scaled by these
+DELTA_WEIGHTS = (10.0, 10.0, 5.0, 5.0)  # factors in the box head's deltas
 PROPOSAL_NMS = 0.7  # IoU
 
 
 @dataclass(frozen=True)
 class Architecture:
-    """What must be known of a network to run its weights."""
+    """The parameters of a network that are not in its weights."""
 
     classes: tuple[str, ...]  # without the background, in the order of the network's columns after it
     backbone: ResNetShape = field(default_factory=ResNetShape)
     fpn_channels: int = 256
     head_features: int = 1024  # of the box head
-    anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, a level
-    anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height over width
-    rounded_anchors: bool = True  # torchvision rounds them to pixels
-    truncated_strides: bool = False  # torchvision spaces P6's by the input's size over P6's, rounded down: 61 at 800 px
-    sampling_ratio: int = 2  # of RoIAlign; 0 = one sample a cell
-    half_pixel: bool = False  # RoIAlign's convention: True is "aligned"
+    anchor_sides: tuple[float, ...] = (32.0, 64.0, 128.0, 256.0, 512.0)  # px, one per level
+    anchor_ratios: tuple[float, ...] = (0.5, 1.0, 2.0)  # height / width
+    rounded_anchors: bool = True  # to whole pixels, as torchvision does
+    truncated_strides: bool = (
+        False  # P6's stride is the input's size over P6's, rounded down: 61 at 800 px (torchvision)
+    )
+    sampling_ratio: int = 2  # of RoIAlign; 0 = one sample per cell
+    half_pixel: bool = False  # RoIAlign's convention; True = "aligned"
     pixel_mean: tuple[float, float, float] = (123.675, 116.28, 103.53)  # RGB, 0..255
     pixel_std: tuple[float, float, float] = (58.395, 57.12, 57.375)
     short_side: int = 800  # px, to which images were resized in training
@@ -54,34 +56,44 @@ class Architecture:
 
 
 class MaskRCNN(nn.Module):
-    """The network; `propose`, `classify` and `segment` are its steps."""
+    """The network; `extract`, `score_anchors`, `classify` and `segment` are its steps."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
         self.architecture = architecture
-        self.backbone = Backbone(architecture)
-        self.rpn = RegionProposals(architecture)
+        self.backbone = nn.Sequential(
+            OrderedDict(
+                body=ResNet(architecture.backbone),
+                fpn=FeaturePyramid(architecture.backbone.channels, architecture.fpn_channels),
+            )
+        )
+        head = ProposalHead(architecture.fpn_channels, len(architecture.anchor_ratios))  # one for all levels
+        self.rpn = nn.ModuleDict({"head": head})
         self.roi_heads = RoiHeads(architecture)
         self._anchors = [_anchors(side, architecture) for side in architecture.anchor_sides]
 
+    @property
+    def dtype(self) -> torch.dtype:
+        return self.roi_heads.box_predictor.cls_score.weight.dtype
+
     def normalize(self, images: Tensor) -> Tensor:
-        """The network's input from RGB images (N, 3, H, W), 0..255, padded at the end to multiples of 32 px."""
+        """Return the network's input of RGB images (N, 3, H, W), 0..255, padded at the end to multiples of 32 px."""
         mean, std = (
             torch.tensor(values, device=images.device)[:, None, None]
             for values in (self.architecture.pixel_mean, self.architecture.pixel_std)
         )
         height, width = images.shape[2:]
         padded = functional.pad((images.float() - mean) / std, (0, -width % 32, 0, -height % 32))
-        return padded.to(self.rpn.head.cls_logits.weight.dtype)
+        return padded.to(self.dtype)
 
     def extract(self, images: Tensor) -> list[Tensor]:
-        """P2 to P6, each (N, C, H / stride, W / stride), of normalized images."""
+        """Return the pyramid of normalized images: P2 to P6, each (N, C, H / stride, W / stride)."""
         levels: list[Tensor] = self.backbone(images)
         return levels
 
     def score_anchors(self, pyramid: Sequence[Tensor]) -> tuple[Tensor, Tensor]:
-        """(objectness (N, A), deltas (N, A, 4)) of the anchors of all levels, in the order of `anchors`."""
-        objectness, deltas = zip(*(self.rpn.head(level) for level in pyramid), strict=True)
+        """Return (objectness (N, A), deltas (N, A, 4)) of the anchors of all levels, in the order of `anchors`."""
+        objectness, deltas = zip(*(self.rpn["head"](level) for level in pyramid), strict=True)
         n = len(pyramid[0])
         return (
             torch.cat([level.permute(0, 2, 3, 1).reshape(n, -1) for level in objectness], dim=1),
@@ -89,7 +101,7 @@ class MaskRCNN(nn.Module):
         )
 
     def anchors(self, pyramid: Sequence[Tensor]) -> list[Float32]:
-        """The (A, 4) anchors of each level."""
+        """Return the (A, 4) anchors of each level."""
         shapes = [(level.shape[2], level.shape[3]) for level in pyramid]
         height, width = (STRIDES[0] * cells for cells in shapes[0])
         truncated = self.architecture.truncated_strides
@@ -98,72 +110,30 @@ class MaskRCNN(nn.Module):
             for anchors, (rows, columns), stride in zip(self._anchors, shapes, STRIDES, strict=True)
         ]
 
-    def propose(
-        self,
-        anchors: Sequence[Float32],
-        objectness: Float32,
-        deltas: Float32,
-        shape: tuple[int, int],
-        before_nms: int,
-        after_nms: int,
-    ) -> Float32:
-        """The boxes (P, 4), best first, in which one image of `shape` (height, width) may have objects.
-
-        objectness (A,) and deltas (A, 4) as from `score_anchors`; the best `before_nms` of each level are decoded.
-        """
-        boxes, scores, levels = [], [], []
-        first = 0
-        for level, of_level in enumerate(anchors):
-            own = slice(first, first + len(of_level))
-            first += len(of_level)
-            best = _best(objectness[own], before_nms)
-            decoded = clip(decode(of_level[best], deltas[own][best], extent=0.0), shape, extent=0.0)
-            wide = (decoded[:, 2:] - decoded[:, :2] >= 1e-3).all(axis=1)
-            boxes.append(decoded[wide])
-            scores.append(objectness[own][best][wide])
-            levels.append(np.full(int(wide.sum()), level, np.int32))
-        all_boxes, all_levels = np.concatenate(boxes), np.concatenate(levels)
-        kept = suppress_boxes(all_boxes, np.concatenate(scores), PROPOSAL_NMS, all_levels, limit=after_nms, extent=0.0)
-        return all_boxes[kept]
-
     def classify(self, pyramid: Sequence[Tensor], boxes: Tensor) -> tuple[Tensor, Tensor]:
-        """(logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image, whose pyramid is (1, C, H, W)."""
+        """Return (logits (P, 1 + C), deltas (P, 1 + C, 4)) of boxes (P, 4) of one image."""
         x = self.roi_heads.box_head(self.pool(pyramid, boxes, BOX_BINS))
         logits, deltas = self.roi_heads.box_predictor(x)
-        return logits, deltas.view(*logits.shape, 4)  # also without boxes, where a -1 would be ambiguous
+        return logits, deltas.view(*logits.shape, 4)  # a -1 would be ambiguous without boxes
 
     def segment(self, pyramid: Sequence[Tensor], boxes: Tensor) -> Tensor:
-        """The logits (P, 1 + C, 28, 28) of being inside the object of each class, over each box of one image."""
+        """Return the mask logits (P, 1 + C, 28, 28) of each class, over each box of one image."""
         logits: Tensor = self.roi_heads.mask_predictor(self.roi_heads.mask_head(self.pool(pyramid, boxes, MASK_BINS)))
         return logits
 
     def pool(self, pyramid: Sequence[Tensor], boxes: Tensor, bins: int) -> Tensor:
-        """RoIAlign (P, C, bins, bins) of each box from the level that suits its size."""
+        """Return RoIAlign (P, C, bins, bins) of each box, from the level for its size (Lin et al. 2017, eq. 1)."""
         sides = (boxes[:, 2:] - boxes[:, :2]).clamp(min=0).prod(dim=1).sqrt()
         level = torch.floor(CANONICAL_LEVEL + torch.log2(sides / CANONICAL_SIDE) + 1e-6)
         level = level.clamp(0, POOLED_LEVELS - 1)
         pooled = pyramid[0].new_zeros((len(boxes), pyramid[0].shape[1], bins, bins))
+        ratio, half_pixel = self.architecture.sampling_ratio, self.architecture.half_pixel
         for k in range(POOLED_LEVELS):
             own = torch.nonzero(level == k)[:, 0]
             if len(own):
-                a = self.architecture
-                pooled[own] = roi_align(
-                    pyramid[k], boxes[own], bins, 1 / STRIDES[k], a.sampling_ratio, a.half_pixel
-                ).to(pooled.dtype)
+                features = roi_align(pyramid[k], boxes[own], bins, 1 / STRIDES[k], ratio, half_pixel)
+                pooled[own] = features.to(pooled.dtype)
         return pooled
-
-
-class Backbone(nn.Module):
-    """Image to pyramid."""
-
-    def __init__(self, architecture: Architecture) -> None:
-        super().__init__()
-        self.body = ResNet(architecture.backbone)
-        self.fpn = FeaturePyramid(architecture.backbone.channels, architecture.fpn_channels)
-
-    def forward(self, images: Tensor) -> list[Tensor]:
-        levels: list[Tensor] = self.fpn(self.body(images))
-        return levels
 
 
 class FeaturePyramid(nn.Module):
@@ -184,14 +154,6 @@ class FeaturePyramid(nn.Module):
         return [*out, functional.max_pool2d(out[-1], 1, 2)]
 
 
-class RegionProposals(nn.Module):
-    """One head for all levels."""
-
-    def __init__(self, architecture: Architecture) -> None:
-        super().__init__()
-        self.head = ProposalHead(architecture.fpn_channels, len(architecture.anchor_ratios))
-
-
 class ProposalHead(nn.Module):
     """Objectness and deltas of the anchors of every cell (Ren et al., "Faster R-CNN", 2015)."""
 
@@ -207,27 +169,33 @@ class ProposalHead(nn.Module):
 
 
 class RoiHeads(nn.Module):
-    """What looks at the regions."""
+    """The heads for pooled regions."""
 
     def __init__(self, architecture: Architecture) -> None:
         super().__init__()
-        labels, channels = 1 + len(architecture.classes), architecture.fpn_channels
-        self.box_head = BoxHead(channels, architecture.head_features)
-        self.box_predictor = BoxPredictor(architecture.head_features, labels)
+        labels, channels, features = (
+            1 + len(architecture.classes),
+            architecture.fpn_channels,
+            architecture.head_features,
+        )
+        self.box_head = nn.Sequential(
+            OrderedDict(
+                flatten=nn.Flatten(),
+                fc6=nn.Linear(channels * BOX_BINS**2, features),
+                relu6=nn.ReLU(),
+                fc7=nn.Linear(features, features),
+                relu7=nn.ReLU(),
+            )
+        )
+        self.box_predictor = BoxPredictor(features, labels)
         self.mask_head = nn.Sequential(*(_convolution(channels, channels) for _ in range(4)))
-        self.mask_predictor = MaskPredictor(channels, labels)
-
-
-class BoxHead(nn.Module):
-    """Two full layers."""
-
-    def __init__(self, channels: int, features: int) -> None:
-        super().__init__()
-        self.fc6 = nn.Linear(channels * BOX_BINS**2, features)
-        self.fc7 = nn.Linear(features, features)
-
-    def forward(self, pooled: Tensor) -> Tensor:
-        return functional.relu(self.fc7(functional.relu(self.fc6(pooled.flatten(1)))))
+        self.mask_predictor = nn.Sequential(
+            OrderedDict(
+                conv5_mask=nn.ConvTranspose2d(channels, channels, 2, 2),
+                relu=nn.ReLU(),
+                mask_fcn_logits=nn.Conv2d(channels, labels, 1),
+            )
+        )
 
 
 class BoxPredictor(nn.Module):
@@ -242,17 +210,46 @@ class BoxPredictor(nn.Module):
         return self.cls_score(x), self.bbox_pred(x)
 
 
-class MaskPredictor(nn.Module):
-    """A mask for each label, twice as fine as what it is made from."""
+def _convolution(channels: int, out: int) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(channels, out, 3, 1, 1), nn.ReLU(inplace=True))
 
-    def __init__(self, channels: int, labels: int) -> None:
-        super().__init__()
-        self.conv5_mask = nn.ConvTranspose2d(channels, channels, 2, 2)
-        self.mask_fcn_logits = nn.Conv2d(channels, labels, 1)
 
-    def forward(self, x: Tensor) -> Tensor:
-        logits: Tensor = self.mask_fcn_logits(functional.relu(self.conv5_mask(x)))
-        return logits
+def _anchors(side: float, architecture: Architecture) -> Float32:
+    """Return the (R, 4) anchors of one cell, around the origin."""
+    ratios = np.array(architecture.anchor_ratios)
+    widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
+    anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2
+    return np.asarray(np.round(anchors) if architecture.rounded_anchors else anchors, np.float32)
+
+
+def propose(
+    anchors: Sequence[Float32],
+    objectness: Float32,
+    deltas: Float32,
+    shape: tuple[int, int],
+    before_nms: int,
+    after_nms: int,
+    extent: float = 0.0,
+) -> Float32:
+    """Return the boxes (P, 4), best first, where one image of `shape` (height, width) may have objects.
+
+    anchors: (A, 4) of each level; objectness (A,) and deltas (A, 4) of all levels in order. `before_nms` anchors of
+    each level are decoded, and `after_nms` boxes of all levels are kept.
+    """
+    boxes, scores, levels = [], [], []
+    start = 0
+    for level, of_level in enumerate(anchors):
+        own = slice(start, start + len(of_level))
+        start += len(of_level)
+        best = np.argsort(-objectness[own], kind="stable")[:before_nms]
+        decoded = clip(decode(of_level[best], deltas[own][best], extent), shape, extent)
+        wide = (decoded[:, 2:] - decoded[:, :2] + extent >= 1e-3).all(axis=1)
+        boxes.append(decoded[wide])
+        scores.append(objectness[own][best][wide])
+        levels.append(np.full(int(wide.sum()), level, np.int32))
+    all_boxes, all_levels = np.concatenate(boxes), np.concatenate(levels)
+    kept = suppress_boxes(all_boxes, np.concatenate(scores), PROPOSAL_NMS, all_levels, limit=after_nms, extent=extent)
+    return all_boxes[kept]
 
 
 def select(
@@ -263,44 +260,28 @@ def select(
     score_threshold: float,
     nms: float,
     limit: int,
+    extent: float = 0.0,
 ) -> tuple[Float32, Int32, Int32]:
-    """The surviving boxes (N, 4) of one image, best first, their proposals (N,) and labels (N,) from 1.
+    """Return the surviving boxes (N, 4) of one image, best first, their proposals (N,) and labels (N,) from 1.
 
-    probabilities (P, 1 + C), deltas (P, 1 + C, 4): every label of a proposal above `score_threshold` is a candidate,
-    moved by its own deltas; within a label, boxes fall to better ones by the IoU `nms`.
+    probabilities (P, 1 + C), deltas (P, 1 + C, 4): each label of a proposal above `score_threshold` is a candidate,
+    moved by its own deltas. `nms`: IoU for suppression within a label.
     """
     proposal, label = np.nonzero(probabilities[:, 1:] > score_threshold)
     label += 1
     own = np.asarray(deltas[proposal, label] / np.array(DELTA_WEIGHTS), np.float32)
-    boxes = clip(decode(proposals[proposal], own, extent=0.0), shape, extent=0.0)
-    wide = (boxes[:, 2:] - boxes[:, :2] >= 1e-2).all(axis=1)
+    boxes = clip(decode(proposals[proposal], own, extent), shape, extent)
+    wide = (boxes[:, 2:] - boxes[:, :2] + extent >= 1e-2).all(axis=1)
     boxes, proposal, label = boxes[wide], proposal[wide], label[wide]
-    kept = suppress_boxes(boxes, probabilities[proposal, label], nms, label.astype(np.int32), limit=limit, extent=0.0)
+    scores = probabilities[proposal, label]
+    kept = suppress_boxes(boxes, scores, nms, label.astype(np.int32), limit=limit, extent=extent)
     return boxes[kept], np.asarray(proposal[kept], np.int32), np.asarray(label[kept], np.int32)
 
 
-def _convolution(channels: int, out: int) -> nn.Sequential:
-    return nn.Sequential(nn.Conv2d(channels, out, 3, 1, 1), nn.ReLU(inplace=True))
-
-
-def _anchors(side: float, architecture: Architecture) -> Float32:
-    """The (R, 4) anchors of one cell, around the origin."""
-    ratios = np.array(architecture.anchor_ratios)
-    widths, heights = side / np.sqrt(ratios), side * np.sqrt(ratios)
-    anchors = np.stack([-widths, -heights, widths, heights], axis=1).astype(np.float64) / 2
-    return np.asarray(np.round(anchors) if architecture.rounded_anchors else anchors, np.float32)
-
-
-def _best(scores: Float32, n: int) -> Int32:
-    """The indices of the n best scores, best first, ties in the order of the input."""
-    return np.asarray(np.argsort(-scores, kind="stable")[:n], np.int32)
-
-
 def fuse_batch_norms(network: nn.Module) -> None:
-    """Replaces, in place, each nn.BatchNorm2d by nothing, and scales the convolution that it follows.
+    """Fold each nn.BatchNorm2d, in place, into the convolution registered directly before it.
 
-    It follows the convolution that was registered right before it, as in every network here. Only for a network that
-    is ready to run (`eval`): in training, normalization depends on the batch.
+    The network must be in inference mode, because in training the normalization depends on the batch.
     """
     for module in network.modules():
         for (name, layer), (next_name, next_layer) in pairwise(list(module.named_children())):

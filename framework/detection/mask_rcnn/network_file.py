@@ -1,8 +1,8 @@
-"""Networks as files: safetensors, whose metadata say what the network is and where it comes from.
+"""Networks as safetensors files, with metadata:
 
 architecture     the Architecture as JSON
-card             the model card's facts as JSON: data, steps, AP, limits, ...; `domain`: the only pictures it is for
-tensors_sha256   of all names, shapes and values, so that a damaged file is noticed
+card             the model card as JSON: data, steps, AP, limits, ...; `domain`: the only images the network is for
+tensors_sha256   of all names, shapes and values, to detect damage
 """
 
 from __future__ import annotations
@@ -27,22 +27,22 @@ from framework.files.atomic_write import written_whole
 from framework.files.json_file import parse_json
 
 Fact = str | int | float | bool | None
-COUNTERS = ".num_batches_tracked"  # of the batch normalization; only a running training needs them
+COUNTERS = ".num_batches_tracked"  # of the batch normalization; used only in training
 
 
 @dataclass(frozen=True)
 class NetworkDescription:
-    """What a file says of its network."""
+    """The metadata of a network file."""
 
     architecture: Architecture
     card: Mapping[str, Fact]
 
 
 def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: bool = False) -> None:
-    """Writes the network to `path`, whole or not at all. `half`: weights as float16, which halves the file.
+    """Write the network to `path` atomically; `half`: weights as float16.
 
-    Only weights of two or more dimensions are halved: biases and statistics are few, and variances may be too large
-    for float16. Raises DataError when a weight is not finite, or the disk does not take the file.
+    Only weights of two or more dimensions are halved: biases and statistics are few, and variances may exceed float16.
+    Raises DataError if a weight is not finite or the file cannot be written.
     """
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in _stored(network).items()}
     if half:
@@ -61,29 +61,29 @@ def save_network(network: MaskRCNN, path: Path, card: Mapping[str, Fact], half: 
 
 
 def load_network(path: Path) -> MaskRCNN:
-    """The network in `path`, in float32 and ready to run (`eval`). Raises DataError when it is no such file."""
+    """Return the network in `path`, in float32 and inference mode. Raises DataError for other files."""
     with _opened(path) as file:
         description = _description(file.metadata(), path)
         names = file.keys()
         tensors = {name: file.get_tensor(name) for name in names}
         if file.metadata().get("tensors_sha256") != _digest(tensors):
-            raise DataError(f"{path} is damaged: its tensors are not those that were written; get it again")
+            raise DataError(f"{path} is damaged: its tensors differ from those written; get it again")
     return filled(description.architecture, tensors, str(path))
 
 
 def describe_network(path: Path) -> NetworkDescription:
-    """What `path` says of its network, without reading the weights."""
+    """Return the metadata of `path` without reading the weights."""
     with _opened(path) as file:
         return _description(file.metadata(), path)
 
 
 def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str) -> MaskRCNN:
-    """A network with these weights, in float32 and ready to run. `where` they are from begins a DataError's line.
+    """Return a network with these weights, in float32 and inference mode.
 
-    The tensors must be exactly the network's, but for the counters of the batch normalization.
+    Raises DataError, starting with the source `where`, unless the tensors are the network's; counters are ignored.
     """
     try:
-        with torch.device("meta"):  # no memory, no random numbers for weights that are replaced at once
+        with torch.device("meta"):  # no memory or random numbers for weights that are replaced
             network = MaskRCNN(architecture)
     except (KeyError, ValueError, RuntimeError) as error:
         raise DataError(f"{where}: there is no such architecture: {in_one_line(error)}") from error
@@ -100,6 +100,13 @@ def filled(architecture: Architecture, tensors: Mapping[str, Tensor], where: str
     return network.eval()
 
 
+def required(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
+    """Return the tensor `name`. Raises DataError, starting with the source `where`, if it is missing."""
+    if name not in tensors:
+        raise DataError(f"{where} lacks the weights {name}: it is no Mask R-CNN with a feature pyramid")
+    return tensors[name]
+
+
 def _stored(network: MaskRCNN) -> dict[str, Tensor]:
     return {name: tensor for name, tensor in network.state_dict().items() if not name.endswith(COUNTERS)}
 
@@ -108,7 +115,7 @@ def _check_names(expected: typing.AbstractSet[str], found: typing.AbstractSet[st
     for names, fault in ((expected - found, "lacks"), (found - expected, "has the unknown")):
         if names:
             more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-            raise DataError(f"{where} {fault} weights {min(names)}{more}: it is not of the network that it should be")
+            raise DataError(f"{where} {fault} weights {min(names)}{more}: it is not of this network")
 
 
 def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
@@ -118,7 +125,7 @@ def _check_finite(tensors: Mapping[str, Tensor], where: str) -> None:
 
 
 def _digest(tensors: Mapping[str, Tensor]) -> str:
-    """SHA-256 (hex) of names, types, shapes and values."""
+    """Return the SHA-256 (hex) of names, types, shapes and values."""
     digest = hashlib.sha256()
     for name in sorted(tensors):
         tensor = tensors[name]
@@ -128,7 +135,6 @@ def _digest(tensors: Mapping[str, Tensor]) -> str:
 
 
 def _opened(path: Path) -> Any:
-    """A handle of safetensors; DataError when there is no such file."""
     if not path.is_file():
         raise DataError(f"there is no network {path}")
     try:
@@ -139,7 +145,7 @@ def _opened(path: Path) -> Any:
 
 def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescription:
     if not metadata or "architecture" not in metadata:
-        raise DataError(f"{path} does not say what network it is: its metadata have no architecture")
+        raise DataError(f"{path} is not a network file: its metadata have no architecture")
     try:
         card = parse_json(path, metadata.get("card", "{}"))
         architecture = parse_json(path, metadata["architecture"])
@@ -149,7 +155,7 @@ def _description(metadata: Mapping[str, str] | None, path: Path) -> NetworkDescr
 
 
 def _parsed(kind: Any, value: Any, name: str) -> Any:
-    """A value from JSON as what a field is annotated with; raises ValueError, in one line, when it is not that."""
+    """Return a value from JSON as the annotated type `kind`. Raises ValueError, in one line, for other types."""
     if dataclasses.is_dataclass(kind):
         if not isinstance(value, dict):
             raise ValueError(f"{name} must have fields, found {value!r}")

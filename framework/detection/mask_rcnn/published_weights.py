@@ -1,4 +1,4 @@
-"""Where networks come from: a file that the user has, or one that its authors publish, downloaded once and checked."""
+"""Network files: the user's own, or published ones, which are downloaded once and checked."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from framework.files.atomic_write import written_whole
 from framework.files.search_paths import candidates
 
 OFFLINE = "INSTANCEMAP_OFFLINE"
-"""An environment variable: set to anything, nothing is downloaded."""
+"""Environment variable: set to anything, nothing is downloaded."""
 
 TIMEOUT = 30.0  # s without an answer
 BLOCK = 1 << 20  # bytes
@@ -29,28 +29,25 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class PublishedNetwork:
-    """A file that is known by how its hash begins, because its authors put that into its name."""
+    """A file identified by the first digits of its hash, which its authors put into its name."""
 
     url: str
     algorithm: str  # of hashlib
     digest: str  # hex, the first digits or all
-    licence: str
-    megabytes: int = 0  # as far as it is known before the download; 0 = not known
+    license: str
+    megabytes: int = 0  # 0 = unknown before the download
 
     @property
     def file(self) -> Path:
-        """Where it is in the user's cache, or is to be put."""
+        """The path in the user's cache."""
         return networks_folder() / self.url.rpartition("/")[2]
 
 
+TORCHVISION = "https://download.pytorch.org/models/"
 DETECTRON2 = "https://dl.fbaipublicfiles.com/detectron2/COCO-InstanceSegmentation/"
 PUBLISHED = {
     "resnet50_fpn_coco": PublishedNetwork(
-        "https://download.pytorch.org/models/maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth",
-        "sha256",
-        "bf2d0c1e",
-        "BSD-3-Clause",
-        178,
+        f"{TORCHVISION}maskrcnn_resnet50_fpn_coco-bf2d0c1e.pth", "sha256", "bf2d0c1e", "BSD-3-Clause", 178
     ),
     "resnet50_fpn_coco_detectron2": PublishedNetwork(
         f"{DETECTRON2}mask_rcnn_R_50_FPN_3x/137849600/model_final_f10217.pkl", "md5", "f10217", "CC BY-SA 3.0"
@@ -59,19 +56,19 @@ PUBLISHED = {
         f"{DETECTRON2}mask_rcnn_R_101_FPN_3x/138205316/model_final_a3ec72.pkl", "md5", "a3ec72", "CC BY-SA 3.0"
     ),
 }
-"""torchvision's first one (COCO mask AP 34.6) and detectron2's (37.2 and 38.6), as published."""
+"""torchvision's first network (COCO mask AP 34.6 as published) and detectron2's (37.2 and 38.6)."""
 
 
 def networks_folder() -> Path:
-    """The folder of downloaded networks in the user's cache."""
+    """Return the folder of downloaded networks in the user's cache."""
     return platformdirs.user_cache_path("instancemap", appauthor=False) / "networks"
 
 
 def find_network(weights: Path) -> Path:
-    """The file that `weights` means: a name in PUBLISHED, downloaded if need be, or a path.
+    """Return the file of `weights`: a name in PUBLISHED, which is downloaded if missing, or a path.
 
-    A relative path is tried from the working folder, then from the project's. Raises DataError, with what to do, when
-    there is no such file, it cannot be downloaded, or its hash is not the published one.
+    A relative path is searched in the working, then in the project folder. Raises DataError, with the fix, if there is
+    no such file, it cannot be downloaded, or its hash differs from the published one.
     """
     if published := PUBLISHED.get(str(weights)):
         if not published.file.exists():
@@ -81,12 +78,12 @@ def find_network(weights: Path) -> Path:
     for candidate in candidates(weights):
         if candidate.is_file():
             return candidate.resolve()
-    looked = " and no ".join(str(candidate) for candidate in candidates(weights))
-    raise DataError(f"there is no network {looked}; give a file, or one of the published: {', '.join(PUBLISHED)}")
+    searched = " and no ".join(str(candidate) for candidate in candidates(weights))
+    raise DataError(f"there is no network {searched}; give a file, or one of the published: {', '.join(PUBLISHED)}")
 
 
 def check(published: PublishedNetwork) -> None:
-    """Raises DataError unless the cached file is the published one."""
+    """Raise DataError unless the cached file is the published one."""
     try:
         with published.file.open("rb") as file:
             found = hashlib.file_digest(file, published.algorithm).hexdigest()
@@ -100,7 +97,7 @@ def check(published: PublishedNetwork) -> None:
 
 
 def download(published: PublishedNetwork) -> None:
-    """Fetches the file into the cache, with a progress bar, whole or not at all."""
+    """Download the file into the cache with a progress bar, and write it atomically."""
     by_hand = f"download {published.url} and put it at {published.file}"
     if os.environ.get(OFFLINE):
         raise DataError(f"there is no {published.file}, and {OFFLINE} forbids to download it: {by_hand}")
@@ -123,7 +120,7 @@ def download(published: PublishedNetwork) -> None:
 
 
 def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
-    """The blocks that its server sends; a fault of the connection, and no other, is a DataError that says `by_hand`."""
+    """Yield the blocks from the server. Raises DataError, with the fix `by_hand`, for connection errors only."""
     url, name = published.url, published.file.name
     try:
         with (
@@ -131,18 +128,14 @@ def _received(published: PublishedNetwork, by_hand: str) -> Iterator[bytes]:
             tqdm(total=response.length, unit="B", unit_scale=True, desc=name, disable=None) as progress,
         ):
             announced, received = response.length or 0, 0
-            size = f"{announced / 1e6:.0f} MB" if announced else "of a size that is not said"
-            log.info("downloading %s, %s, licence %s, into %s", url, size, published.licence, published.file.parent)
+            size = f"{announced / 1e6:.0f} MB" if announced else "of unknown size"
+            log.info("downloading %s, %s, license %s, into %s", url, size, published.license, published.file.parent)
             while block := response.read(BLOCK):
                 received += len(block)
                 progress.update(len(block))
                 yield block
     except (OSError, http.client.HTTPException) as error:
-        raise DataError(f"{url} could not be downloaded ({_reason(error)}): {by_hand}") from error
+        reason = in_one_line(getattr(error, "reason", None) or error)
+        raise DataError(f"{url} could not be downloaded ({reason}): {by_hand}") from error
     if received < announced:
         raise DataError(f"{url} ended after {received} of {announced} bytes: try again, or {by_hand}")
-
-
-def _reason(error: Exception) -> str:
-    """What is wrong, in a few words."""
-    return in_one_line(getattr(error, "reason", None) or error)

@@ -14,22 +14,22 @@ DEPTHS = {
     "resnet101": (3, 4, 23, 3),
 }
 WITH_BOTTLENECKS = ("resnet50", "resnet101")
-EXPANSION = 4  # of a bottleneck: channels out for each channel inside
+EXPANSION = 4  # of a bottleneck: output channels per inner channel
 
 
 @dataclass(frozen=True)
 class ResNetShape:
-    """What tells one residual network from another."""
+    """The parameters of a residual network."""
 
     name: str = "resnet50"  # a key of DEPTHS
     width: int = 64  # channels of the stem; 64 in the paper
-    stride_in_1x1: bool = False  # where a bottleneck halves the image: in its first convolution (the paper, Detectron's
-    # networks) or in its second one (torchvision, "v1.5")
+    stride_in_1x1: bool = False  # convolution of a bottleneck with the stride: True = the first (the paper, Detectron's
+    # networks), False = the second (torchvision, "v1.5")
     norm_eps: float = 1e-5  # of the batch normalization
 
     @property
     def channels(self) -> tuple[int, ...]:
-        """Of the four levels."""
+        """The channels of the four levels."""
         factor = EXPANSION if self.name in WITH_BOTTLENECKS else 1
         return tuple(self.width * 2**level * factor for level in range(4))
 
@@ -57,56 +57,34 @@ class ResNet(nn.Module):
 
 
 def _layer(channels: int, out: int, stride: int, blocks: int, shape: ResNetShape) -> nn.Sequential:
-    block = Bottleneck if shape.name in WITH_BOTTLENECKS else BasicBlock
-    return nn.Sequential(block(channels, out, stride, shape), *(block(out, out, 1, shape) for _ in range(blocks - 1)))
+    return nn.Sequential(Block(channels, out, stride, shape), *(Block(out, out, 1, shape) for _ in range(blocks - 1)))
 
 
-class BasicBlock(nn.Module):
-    """Two 3x3 convolutions beside a shortcut."""
-
-    def __init__(self, channels: int, out: int, stride: int, shape: ResNetShape) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels, out, 3, stride, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(out, shape.norm_eps)
-        self.conv2 = nn.Conv2d(out, out, 3, 1, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(out, shape.norm_eps)
-        self.relu = nn.ReLU(inplace=True)
-        self.downsample = _shortcut(channels, out, stride, shape)
-
-    def forward(self, x: Tensor) -> Tensor:
-        shortcut = x if self.downsample is None else self.downsample(x)
-        y = self.relu(self.bn1(self.conv1(x)))
-        y = self.bn2(self.conv2(y))
-        y += shortcut
-        return functional.relu(y, inplace=True)
-
-
-class Bottleneck(nn.Module):
-    """A 3x3 convolution between two 1x1 ones, on a quarter of the channels, beside a shortcut."""
+class Block(nn.Module):
+    """Convolutions with a shortcut: two of 3x3, or a bottleneck of 1x1, 3x3 and 1x1 on a quarter of the channels."""
 
     def __init__(self, channels: int, out: int, stride: int, shape: ResNetShape) -> None:
         super().__init__()
-        inside = out // EXPANSION
-        strides = (stride, 1) if shape.stride_in_1x1 else (1, stride)
-        self.conv1 = nn.Conv2d(channels, inside, 1, strides[0], bias=False)
-        self.bn1 = nn.BatchNorm2d(inside, shape.norm_eps)
-        self.conv2 = nn.Conv2d(inside, inside, 3, strides[1], 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(inside, shape.norm_eps)
-        self.conv3 = nn.Conv2d(inside, out, 1, bias=False)
-        self.bn3 = nn.BatchNorm2d(out, shape.norm_eps)
-        self.relu = nn.ReLU(inplace=True)
-        self.downsample = _shortcut(channels, out, stride, shape)
+        inner, kernels, strides = out, [3, 3], [stride, 1]
+        if shape.name in WITH_BOTTLENECKS:
+            inner, kernels = out // EXPANSION, [1, 3, 1]
+            strides = [stride, 1, 1] if shape.stride_in_1x1 else [1, stride, 1]
+        self.depth = len(kernels)
+        widths = (channels, *[inner] * (self.depth - 1), out)
+        for k in range(self.depth):
+            convolution = nn.Conv2d(widths[k], widths[k + 1], kernels[k], strides[k], kernels[k] // 2, bias=False)
+            self.add_module(f"conv{k + 1}", convolution)
+            self.add_module(f"bn{k + 1}", nn.BatchNorm2d(widths[k + 1], shape.norm_eps))
+        self.downsample: nn.Module | None = None
+        if stride != 1 or channels != out:
+            shortcut = nn.Conv2d(channels, out, 1, stride, bias=False)
+            self.downsample = nn.Sequential(shortcut, nn.BatchNorm2d(out, shape.norm_eps))
 
     def forward(self, x: Tensor) -> Tensor:
         shortcut = x if self.downsample is None else self.downsample(x)
-        y = self.relu(self.bn1(self.conv1(x)))
-        y = self.relu(self.bn2(self.conv2(y)))
-        y = self.bn3(self.conv3(y))
-        y += shortcut
-        return functional.relu(y, inplace=True)
-
-
-def _shortcut(channels: int, out: int, stride: int, shape: ResNetShape) -> nn.Module | None:
-    if stride == 1 and channels == out:
-        return None
-    return nn.Sequential(nn.Conv2d(channels, out, 1, stride, bias=False), nn.BatchNorm2d(out, shape.norm_eps))
+        for k in range(1, self.depth + 1):
+            x = getattr(self, f"bn{k}")(getattr(self, f"conv{k}")(x))
+            if k == self.depth:
+                x += shortcut
+            x = functional.relu(x, inplace=True)
+        return x

@@ -9,34 +9,33 @@ import torch
 from torch import Tensor
 
 from framework.detection.mask_rcnn.network import Architecture, MaskRCNN
-from framework.detection.mask_rcnn.network_file import filled
+from framework.detection.mask_rcnn.network_file import filled, required
 from framework.detection.mask_rcnn.resnet import DEPTHS, WITH_BOTTLENECKS, ResNetShape
 from framework.errors import DataError
 from framework.vocabulary.label_spaces import COCO
 
 COCO_GAPS = (12, 26, 29, 30, 45, 66, 68, 69, 71, 83)
-"""Categories that COCO numbers, up to 90, and never labelled."""
+"""Category ids of COCO, up to 90, that were never annotated."""
 
 COCO_LABELS = 1 + len(COCO) + len(COCO_GAPS)
-NEWER_NAMES = (  # torchvision wraps its convolutions since 0.13; its older checkpoints have the bare names
+NEWER_NAMES = (  # since 0.13, torchvision wraps its convolutions; older checkpoints have the bare names
     (r"(fpn\.(?:inner|layer)_blocks\.\d)\.(weight|bias)", r"\1.0.\2"),
     (r"rpn\.head\.conv\.(weight|bias)", r"rpn.head.conv.0.0.\1"),
-    (r"roi_heads\.mask_head\.mask_fcn(\d)\.(weight|bias)", lambda match: _mask_layer(int(match[1]), match[2])),
+    (r"roi_heads\.mask_head\.mask_fcn(\d)\.(weight|bias)", lambda m: f"roi_heads.mask_head.{int(m[1]) - 1}.0.{m[2]}"),
 )
 
 
 def from_torchvision(
     state: Mapping[str, Tensor], where: str, classes: tuple[str, ...] | None = None, norm_eps: float = 0.0
 ) -> MaskRCNN:
-    """The network of a state_dict, with torchvision's conventions; `where` it is from begins a DataError's line.
+    """Return the network of a state_dict with torchvision's conventions.
 
-    `classes`: the names of the labels after the background. Without it the network must be one of COCO, with 91 labels:
-    the rows of the gaps in COCO's numbers, never trained but as negatives, are left out, so that their share, nearly
-    0, spreads over the others as they are. `norm_eps`: torchvision sets it to 0 for its published checkpoint and no
-    other; networks trained with its defaults have 1e-5.
+    `classes`: the labels after the background; None = COCO's 91 labels, without the rows of the gaps in COCO's ids,
+    which were trained only as negatives. `norm_eps`: 0 for torchvision's published checkpoint, 1e-5 for networks
+    trained with its defaults. Raises DataError, starting with the source `where`, for other networks.
     """
     tensors = {_newer_name(name): tensor for name, tensor in state.items()}
-    labels = len(_taken(tensors, "roi_heads.box_predictor.cls_score.bias", where))
+    labels = len(required(tensors, "roi_heads.box_predictor.cls_score.bias", where))
     if classes is None:
         if labels != COCO_LABELS:
             raise DataError(f"{where}: {labels} labels are not COCO's {COCO_LABELS}: the classes must be given")
@@ -46,16 +45,11 @@ def from_torchvision(
     architecture = Architecture(
         classes=classes,
         backbone=_backbone(tensors, norm_eps, where),
-        fpn_channels=len(_taken(tensors, "backbone.fpn.inner_blocks.0.0.bias", where)),
-        head_features=len(_taken(tensors, "roi_heads.box_head.fc6.bias", where)),
+        fpn_channels=len(required(tensors, "backbone.fpn.inner_blocks.0.0.bias", where)),
+        head_features=len(required(tensors, "roi_heads.box_head.fc6.bias", where)),
         truncated_strides=True,
     )
     return filled(architecture, tensors, where)
-
-
-def is_torchvision(names: Mapping[str, Tensor]) -> bool:
-    """Whether these are the weights of torchvision's Mask R-CNN."""
-    return "backbone.body.conv1.weight" in names
 
 
 def _newer_name(name: str) -> str:
@@ -64,18 +58,13 @@ def _newer_name(name: str) -> str:
     return name
 
 
-def _mask_layer(number: int, kind: str) -> str:
-    return f"roi_heads.mask_head.{number - 1}.0.{kind}"
-
-
 def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The predictors' rows of the background and of the 80 classes."""
+    """Return the tensors with the predictors' rows of the background and the 80 classes only."""
     rows = torch.tensor([label for label in range(COCO_LABELS) if label not in COCO_GAPS])
     sliced = dict(tensors)
-    for layer in ("roi_heads.box_predictor.cls_score", "roi_heads.mask_predictor.mask_fcn_logits"):
-        for kind in ("weight", "bias"):
-            sliced[f"{layer}.{kind}"] = tensors[f"{layer}.{kind}"][rows]
     for kind in ("weight", "bias"):
+        for layer in ("roi_heads.box_predictor.cls_score", "roi_heads.mask_predictor.mask_fcn_logits"):
+            sliced[f"{layer}.{kind}"] = tensors[f"{layer}.{kind}"][rows]
         deltas = tensors[f"roi_heads.box_predictor.bbox_pred.{kind}"]
         kept = deltas.unflatten(0, (COCO_LABELS, 4))[rows]  # type: ignore[no-untyped-call]
         sliced[f"roi_heads.box_predictor.bbox_pred.{kind}"] = kept.flatten(0, 1)
@@ -83,7 +72,7 @@ def _without_gaps(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> ResNetShape:
-    """What residual network it is, by the number of blocks of each level."""
+    """Return the residual network, by the number of blocks of each level."""
     depths = tuple(
         len({match[1] for name in tensors if (match := re.match(rf"backbone\.body\.layer{level}\.(\d+)\.", name))})
         for level in (1, 2, 3, 4)
@@ -91,12 +80,6 @@ def _backbone(tensors: Mapping[str, Tensor], norm_eps: float, where: str) -> Res
     bottlenecks = "backbone.body.layer1.0.conv3.weight" in tensors
     for name, expected in DEPTHS.items():
         if expected == depths and (name in WITH_BOTTLENECKS) == bottlenecks:
-            width = len(_taken(tensors, "backbone.body.conv1.weight", where))
+            width = len(required(tensors, "backbone.body.conv1.weight", where))
             return ResNetShape(name, width, norm_eps=norm_eps)
     raise DataError(f"{where}: there is no residual network here with {depths} blocks")
-
-
-def _taken(tensors: Mapping[str, Tensor], name: str, where: str) -> Tensor:
-    if name not in tensors:
-        raise DataError(f"{where} lacks the weights {name}: it is no Mask R-CNN with a feature pyramid")
-    return tensors[name]

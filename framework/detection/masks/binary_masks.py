@@ -1,19 +1,21 @@
-"""Masks of objects: from a network's small grid to the image, and the boxes around them."""
+"""Binary masks: from box grids and prototypes to the image; their boxes, overlaps and duplicates."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 
 from framework.data import Bool, Detections, Float32, Float64, Int32
-from framework.detection.masks.binary_masks_kernels import mask_bounds, paste, shared_pixels
+from framework.detection.masks.binary_masks_kernels import mask_bounds, paste, sample_prototypes, shared_pixels
+from framework.detection.masks.letterbox import Letterbox
 
 
 def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], threshold: float = 0.5) -> Bool:
-    """The masks (N, H, W) of an image of `shape` (height, width) where bilinearly resized grids exceed `threshold`.
+    """Return the masks (N, H, W), for an image of `shape`, where bilinearly resized grids exceed `threshold`.
 
-    grids (N, G, G) probabilities over each box; borders (N, 4) x1 y1 x2 y2 of the boxes in px with pixel centres at
-    integers. Around a grid there is a ring of zero cells, as in Detectron, so that an object that fills its box ends at
-    the box, and not at the centre of the last cell.
+    grids (N, G, G): probabilities over each box; borders (N, 4): boxes x1 y1 x2 y2 px, pixel centers at integers. A
+    ring of zero cells is added, as in Detectron, so that an object that fills its box ends at the border of the box.
     """
     ringed = np.pad(grids.astype(np.float32, copy=False), ((0, 0), (1, 1), (1, 1)))
     masks = np.zeros((len(grids), *shape), np.bool_)
@@ -21,23 +23,51 @@ def paste_masks(grids: Float32, borders: Float32, shape: tuple[int, int], thresh
     return masks
 
 
+def masks_from_prototypes(
+    coefficients: Float32,
+    prototypes: Float32,
+    borders: Float32,
+    letterbox: Letterbox,
+    shape: tuple[int, int],
+    threshold: float = 0.5,
+) -> Bool:
+    """Return the masks (N, H, W) where the weighted sums of prototypes exceed `threshold` (Bolya et al., "YOLACT").
+
+    coefficients (N, M); prototypes (M, h, w), whose cells cover the network's whole input; borders (N, 4): boxes
+    x1 y1 x2 y2 px of the image, which bound the masks. The sums are logits, interpolated bilinearly between cell
+    centers before they are compared.
+    """
+    count, rows, columns = prototypes.shape
+    logits = (coefficients @ prototypes.reshape(count, -1)).reshape(len(coefficients), rows, columns)
+    cells_y, cells_x = rows / letterbox.input_shape[0], columns / letterbox.input_shape[1]  # cells per px of the input
+    # the cell of pixel u is ((u + 0.5) scale + left) cells - 0.5: centers map to centers
+    affine = np.array(
+        [
+            [letterbox.scale_x * cells_x, (0.5 * letterbox.scale_x + letterbox.left) * cells_x - 0.5],
+            [letterbox.scale_y * cells_y, (0.5 * letterbox.scale_y + letterbox.top) * cells_y - 0.5],
+        ]
+    )
+    masks = np.zeros((len(coefficients), *shape), np.bool_)
+    logit = np.float32(math.log(threshold / (1 - threshold)))
+    logits, borders = np.ascontiguousarray(logits, np.float32), np.ascontiguousarray(borders, np.float64)
+    sample_prototypes(logits, borders, affine, logit, masks)
+    return masks
+
+
 def tight_boxes(masks: Bool) -> Float32:
-    """The (N, 4) boxes x1 y1 x2 y2 px of masks (N, H, W): first and last column and row inside; 0 for an empty mask."""
+    """Return the boxes (N, 4) x1 y1 x2 y2 px of masks (N, H, W): first and last column and row; 0 for an empty mask."""
     return np.asarray(mask_bounds(masks.view(np.uint8)), np.float32)
 
 
 def mask_overlaps(masks: Bool, boxes: Float32) -> Float64:
-    """The (N, N) numbers of pixels that masks (N, H, W) share; on the diagonal their areas.
-
-    boxes (N, 4) are `tight_boxes` of the masks, which is not checked.
-    """
+    """Return the numbers of pixels (N, N) that masks (N, H, W) share; boxes (N, 4) must be their `tight_boxes`."""
     return np.asarray(shared_pixels(masks.view(np.uint8), boxes.astype(np.int64)), np.float64)
 
 
 def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
-    """The indices of the masks (N, H, W), best first, that are not empty and overlap no better survivor by `iou`.
+    """Return the indices of the non-empty masks, best first, whose IoU with each better survivor is at most `iou`.
 
-    boxes (N, 4) are the masks' tight ones.
+    masks (N, H, W), best first; boxes (N, 4) must be their `tight_boxes`.
     """
     overlaps = mask_overlaps(masks, boxes)
     areas = overlaps.diagonal()
@@ -51,7 +81,7 @@ def suppress_duplicates(masks: Bool, boxes: Float32, iou: float) -> Int32:
 def without_duplicates(
     masks: Bool, scores: Float32, class_probabilities: Float32, classes: tuple[str, ...], iou: float
 ) -> Detections:
-    """The detections, best first, whose masks (N, H, W) `suppress_duplicates` leaves, in tight boxes."""
+    """Return the detections, with tight boxes, of the masks (N, H, W) that `suppress_duplicates` keeps."""
     boxes = tight_boxes(masks)
     kept = suppress_duplicates(masks, boxes, iou)
     return Detections(masks[kept], boxes[kept], scores[kept], class_probabilities[kept], classes)

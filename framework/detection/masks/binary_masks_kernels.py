@@ -1,14 +1,16 @@
-"""Kernels of binary_masks.py."""
+"""Kernels of binary_masks.py, and contacts between instances."""
 
 from __future__ import annotations
 
 import numpy as np
 from numba import njit
 
+CONTACT_DEPTH = 0.1  # m, largest difference in depth between neighboring pixels of two instances that touch
+
 
 @njit(cache=True, nogil=True)
 def mask_bounds(masks):
-    """Each row is read whole first, 64 pixels at a time, as most rows are empty; then from both ends."""
+    """Test each row 64 pixels at a time, because most rows are empty, then scan it from both ends."""
     n, height, width = masks.shape
     bounds = np.zeros((n, 4), np.int64)
     for i in range(n):
@@ -16,7 +18,7 @@ def mask_bounds(masks):
         for v in range(height):
             filled = np.uint8(0)
             for u in range(width):
-                filled = np.uint8(filled | masks[i, v, u])  # numba would go on in 64 bits
+                filled = np.uint8(filled | masks[i, v, u])  # numba would widen to 64 bits
             if not filled:
                 continue
             u = 0
@@ -34,7 +36,7 @@ def mask_bounds(masks):
 
 @njit(cache=True, nogil=True)
 def shared_pixels(masks, bounds):
-    """Counts the pixels of two masks where their bounds (N, 4) meet: quick where most masks are small, and few meet."""
+    """Count the pixels that two masks share where their bounds (N, 4) intersect."""
     n = len(masks)
     shared = np.zeros((n, n), np.int64)
     for i in range(n):
@@ -43,7 +45,7 @@ def shared_pixels(masks, bounds):
             x2, y2 = min(bounds[i, 2], bounds[j, 2]), min(bounds[i, 3], bounds[j, 3])
             for v in range(y1, y2 + 1):
                 count = np.int32(0)
-                for u in range(np.uint64(x1), np.uint64(max(x2 + 1, x1))):  # what may be negative is no vector's index
+                for u in range(np.uint64(x1), np.uint64(max(x2 + 1, x1))):  # a signed index prevents vectorization
                     count = np.int32(count + np.int32(masks[i, v, u] & masks[j, v, u]))  # numba would add in 64 bits
                 shared[i, j] += count
             shared[j, i] = shared[i, j]
@@ -51,10 +53,10 @@ def shared_pixels(masks, bounds):
 
 
 @njit(cache=True, nogil=True)
-def _axis_cells(start, end, cells, pixels):
-    """Where pixels along one axis fall in a ringed grid: first pixel, then the lower cell and the weight of the upper.
+def _grid_cells(start, end, cells, pixels):
+    """Return, along one axis, the first pixel in reach of a ringed grid, then each pixel's lower cell and upper weight.
 
-    `cells` is without the ring. Only pixels within half a cell of the box or inside it can see it.
+    `cells` excludes the ring. Pixels are in reach inside the box and up to half a cell outside.
     """
     cell = (end - start) / cells  # px
     first = max(0, int(np.ceil(start - 0.5 * cell)))
@@ -63,16 +65,16 @@ def _axis_cells(start, end, cells, pixels):
     lower = np.empty(n, np.int64)
     weight = np.empty(n, np.float32)
     for i in range(n):
-        place = (first + i - start) / cell + 0.5  # 0 is the centre of the ring's first cell, cells + 1 of its last
-        place = min(max(place, 0.0), cells + 1.0)
-        lower[i] = min(int(place), cells)
-        weight[i] = place - lower[i]
+        position = (first + i - start) / cell + 0.5  # 0 is the center of the ring's first cell, cells + 1 of its last
+        position = min(max(position, 0.0), cells + 1.0)
+        lower[i] = min(int(position), cells)
+        weight[i] = position - lower[i]
     return first, lower, weight
 
 
 @njit(cache=True, nogil=True)
 def paste(ringed, borders, threshold, masks):
-    """Rows first: one blended row of the grid serves a whole row of pixels."""
+    """Blend along y first: one blended row of the grid serves a whole row of pixels."""
     n, height, width = masks.shape
     cells = ringed.shape[1] - 2
     row = np.empty(cells + 2, np.float32)
@@ -80,11 +82,62 @@ def paste(ringed, borders, threshold, masks):
         x1, y1, x2, y2 = borders[i, 0], borders[i, 1], borders[i, 2], borders[i, 3]
         if not (x2 > x1 and y2 > y1):
             continue
-        u0, left, u_weight = _axis_cells(x1, x2, cells, width)
-        v0, above, v_weight = _axis_cells(y1, y2, cells, height)
+        u0, left, u_weight = _grid_cells(x1, x2, cells, width)
+        v0, above, v_weight = _grid_cells(y1, y2, cells, height)
         for j in range(len(above)):
             for c in range(cells + 2):
                 row[c] = ringed[i, above[j], c] + v_weight[j] * (ringed[i, above[j] + 1, c] - ringed[i, above[j], c])
             for k in range(len(left)):
                 value = row[left[k]] + u_weight[k] * (row[left[k] + 1] - row[left[k]])
                 masks[i, v0 + j, u0 + k] = value > threshold
+
+
+@njit(cache=True, nogil=True)
+def _prototype_cells(start, end, pixels, scale, shift, cells):
+    """Return, along one axis, the first pixel inside a box, then each pixel's lower cell and upper weight."""
+    first, stop = max(0, int(np.ceil(start))), min(pixels, int(np.ceil(end)))
+    n = max(0, stop - first)
+    lower = np.empty(n, np.int64)
+    weight = np.empty(n, np.float32)
+    for i in range(n):
+        position = min(max((first + i) * scale + shift, 0.0), cells - 1.0)
+        lower[i] = min(int(position), max(cells - 2, 0))
+        weight[i] = position - lower[i]
+    return first, lower, weight
+
+
+@njit(cache=True, nogil=True)
+def sample_prototypes(logits, borders, affine, least, masks):
+    """Blend along y first: one blended row of cells serves a whole row of pixels."""
+    n, height, width = masks.shape
+    rows, columns = logits.shape[1:]
+    for i in range(n):
+        x1, y1, x2, y2 = borders[i]
+        u0, left, u_weight = _prototype_cells(x1, x2, width, affine[0, 0], affine[0, 1], columns)
+        v0, above, v_weight = _prototype_cells(y1, y2, height, affine[1, 0], affine[1, 1], rows)
+        for j in range(len(above)):
+            upper, under = logits[i, above[j]], logits[i, min(above[j] + 1, rows - 1)]
+            row = upper + v_weight[j] * (under - upper)
+            for k in range(len(left)):
+                low, high = row[left[k]], row[min(left[k] + 1, columns - 1)]
+                masks[i, v0 + j, u0 + k] = low + u_weight[k] * (high - low) > least
+
+
+@njit(cache=True, nogil=True)
+def contacts(ids, depth):
+    """Return the pairs (M, 2) of touching instances, the smaller id first; pairs may repeat."""
+    height, width = ids.shape
+    pairs = np.empty((2 * height * width, 2), np.int32)
+    n = 0
+    for v in range(height):
+        for u in range(width):
+            own = ids[v, u]
+            if own <= 0:
+                continue
+            for y, x in ((v, u + 1), (v + 1, u)):
+                if y == height or x == width or ids[y, x] <= 0 or ids[y, x] == own:
+                    continue
+                if abs(depth[v, u] - depth[y, x]) < np.float32(CONTACT_DEPTH):
+                    pairs[n, 0], pairs[n, 1] = min(own, ids[y, x]), max(own, ids[y, x])
+                    n += 1
+    return pairs[:n].copy()

@@ -1,24 +1,24 @@
-"""Boxes: x1 y1 x2 y2 in pixels, and the deltas by which a network moves them.
+"""Boxes x1 y1 x2 y2 in px: anchors, deltas, non-maximum suppression.
 
-Two conventions are in the field, and a network works only with the one that it was trained with. `extent` tells them
-apart: 1 = the old one, where x2 is the last pixel inside, so that a box is x2 - x1 + 1 wide; 0 = the newer one, where
-x2 is the right border.
+A network works only with the box convention of its training. `extent` selects it: 1 = the older convention, where x2 is
+the last pixel inside and a box is x2 - x1 + 1 px wide; 0 = the newer one, where x2 is the right border.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from framework.data import Float32
+from framework.data import Float32, Int32
+from framework.detection.masks.boxes_kernels import suppress_sorted
 
-LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))  # a box grows by at most this factor, so that exp cannot overflow
-"""Detectron's bound (Girshick et al., github.com/facebookresearch/Detectron)."""
+LARGEST_LOG_SCALE = float(np.log(1000.0 / 16.0))
+"""Bound on the growth of a box against overflow (Girshick et al., github.com/facebookresearch/Detectron)."""
 
 
 def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple[float, float]) -> Float32:
-    """The (A, 4) anchors of cell (0, 0) repeated over a feature map: (rows * columns * A, 4), the anchor fastest.
+    """Return the (A, 4) anchors of cell (0, 0) for every cell: (rows * columns * A, 4), the anchor index fastest.
 
-    `stride`: px per cell, one for both axes or y and x.
+    `stride`: px per cell, for both axes or as (y, x).
     """
     stride_y, stride_x = stride if isinstance(stride, tuple) else (stride, stride)
     x, y = np.meshgrid(np.arange(columns) * stride_x, np.arange(rows) * stride_y)
@@ -27,7 +27,7 @@ def anchor_grid(anchors: Float32, rows: int, columns: int, stride: float | tuple
 
 
 def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
-    """The (N, 4) boxes moved by (N, 4) deltas dx dy dw dh, relative to the boxes' centres and sizes.
+    """Return the (N, 4) boxes moved by (N, 4) deltas dx dy dw dh, relative to the boxes' centers and sizes.
 
     Source: Girshick et al., "Rich feature hierarchies ...", 2014, appendix C, with Detectron's pixel conventions.
     """
@@ -40,7 +40,7 @@ def decode(boxes: Float32, deltas: Float32, extent: float = 1.0) -> Float32:
 
 
 def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32:
-    """The boxes (N, 4) cut at the borders of an image of `shape` (height, width)."""
+    """Return the boxes (N, 4) clipped to an image of `shape` (height, width)."""
     height, width = shape
     largest = np.array([width, height, width, height], np.float32) - np.float32(extent)
     return np.clip(boxes, np.float32(0), largest)
@@ -49,10 +49,39 @@ def clip(boxes: Float32, shape: tuple[int, int], extent: float = 1.0) -> Float32
 def to_original_image(
     boxes: Float32, resized: tuple[int, int], original: tuple[int, int], extent: float = 1.0
 ) -> Float32:
-    """Boxes (N, 4) in a resized image, as borders in the image before: shapes (height, width).
+    """Return the borders (N, 4), in the original image, of boxes in the resized image; shapes are (height, width).
 
-    Pixel centres are at integers, so the returned borders of a box of one pixel (u, v) are u - 0.5 and u + 0.5.
+    Pixel centers are at integers: the borders of pixel (u, v) are u - 0.5 and u + 0.5.
     """
     scale = np.array(original[::-1], np.float32) / np.array(resized[::-1], np.float32)
     borders = boxes + np.array([0, 0, extent, extent], np.float32)
     return np.asarray(borders * np.tile(scale, 2) - np.float32(0.5), np.float32)
+
+
+def suppress_boxes(
+    boxes: Float32,
+    scores: Float32,
+    iou: float,
+    classes: Int32 | None = None,
+    limit: int | None = None,
+    extent: float = 1.0,
+) -> Int32:
+    """Return the indices that survive greedy non-maximum suppression, best first, ties in input order.
+
+    A box of `boxes` (N, 4) is removed if its IoU with a better survivor of its class exceeds `iou`. `classes` (N,):
+    None = one class. `limit`: largest number of survivors. Not OpenCV's: that offsets boxes by class, which rounds the
+    IoU. Not torchvision's: its extension loads only with its own build of torch.
+    """
+    order = np.argsort(-scores, kind="stable").astype(np.int32)
+    if classes is None:
+        classes = np.zeros(len(scores), np.int32)
+    return np.asarray(
+        suppress_sorted(
+            np.ascontiguousarray(boxes[order], np.float32),
+            np.ascontiguousarray(classes[order], np.int32),
+            order,
+            np.float32(iou),
+            np.float32(extent),
+            len(scores) if limit is None else limit,
+        )
+    )

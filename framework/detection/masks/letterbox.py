@@ -1,4 +1,4 @@
-"""How an image of any shape lies in a network's input of fixed shape."""
+"""Placement of an image of any shape in a network's input of fixed shape."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from framework.data import Float32, UInt8
 
 
 class Placement(Enum):
-    """Where the resized image lies in the input; the rest is padded."""
+    """Position of the resized image in the input; the rest is padding."""
 
     top_left = "top_left"
     center = "center"
-    stretch = "stretch"  # it fills the input, and does not keep its aspect
+    stretch = "stretch"  # fills the input without keeping the aspect ratio
 
 
 @dataclass(frozen=True)
 class Letterbox:
-    """The resizing and shifting from an image to a network's input, axis by axis.
+    """Resizing and shifting from an image to a network's input, for each axis.
 
-    Networks measure in borders: 0 is the left border of the first pixel, W the right border of the last. Images here
-    have their pixel centres at integers, so that x_input = scale_x (u + 0.5) + left.
+    In the input, 0 is the left border of the first pixel. Images have pixel centers at integers. Therefore
+    x_input = scale_x (u + 0.5) + left.
     """
 
     input_shape: tuple[int, int]  # (height, width) px of the network's input
@@ -37,7 +37,7 @@ class Letterbox:
 
     @classmethod
     def fit(cls, image_shape: tuple[int, int], input_shape: tuple[int, int], placement: Placement) -> Letterbox:
-        """The largest place for an image of `image_shape` in `input_shape`, each (height, width)."""
+        """Fit an image into the input as large as possible; shapes are (height, width)."""
         height, width = image_shape
         resized = input_shape
         if placement is not Placement.stretch:
@@ -45,11 +45,11 @@ class Letterbox:
             resized = max(1, round(height * scale)), max(1, round(width * scale))
         centered = placement is Placement.center
         top, left = ((input_shape[k] - resized[k]) // 2 if centered else 0 for k in (0, 1))
-        # of the size in whole pixels: the wanted scale is a little off
+        # rounding to whole pixels changes the scale
         return cls(input_shape, resized, top, left, resized[1] / width, resized[0] / height)
 
     def fill(self, color: UInt8, padding: int) -> UInt8:
-        """The input (H, W, 3) for the image `color` (h, w, 3); `padding` is the value around it."""
+        """Return the input (H, W, 3) for the image `color` (h, w, 3), with the value `padding` around it."""
         height, width = self.resized
         canvas = np.full((*self.input_shape, 3), padding, np.uint8)
         canvas[self.top : self.top + height, self.left : self.left + width] = cv2.resize(
@@ -58,16 +58,16 @@ class Letterbox:
         return canvas
 
     def to_image(self, boxes: Float32) -> Float32:
-        """Boxes (N, 4) x1 y1 x2 y2 in the input, in borders, as borders in the image with centres at integers."""
+        """Return the borders (N, 4), px of the image, of boxes x1 y1 x2 y2 in the input."""
         shift = np.array([self.left, self.top] * 2)
         scale = np.array([self.scale_x, self.scale_y] * 2)
         return np.asarray((boxes - shift) / scale - 0.5, np.float32)
 
 
 def network_input(canvas: UInt8, dtype: str, bgr: bool, black: float, white: float) -> np.ndarray[Any, Any]:
-    """The image (H, W, 3), 0..255 RGB, as a network of this input dtype wants it: 0 becomes `black`, 255 `white`.
+    """Return an RGB image (H, W, 3) in a network's dtype, with 0 mapped to `black` and 255 to `white`.
 
-    An integer network takes 0..255 only.
+    A uint8 network gets 0..255.
     """
     image = canvas[..., ::-1] if bgr else canvas
     if dtype == "uint8":

@@ -1,41 +1,60 @@
-"""From boxes to masks by depth: what stands in front in a box, and holds together, is taken for the object.
+"""Masks from boxes and depth: the connected foreground of each box.
 
-A box detector says where an object is, not which pixels are its own. The rule, for each box:
+For each box:
 
-1. The readings inside are weighted by how near they lie to the box's centre, 1 there and 0 at its border, and counted
-   in a histogram over log depth, because sensor noise and the slant of surfaces per pixel grow with depth.
-2. A mode is a run of bins between two valleys, bins that hold less than `VALLEY` of the run's highest. The nearest mode
-   with at least `significance` of the weight is the foreground: a thin thing in front of the object does not have it,
-   and the wall behind is not the nearest.
-3. The foreground's pixels are connected to their four neighbours where a surface less slanted than `max_slant` explains
-   the difference in depth: z tan(max_slant) / f from one pixel to the next, and the sensor's noise, which grows with
-   z^2. The component with the most weight is the object: the one at the centre.
-4. What it encloses is closed where there is no reading, or where the hole is small.
-
-A box in which too few pixels have a reading has no mask: its object is not in front of anything that is known.
+1. Its depth readings, weighted from 1 at the box's center to 0 at its border, form a histogram over log depth, because
+   sensor noise and the depth step per pixel of a slanted surface grow with depth.
+2. A mode is a run of bins between two valleys, bins below `VALLEY` of the run's peak. The nearest mode with at least
+   `significance` of the weight is the foreground: thin things in front have less, and the wall behind is farther.
+3. Foreground pixels are connected to their four neighbors if a surface less slanted than `max_slant`, that is
+   z tan(max_slant) / f per pixel, and the sensor's noise explain the depth step. The heaviest component is the object.
+4. Its holes are closed if they have no readings or are small.
 """
 
 from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
 
 from framework.data import Bool, Camera, Float32
 from framework.detection.masks.masks_from_boxes_kernels import fill_masks
 
+LARGEST_CLOSED_HOLE = 0.01  # fraction of the box; the background is visible through larger holes with readings
+
 
 def masks_in_boxes(
     borders: Float32, depth: Float32, camera: Camera, significance: float, max_slant: float, min_readings: float
 ) -> tuple[Bool, Bool]:
-    """The masks (N, H, W) of the objects in boxes, and (N,) whether there was enough depth for one.
+    """Return the masks (N, H, W) of the objects in boxes, and (N,) True for boxes with enough depth; others are empty.
 
-    borders (N, 4) x1 y1 x2 y2 px with pixel centres at integers; depth (H, W) m, 0 = no reading. `significance`: share
-    of the centre-weighted readings that the foreground has at least. `max_slant`: degrees between the image plane and
-    a surface, at most. `min_readings`: share of the box's pixels in the image that must have a reading. A mask without
-    enough depth is empty.
+    Args:
+        borders: (N, 4) x1 y1 x2 y2 px, pixel centers at integers.
+        depth: (H, W) m, 0 = no reading.
+        camera: The camera of the depth image.
+        significance: Smallest fraction of the weighted readings in the foreground.
+        max_slant: Largest angle between the image plane and a surface, degrees.
+        min_readings: Smallest fraction of the box's pixels with a reading.
     """
-    masks = np.zeros((len(borders), *depth.shape), np.bool_)
+    height, width = depth.shape
+    masks = np.zeros((len(borders), height, width), np.bool_)
     step = math.tan(math.radians(max_slant)) / min(camera.fx, camera.fy)
-    found = fill_masks(np.ascontiguousarray(borders, np.float64), depth, significance, step, min_readings, masks)
+    borders = np.ascontiguousarray(borders, np.float64)
+    windows = np.clip(np.ceil(borders), 0, [width, height, width, height]).astype(np.int64)
+    found = fill_masks(borders, windows, depth, significance, step, min_readings, masks)
+    for i in np.flatnonzero(found):
+        u1, v1, u2, v2 = windows[i]
+        _close_holes(masks[i, v1:v2, u1:u2], depth[v1:v2, u1:u2] > 0)
     return masks, found
+
+
+def _close_holes(mask: Bool, has_reading: Bool) -> None:
+    """Add the holes of `mask` (h, w) that do not touch the border and have no readings or are small."""
+    count, component = cv2.connectedComponents((~mask).view(np.uint8), connectivity=4)
+    sizes = np.bincount(component.ravel(), minlength=count)
+    readings = np.bincount(component[has_reading], minlength=count)
+    closed = (readings == 0) | (sizes <= LARGEST_CLOSED_HOLE * mask.size)
+    closed[np.concatenate([component[0], component[-1], component[:, 0], component[:, -1]])] = False
+    closed[0] = True  # the mask itself
+    mask[:] = closed[component]

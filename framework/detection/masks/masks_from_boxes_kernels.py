@@ -7,21 +7,18 @@ from numba import njit
 
 from framework.sensors.noise_models import axial_sigma
 
-BIN = 0.02  # of log depth: 2 % of the depth
-FARTHEST = 100.0  # m, the end of the histogram
-NEAREST = 0.05  # m, its start; nearer readings are not counted
-VALLEY = 0.15  # share of a mode's peak below which a bin ends it
-NOISE = 3.0  # standard deviations of the depth's noise
-CLOSED_HOLE = 0.01  # share of the box: larger holes with readings are seen through
+BIN = 0.02  # of log depth: 2% of the depth
+NEAREST, FARTHEST = 0.05, 100.0  # m, range of the histogram
+VALLEY = 0.15  # fraction of a mode's peak below which a bin ends the mode
+NOISE = 3.0  # standard deviations of the depth noise
 
 
 @njit(cache=True, nogil=True)
-def fill_masks(borders, depth, significance, step, min_readings, masks):
-    n, height, width = masks.shape
-    found = np.zeros(n, np.bool_)
-    for i in range(n):
-        u0, v0 = max(0, int(np.ceil(borders[i, 0]))), max(0, int(np.ceil(borders[i, 1])))
-        u1, v1 = min(width, int(np.ceil(borders[i, 2]))), min(height, int(np.ceil(borders[i, 3])))
+def fill_masks(borders, windows, depth, significance, step, min_readings, masks):
+    """Write the object's mask of each box, holes included; `windows` (N, 4) are the boxes in whole pixels."""
+    found = np.zeros(len(masks), np.bool_)
+    for i in range(len(masks)):
+        u0, v0, u1, v1 = windows[i]
         if u1 <= u0 or v1 <= v0:
             continue
         window = depth[v0:v1, u0:u1]
@@ -38,14 +35,14 @@ def fill_masks(borders, depth, significance, step, min_readings, masks):
 
 @njit(cache=True, nogil=True)
 def _tent(start, end, first, stop):
-    """Weights of pixels first to stop - 1 along one axis of a box: 1 at its centre, 0 at its borders."""
+    """Return the weights of pixels first to stop - 1 along one axis of a box: 1 at its center, 0 at its borders."""
     center, half = 0.5 * (start + end), 0.5 * (end - start)
     return np.maximum(0.0, 1.0 - np.abs(np.arange(first, stop) - center) / half) + 1e-6
 
 
 @njit(cache=True, nogil=True)
 def _foreground(window, weight_x, weight_y, significance):
-    """The interval of depth (near, far), m, of the nearest significant mode; of the heaviest where none is."""
+    """Return the depth interval (near, far), m, of the nearest significant mode, else of the heaviest."""
     bins = int(np.log(FARTHEST / NEAREST) / BIN) + 1
     histogram = np.zeros(bins + 2)
     total = 0.0
@@ -68,7 +65,7 @@ def _foreground(window, weight_x, weight_y, significance):
         rising = True
         while last + 1 < len(smooth):
             following = smooth[last + 1]
-            # a valley: low against the peak, and it does not go on falling
+            # a valley: low compared with the peak, and no longer falling
             if following <= 0 or (following < VALLEY * peak and not rising and following > smooth[last]):
                 break
             rising = following >= smooth[last]
@@ -86,7 +83,7 @@ def _foreground(window, weight_x, weight_y, significance):
 
 @njit(cache=True, nogil=True)
 def _grow(window, weight_x, weight_y, near, far, step, mask):
-    """Writes the heaviest connected component of the pixels between near and far into `mask`, its holes closed."""
+    """Write the heaviest connected component of the pixels between near and far to `mask`."""
     height, width = window.shape
     label = np.zeros((height, width), np.int32)
     stack = np.empty((height * width, 2), np.int32)
@@ -118,39 +115,9 @@ def _grow(window, weight_x, weight_y, near, far, step, mask):
     for v in range(height):
         for u in range(width):
             mask[v, u] = label[v, u] == best
-    _close(window, mask, stack)
 
 
 @njit(cache=True, nogil=True)
 def _largest_step(z, step):
-    """The largest difference in depth, m, between neighbours of one surface at z m."""
+    """Return the largest difference in depth, m, between neighboring pixels of one surface at depth z m."""
     return step * z + NOISE * axial_sigma(z)
-
-
-@njit(cache=True, nogil=True)
-def _close(window, mask, stack):
-    """Adds to `mask` the holes that do not reach the window's border, and are without readings or small."""
-    height, width = mask.shape
-    seen = mask.copy()
-    for v0 in range(height):
-        for u0 in range(width):
-            if seen[v0, u0]:
-                continue
-            seen[v0, u0] = True
-            stack[0] = v0, u0
-            done, n, readings, enclosed = 0, 1, 0, True
-            while done < n:
-                v, u = stack[done]
-                done += 1
-                readings += window[v, u] > 0
-                if v == 0 or u == 0 or v == height - 1 or u == width - 1:
-                    enclosed = False
-                for dv, du in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-                    y, x = v + dv, u + du
-                    if 0 <= y < height and 0 <= x < width and not seen[y, x]:
-                        seen[y, x] = True
-                        stack[n] = y, x
-                        n += 1
-            if enclosed and (readings == 0 or n <= CLOSED_HOLE * mask.size):
-                for k in range(n):
-                    mask[stack[k, 0], stack[k, 1]] = True

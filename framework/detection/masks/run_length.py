@@ -1,8 +1,8 @@
-"""Masks as run lengths, in COCO's format: the lengths of the runs of 0 and 1 in turn, column by column.
+"""Masks as run lengths in COCO's format: the lengths of alternating runs of 0 and 1, column by column.
 
-In a file they are a list of numbers, or a string that packs them (pycocotools' `rleToString`): groups of five bits, the
-lowest first, each number from the third on as its difference to the one before the last. pycocotools packs and decodes;
-strings are checked here, for it leaves what a short one does not tell as it was in memory (seen in 2.0.11).
+In a file they are a list of numbers or a packed string (pycocotools' `rleToString`): groups of five bits, the lowest
+first, each number from the third on as its difference to the number two before it. pycocotools packs and decodes.
+Strings are checked here, because pycocotools leaves pixels after a short string uninitialized (seen in 2.0.11).
 """
 
 from __future__ import annotations
@@ -11,39 +11,34 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
+from pycocotools import mask as coco
 
 from framework.data import Bool, Int64
 from framework.errors import DataError
 
-FIRST_CHARACTER = 48  # stands for 0; each character carries five bits, and a sixth that says that more follow
+FIRST_CHARACTER = 48  # stands for 0; each character has five bits of the number, and a sixth if more follow
 MORE, SIGN, BITS = 0x20, 0x10, 5
 LONGEST = 7  # characters of one number: more bits than any image has pixels
 
 
 def encode(masks: Bool) -> list[bytes]:
-    """The packed run lengths of masks (N, H, W)."""
-    from pycocotools import mask as coco
-
+    """Return the packed run lengths of masks (N, H, W)."""
     columns_first = np.asfortranarray(masks.transpose(1, 2, 0).view(np.uint8))
     return [run["counts"] for run in coco.encode(columns_first)] if len(masks) else []
 
 
 def decode(counts: Sequence[bytes], shape: tuple[int, int]) -> Bool:
-    """The masks (N, H, W) of `shape` (height, width). `counts` are trusted: `check` what comes from a user."""
-    from pycocotools import mask as coco
-
+    """Return the masks (N, H, W) of `shape` (height, width); call `check` first for untrusted `counts`."""
     masks = np.zeros((len(counts), *shape), np.uint8)
     size = list(shape)
     for mask, packed in zip(masks, counts, strict=True):
-        # pycocotools answers column by column; OpenCV transposes several times faster than numpy
+        # pycocotools returns columns; OpenCV transposes several times faster than numpy
         cv2.transpose(coco.decode({"size": size, "counts": packed}).T, dst=mask)
     return masks.view(np.bool_)
 
 
 def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
-    """Run lengths as the packed string. Raises DataError unless they fill an image of `shape` (height, width)."""
-    from pycocotools import mask as coco
-
+    """Return run lengths as a packed string. Raises DataError unless they fill an image of `shape` (height, width)."""
     if not all(isinstance(length, int) and not isinstance(length, bool) for length in lengths):
         raise DataError("the run lengths must be whole numbers")
     _check_filled(np.array(lengths, np.float64), shape)
@@ -52,25 +47,25 @@ def pack(lengths: Sequence[int], shape: tuple[int, int]) -> bytes:
 
 
 def check(counts: bytes, shape: tuple[int, int]) -> None:
-    """Raises DataError unless packed run lengths fill an image of `shape` (height, width) exactly."""
+    """Raise DataError unless packed run lengths fill an image of `shape` (height, width) exactly."""
     _check_filled(unpack(counts), shape)
 
 
 def unpack(counts: bytes) -> Int64:
-    """The run lengths (R,) of a packed string. Raises DataError when it is not one."""
+    """Return the run lengths (R,) of a packed string. Raises DataError for other strings."""
     codes = np.frombuffer(counts, np.uint8).astype(np.int64) - FIRST_CHARACTER
     if not len(codes) or codes.min() < 0 or codes.max() >= 2 * MORE or codes[-1] & MORE:
         raise DataError("the run lengths are damaged: not a packed string of COCO's")
     ends = np.flatnonzero((codes & MORE) == 0)
     starts = np.concatenate([[0], ends[:-1] + 1])
-    place = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
-    if place.max() >= LONGEST:
+    position = np.arange(len(codes)) - np.repeat(starts, ends - starts + 1)
+    if position.max() >= LONGEST:
         raise DataError("the run lengths are damaged: a number is longer than any image")
-    numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * place), starts)
-    numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (place[ends] + 1)), 0)
+    numbers = np.add.reduceat((codes & (MORE - 1)) << (BITS * position), starts)
+    numbers -= np.where(codes[ends] & SIGN, 1 << (BITS * (position[ends] + 1)), 0)
     lengths = numbers.copy()
-    for first in (1, 2):
-        lengths[first::2] = np.cumsum(numbers[first::2])
+    for parity in (1, 2):
+        lengths[parity::2] = np.cumsum(numbers[parity::2])
     return np.asarray(lengths, np.int64)
 
 

@@ -1,8 +1,8 @@
-"""Networks that Caffe2 wrote in 8-bit integers, computed in these integers on a CPU, or in float on any device.
+"""Networks written by Caffe2 in 8-bit integers, computed in these integers on a CPU or in float on any device.
 
-A number q of a blob stands for scale * (q - zero point) (Jacob et al., "Quantization and Training of Neural Networks
-for Efficient Integer-Arithmetic-Only Inference", 2018). Convolutions of integers are oneDNN's, through torch, on
-x86 processors with VNNI: on others, sums of products of 8 bits overflow 16 bits.
+An integer q of a blob stands for scale * (q - zero point) (Jacob et al., "Quantization and Training of Neural Networks
+for Efficient Integer-Arithmetic-Only Inference", 2018). Integer convolutions are oneDNN's, through torch, on x86
+processors with VNNI: on others, sums of 8-bit products overflow 16 bits.
 """
 
 from __future__ import annotations
@@ -18,19 +18,20 @@ from torch import Tensor
 from torch.nn import functional
 
 from framework.data import Array
-from framework.detection.runtimes.quantization import MOST, round_to_bytes
+from framework.detection.runtimes.caffe2_network_kernels import MOST, round_to_bytes
 from framework.errors import DataError
 
 Operator = Mapping[str, Any]  # type, inputs (blobs, then weights), outputs (one blob), args
 Tensors = Mapping[str, Tensor]  # float32; kernels are (out, in, h, w), those of transposed convolutions (in, out, h, w)
 Run = Callable[..., Tensor]  # from an operator's blobs (N, C, H, W) to its output
+Window = tuple[list[int], list[int], list[int], int]  # strides, pads, dilations, groups
 
 CONVOLUTIONS = ("Int8Conv", "Int8ConvRelu")
-MOST_OF_WEIGHTS = 127  # of int8, which oneDNN wants to be symmetric about 0
+MOST_OF_WEIGHTS = 127  # of int8, which oneDNN requires to be symmetric about 0
 
 
 class Step(NamedTuple):
-    """What one operator does."""
+    """The computation of one blob."""
 
     run: Run
     inputs: tuple[str, ...]  # blobs
@@ -39,7 +40,7 @@ class Step(NamedTuple):
 
 @dataclass(frozen=True)
 class Network:
-    """The steps that compute the blobs `outputs` from the blobs `inputs`, all of which are float32."""
+    """The steps that compute the blobs `outputs` from the blobs `inputs`, all of them float32."""
 
     steps: tuple[Step, ...]
     inputs: tuple[str, ...]
@@ -52,28 +53,28 @@ class Network:
         return tuple(blobs[name] for name in self.outputs)
 
 
-class Quantisation(NamedTuple):
-    """What the numbers of a blob stand for."""
+class Quantization(NamedTuple):
+    """Scale and zero point of a blob's integers."""
 
     scale: float
     zero_point: int
 
-    def quantised(self, x: Tensor) -> Tensor:
-        """uint8, rounded to the nearest, of x (N, C, H, W) on the CPU."""
+    def quantize(self, x: Tensor) -> Tensor:
+        """Return x (N, C, H W) on the CPU as uint8, rounded to nearest."""
         channels_last = x.permute(0, 2, 3, 1).contiguous()
         rounded = torch.empty_like(channels_last, dtype=torch.uint8)
         flat = channels_last.numpy().reshape(-1), rounded.numpy().reshape(-1)
         round_to_bytes(*flat, np.float32(1 / self.scale), np.float32(self.zero_point))
         return rounded.permute(0, 3, 1, 2)
 
-    def real(self, q: Tensor) -> Tensor:
+    def dequantize(self, q: Tensor) -> Tensor:
         return (q.float() - self.zero_point) * self.scale
 
 
-def dequantised(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
-    """scale * (q - zero point) as float32, kernels from (out, h, w, in) or, transposed, (in, h, w, out) to torch's.
+def dequantized_weights(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
+    """Return scale * (q - zero point) as float32; kernels (out, h, w, in) and (in, h, w, out) get torch's axis order.
 
-    Without a scale the values are numbers already.
+    `scale_zero`: None = the values are not quantized.
     """
     if scale_zero is None:
         return torch.from_numpy(values)
@@ -84,56 +85,46 @@ def dequantised(values: Array, scale_zero: tuple[float, int] | None) -> Tensor:
 
 @cache
 def has_int8_kernels() -> bool:
-    """Whether torch computes convolutions of integers here, and the largest numbers right."""
+    """Return whether torch computes integer convolutions on this processor, and the largest values correctly."""
     has_mkldnn = torch.backends.mkldnn.is_available()  # type: ignore[no-untyped-call]
     if not has_mkldnn or torch.backends.quantized.engine != "x86":
         return False
     channels = 16
     kernel = torch.full((1, channels, 1, 1), float(MOST_OF_WEIGHTS))
     window = [1, 1], [0, 0], [1, 1], 1
-    convolution = Int8Convolution(kernel, torch.zeros(1), 1.0, window, Quantisation(1.0, 0), None, False)
-    found = convolution(torch.full((1, channels, 8, 8), MOST, dtype=torch.uint8))
+    convolve = _int8_convolution(kernel, torch.zeros(1), 1.0, window, Quantization(1.0, 0), None, False)
+    found = convolve(torch.full((1, channels, 8, 8), MOST, dtype=torch.uint8))
     return bool((found == channels * MOST_OF_WEIGHTS * MOST).all())
 
 
-def float_network(
-    graph: list[Operator], tensors: Tensors, inputs: tuple[str, ...], outputs: tuple[str, ...]
-) -> Network:
-    """The part of a graph between some blobs in float: the weights' integers as they are, and no rounding between.
-
-    Raises DataError for an operator that is not known.
-    """
-    steps = [
-        Step(_in_float(operator, tensors), _blobs(operator, tensors), operator["outputs"][0])
-        for operator in _between(graph, tensors, inputs, outputs)
-    ]
-    return Network(tuple(steps), inputs, outputs)
-
-
-def int8_network(
+def network_between(
     graph: list[Operator],
     tensors: Tensors,
-    spacings: Mapping[str, float],
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
+    spacings: Mapping[str, float] | None = None,
 ) -> Network:
-    """The same in integers; `spacings` has the distance between neighboring numbers of each kernel.
+    """Return the part of a graph between some blobs.
 
-    As the graph has it, but for what costs little: the few linear channels from block to block (Sandler et al.,
-    "MobileNetV2", 2018), whose rounding errors would add up, what leaves the network, means, fully connected layers
-    and transposed convolutions are not rounded. Mask R-CNN 2Go's features are off by 0.037 of their standard deviation
-    from those in float (six frames of redkitchen and replica_floor2).
+    `spacings`: the kernels' quantization steps for convolutions in integers; None = float, with quantized weights but
+    no rounding between operators. In integers, these are not rounded either, at little cost: the linear channels
+    between blocks (Sandler et al., "MobileNetV2", 2018), whose rounding errors would add up, the outputs, means, fully
+    connected layers and transposed convolutions.
 
-    Raises DataError for an operator that is not known.
+    Raises DataError for an unknown operator.
     """
-    steps = _int8_steps(_between(graph, tensors, inputs, outputs), tensors, spacings, outputs)
+    operators = _between(graph, tensors, inputs, outputs)
+    if spacings is None:
+        steps = [Step(_in_float(one, tensors), _blobs(one, tensors), one["outputs"][0]) for one in operators]
+    else:
+        steps = [*_int8_steps(operators, tensors, spacings, outputs)]
     return Network(tuple(steps), inputs, outputs)
 
 
 def _between(
     graph: list[Operator], tensors: Tensors, inputs: tuple[str, ...], outputs: tuple[str, ...]
 ) -> list[Operator]:
-    """The operators that the outputs need, in order."""
+    """Return the operators that the outputs need, in order."""
     needed, found = set(outputs), []
     for operator in reversed(graph):
         name = operator["outputs"][0]
@@ -148,25 +139,12 @@ def _blobs(operator: Operator, tensors: Tensors) -> tuple[str, ...]:
 
 
 def _weights(operator: Operator, tensors: Tensors) -> tuple[Tensor, ...]:
-    """Those of an operator that has any: kernel and bias."""
+    """Return kernel and bias, or nothing for an operator without weights."""
     return tuple(tensors[name] for name in operator["inputs"] if name in tensors)
 
 
 def _in_float(operator: Operator, tensors: Tensors) -> Run:
     kind, args = operator["type"], operator["args"]
-    weights = _weights(operator, tensors)
-    if kind in CONVOLUTIONS:
-        weight, bias = weights
-        stride, pad, group = args["stride"], args["pad"], args.get("group", 1)
-        if kind == "Int8Conv":
-            return lambda x: functional.conv2d(x, weight, bias, stride, pad, 1, group)
-        return lambda x: functional.conv2d(x, weight, bias, stride, pad, 1, group).relu_()
-    if kind == "Int8ConvTranspose":
-        weight, bias = weights
-        return lambda x: functional.conv_transpose2d(x, weight, bias, args["stride"], args["pad"])
-    if kind == "Int8FC":
-        weight, bias = weights
-        return lambda x: functional.linear(x.flatten(1), weight, bias)
     if kind == "Int8AveragePool":
         return lambda x: functional.avg_pool2d(x, args["kernel"], args["stride"])
     if kind == "Int8Sum":
@@ -175,80 +153,78 @@ def _in_float(operator: Operator, tensors: Tensors) -> Run:
         return torch.relu
     if kind == "Int8Quantize":
         return lambda x: x
-    raise DataError(f"graph.json: the operator {kind} is not known")
+    if kind not in (*CONVOLUTIONS, "Int8ConvTranspose", "Int8FC"):
+        raise DataError(f"graph.json: the operator {kind} is not known")
+    weight, bias = _weights(operator, tensors)
+    if kind == "Int8FC":
+        return lambda x: functional.linear(x.flatten(1), weight, bias)
+    stride, pad, group = args["stride"], args["pad"], args.get("group", 1)
+    if kind == "Int8ConvTranspose":
+        return lambda x: functional.conv_transpose2d(x, weight, bias, stride, pad)
+    if kind == "Int8Conv":
+        return lambda x: functional.conv2d(x, weight, bias, stride, pad, 1, group)
+    return lambda x: functional.conv2d(x, weight, bias, stride, pad, 1, group).relu_()
 
 
 def _int8_steps(
     operators: list[Operator], tensors: Tensors, spacings: Mapping[str, float], outputs: tuple[str, ...]
 ) -> Iterator[Step]:
-    quantisations = {
-        operator["outputs"][0]: Quantisation(operator["args"]["Y_scale"], operator["args"]["Y_zero_point"])
+    quantizations = {
+        operator["outputs"][0]: Quantization(operator["args"]["Y_scale"], operator["args"]["Y_zero_point"])
         for operator in operators
     }
     in_integers: set[str] = set()  # blobs that are uint8; the others are float32
-    rounded: dict[str, str] = {}  # blobs in float to their names in integers
+    converted: dict[str, str] = {}  # blobs to their names in the other type
     for operator in operators:
         kind, name, blobs = operator["type"], operator["outputs"][0], _blobs(operator, tensors)
-        if kind in CONVOLUTIONS and name not in outputs:
-            (blob,) = blobs
-            if blob not in quantisations:
+        on_integers = kind in CONVOLUTIONS and name not in outputs
+        for blob in blobs:
+            if on_integers and blob not in quantizations:
                 raise DataError(f"graph.json: {blob} goes into a convolution, and its integers have no scale")
-            if blob not in in_integers and blob not in rounded:
-                rounded[blob] = f"{blob}, rounded"
-                yield Step(quantisations[blob].quantised, blobs, rounded[blob])
-            linear = kind == "Int8Conv" and operator["args"].get("group", 1) == 1
-            if not linear:
-                in_integers.add(name)
-            spacing = spacings[operator["inputs"][1]]
-            run = _in_integers(operator, tensors, spacing, quantisations[blob], None if linear else quantisations[name])
-            yield Step(run, (rounded.get(blob, blob),), name)
-        else:
-            real = tuple(quantisations[blob].real if blob in in_integers else _same for blob in blobs)
-            yield Step(_composed(_in_float(operator, tensors), real), blobs, name)
+            if blob not in converted and (blob in in_integers) != on_integers:
+                converted[blob] = f"{blob}, converted"
+                convert = quantizations[blob].quantize if on_integers else quantizations[blob].dequantize
+                yield Step(convert, (blob,), converted[blob])
+        sources = tuple(converted[blob] if (blob in in_integers) != on_integers else blob for blob in blobs)
+        if not on_integers:
+            yield Step(_in_float(operator, tensors), sources, name)
+            continue
+        args, group = operator["args"], operator["args"].get("group", 1)
+        linear = kind == "Int8Conv" and group == 1
+        if not linear:
+            in_integers.add(name)
+        kernel, bias = _weights(operator, tensors)
+        window = [args["stride"]] * 2, [args["pad"]] * 2, [1, 1], group
+        result = None if linear else quantizations[name]
+        spacing, relu = spacings[operator["inputs"][1]], kind == "Int8ConvRelu"
+        run = _int8_convolution(kernel, bias, spacing, window, quantizations[blobs[0]], result, relu)
+        yield Step(run, sources, name)
 
 
-def _same(x: Tensor) -> Tensor:
-    return x
-
-
-def _composed(run: Run, before: tuple[Run, ...]) -> Run:
-    return lambda *blobs: run(*(real(blob) for real, blob in zip(before, blobs, strict=True)))
-
-
-def _in_integers(
-    operator: Operator, tensors: Tensors, spacing: float, source: Quantisation, result: Quantisation | None
+def _int8_convolution(
+    kernel: Tensor,
+    bias: Tensor,
+    spacing: float,
+    window: Window,
+    source: Quantization,
+    result: Quantization | None,
+    relu: bool,
 ) -> Run:
-    """A convolution from uint8 to uint8 or, without `result`, to float32; `spacing` is the kernel's."""
-    args = operator["args"]
-    kernel, bias = _weights(operator, tensors)
-    window = [args["stride"]] * 2, [args["pad"]] * 2, [1, 1], args.get("group", 1)
-    return Int8Convolution(kernel, bias, spacing, window, source, result, operator["type"] == "Int8ConvRelu")
+    """Return oneDNN's convolution (out, in, h, w) from uint8 to uint8 or, with `result` None, to float32.
 
+    The kernel's integers, `spacing` apart, are kept in all channels where they fit into int8 (30,194 of 2Go's 30,381);
+    the other channels are rounded to a coarser step.
+    """
+    scales = torch.clamp(kernel.abs().amax(dim=(1, 2, 3)) / MOST_OF_WEIGHTS, min=spacing)
+    integers = torch.round(kernel / scales[:, None, None, None]).to(torch.int8)
+    packed = torch.ops.onednn.qconv_prepack(integers, scales, *source, *window, None)
+    zeros = torch.zeros(len(scales), dtype=torch.int32)
+    before = *source, packed, scales, zeros, bias.contiguous(), *window
+    kind: tuple[Any, ...] = (1.0, 0, torch.float32) if result is None else (*result, torch.uint8)
+    after = *kind, "relu" if relu else "none", list[Any](), ""
 
-class Int8Convolution:
-    """A convolution (out, in, h, w) of integers by oneDNN."""
-
-    def __init__(
-        self,
-        kernel: Tensor,
-        bias: Tensor,
-        spacing: float,
-        window: tuple[list[int], list[int], list[int], int],  # strides, pads, dilations, groups
-        source: Quantisation,
-        result: Quantisation | None,
-        relu: bool,
-    ) -> None:
-        """The kernel's integers stay as they are in all channels where they fit into int8, in 30,194 of 2Go's 30,381;
-        in the others they are rounded to numbers that lie farther apart.
-        """
-        scales = torch.clamp(kernel.abs().amax(dim=(1, 2, 3)) / MOST_OF_WEIGHTS, min=spacing)
-        integers = torch.round(kernel / scales[:, None, None, None]).to(torch.int8)
-        packed = torch.ops.onednn.qconv_prepack(integers, scales, *source, *window, None)
-        zeros = torch.zeros(len(scales), dtype=torch.int32)
-        self._before = *source, packed, scales, zeros, bias.contiguous(), *window
-        kind: tuple[Any, ...] = (1.0, 0, torch.float32) if result is None else (*result, torch.uint8)
-        self._after = *kind, "relu" if relu else "none", list[Any](), ""
-
-    def __call__(self, q: Tensor) -> Tensor:
-        found: Tensor = torch.ops.onednn.qconv2d_pointwise(q, *self._before, *self._after)
+    def convolve(q: Tensor) -> Tensor:
+        found: Tensor = torch.ops.onednn.qconv2d_pointwise(q, *before, *after)
         return found
+
+    return convolve

@@ -1,36 +1,43 @@
-"""Where a network runs."""
+"""Device, precision and threads of a torch network."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import Lock
+from typing import Any
 
 import torch
 
 from framework.config.validation import require
 
 _changing = Lock()
-_before: list[int] = []  # torch's number of threads before, once for each thread that is within one_torch_thread()
+_before: list[int] = []  # torch's number of threads before, once for each thread inside one_torch_thread()
 
 
 def torch_device(device: str, name: str = "detector.device") -> torch.device:
-    """What `device` (auto, cpu or cuda) means here; auto = cuda where there is one.
+    """Return the device for auto, cpu or cuda; auto = cuda if available.
 
-    Raises ConfigError, naming the parameter, for another word and for cuda without a GPU.
+    Raises ConfigError, naming the parameter, for other words and for cuda without a GPU.
     """
     require(device in ("auto", "cpu", "cuda"), name, device, "auto, cpu or cuda")
-    there = torch.cuda.is_available()
-    require(device != "cuda" or there, name, device, "cpu or auto without a GPU")
-    return torch.device("cuda" if device != "cpu" and there else "cpu")
+    available = torch.cuda.is_available()
+    require(device != "cuda" or available, name, device, "cpu or auto without a GPU")
+    return torch.device("cuda" if device != "cpu" and available else "cpu")
+
+
+def ready(network: Any, device: torch.device, half_precision: bool) -> Any:
+    """Return the network in inference mode on the device, in half precision only on CUDA."""
+    dtype = torch.float16 if half_precision and device.type == "cuda" else torch.float32
+    return network.to(device, dtype).eval()
 
 
 @contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """Has torch compute in the calling thread alone: what is short is done before others have woken up.
+    """Let torch compute in the calling thread alone: short operations end before other threads wake up.
 
-    Several threads may be within at once. Torch keeps the number by thread, and a thread gets the one that was set last
-    by any when it first asks: so each asks before it sets its own, and whoever leaves sets the one from before.
+    Several threads may be inside at once. Torch stores the number per thread, and a thread gets the number that any
+    thread set last when it first asks. So each thread asks before it sets its own, and restores the number on exit.
     """
     with _changing:
         asked = torch.get_num_threads()

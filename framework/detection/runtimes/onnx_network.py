@@ -1,44 +1,51 @@
-"""A network in an ONNX file, run by onnxruntime."""
+"""Networks in ONNX files, run by onnxruntime, for images of fixed and of any shape."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import cv2
 import numpy as np
 
-from framework.data import Array, Float32
-from framework.errors import ConfigError, DataError, in_one_line
+from framework.config.validation import LONGEST_SIDE, require
+from framework.data import Array, Float32, UInt8
+from framework.detection.masks.letterbox import Letterbox, Placement, network_input
+from framework.errors import ConfigError, DataError, import_optional, in_one_line
 from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
 if TYPE_CHECKING:
     from onnxruntime import InferenceSession, NodeArg
 
+Outputs = dict[str, Float32]
 Shape = tuple[int, ...]  # 0 = any
 INPUT_DTYPES = {"tensor(float)": "float32", "tensor(float16)": "float16", "tensor(uint8)": "uint8"}  # numpy's names
+CUDA = "CUDAExecutionProvider"
 
 
 class OnnxNetwork:
     """A network from one image to named arrays, on the CPU or with CUDA.
 
-    It takes as many threads as OpenCV, which `threads` of the config sets: onnxruntime would take all cores. Its idle
-    threads sleep, because the map is built at the same time.
+    It uses as many threads as OpenCV (`threads` of the config), because onnxruntime would take all cores. Idle threads
+    sleep, because the map is built at the same time.
     """
 
     def __init__(self, path: Path, sha256: str, device: str, input_size: int) -> None:
-        """Loads the network of the file `path`; see `find_file` for a relative one.
+        """Load the network of the file `path`; see `find_file` for a relative path.
 
-        sha256: what the file must have, "" = whatever it is. device: auto, cpu or cuda. input_size: px, the side of
-        the square input of a network that takes any size, 0 for one with a size of its own.
+        Args:
+            path: The ONNX file.
+            sha256: The expected hash; "" = any.
+            device: auto, cpu or cuda.
+            input_size: Side of the square input, px, of a network that takes any size; 0 = the network's own size.
 
         Raises:
-            DataError: the file is missing, damaged, not the expected one, or cannot be run.
-            ConfigError: onnxruntime or the device is not there, or `input_size` does not fit the network.
+            DataError: The file is missing, damaged, not the expected one, or cannot be run.
+            ConfigError: onnxruntime or the device is missing, or `input_size` does not fit the network.
         """
         self.path = find_file(path)
         self.sha256 = checked_hash(self.path, sha256)
@@ -54,25 +61,77 @@ class OnnxNetwork:
         self.shape = _input_shape(self.path, image, self.channels_last, input_size, self.metadata)
 
     def __call__(self, image: Array) -> Outputs:
-        """The outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
+        """Return the outputs by name, in float32, for an image (H, W, 3) of the network's `shape` and dtype.
 
-        Raises DataError when the network fails or computes numbers that are not finite.
+        Raises DataError if the network fails or its outputs are not finite.
         """
         blob = image[None] if self.channels_last else image.transpose(2, 0, 1)[None]
         names = [output.name for output in self._session.get_outputs()]
         try:
-            outputs = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
-        except Exception as error:  # onnxruntime has no base of its own
-            raise DataError(f"{self.path} failed in onnxruntime: {one_line(error)}") from error
-        return finite_outputs(self.path, zip(names, outputs, strict=True))
+            arrays = self._session.run(names, {self._name: np.ascontiguousarray(blob)})
+        except Exception as error:  # onnxruntime's errors have no common base
+            raise DataError(f"{self.path} failed in onnxruntime: {in_one_line(error)}") from error
+        outputs = {name: np.asarray(array, np.float32) for name, array in zip(names, arrays, strict=True)}
+        for name, array in outputs.items():
+            if not np.isfinite(array).all():
+                raise DataError(f"{self.path}: the output {name} holds values that are not finite")
+        return outputs
+
+
+class ImageNetworkParameters(Protocol):
+    """The parameters that detectors with an image network share; see their fields."""
+
+    weights: Path
+    sha256: str
+    input_size: int
+    placement: Placement
+    padding: int
+    bgr: bool
+    black_level: float
+    white_level: float
+    device: str
+
+
+class ImageNetwork:
+    """An ONNX network with the preparation of images of any shape, which are fitted into its input."""
+
+    def __init__(self, detector: ImageNetworkParameters) -> None:
+        """Load the network. Raises ConfigError for a parameter out of its bounds, and the errors of `OnnxNetwork`."""
+        path, device, black, white = detector.weights, detector.device, detector.black_level, detector.white_level
+        require(len(detector.sha256) in (0, 64), "detector.sha256", detector.sha256, "64 hexadecimal digits, or empty")
+        allowed = f"0 (the network's own) or positive px, at most {LONGEST_SIDE}"
+        require(0 <= detector.input_size <= LONGEST_SIDE, "detector.input_size", detector.input_size, allowed)
+        require(0 <= detector.padding <= 255, "detector.padding", detector.padding, "in [0, 255]")
+        finite = bool(np.isfinite([black, white]).all())
+        require(finite and black != white, "detector.white_level", white, f"not {black}")
+        require(device in ("auto", "cpu", "cuda"), "detector.device", device, "auto, cpu or cuda")
+        onnx = "an ONNX file; convert a .tflite file with tf2onnx (docs/guides/detectors.md)"
+        require(path.suffix.lower() != ".tflite", "detector.weights", path, onnx)
+        self._network = OnnxNetwork(path, detector.sha256, device, detector.input_size)
+        levels = f"{black} and {white}"
+        fits = self._network.dtype != "uint8" or (black, white) == (0, 255)
+        require(fits, "detector.black_level and white_level", levels, "0 and 255 for a network of integers")
+        self.shape = self._network.shape  # (height, width) px
+        self.channels_last = self._network.channels_last  # the input is (1, H, W, 3)
+        self.metadata = self._network.metadata
+        self._detector = detector
+
+    def __call__(self, color: UInt8) -> tuple[Outputs, Letterbox]:
+        """Return the outputs by name for an RGB image (h, w, 3), and the placement of the image in the input."""
+        detector = self._detector
+        letterbox = Letterbox.fit(color.shape[:2], self.shape, detector.placement)
+        canvas, levels = letterbox.fill(color, detector.padding), (detector.black_level, detector.white_level)
+        return self._network(network_input(canvas, self._network.dtype, detector.bgr, *levels)), letterbox
+
+    def outputs_for_black(self) -> Outputs:
+        """Return the outputs for a black image, so that a detector can check their form when it is built."""
+        outputs, _ = self(np.zeros((*self.shape, 3), np.uint8))
+        return outputs
 
 
 def _loaded(path: Path, device: str) -> InferenceSession:
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise ConfigError("onnxruntime, which runs ONNX files, is not there: pip install instancemap[onnx]") from error
-    cuda = "CUDAExecutionProvider" in onnxruntime.get_available_providers()
+    onnxruntime = import_optional("onnxruntime", "runs ONNX files", "onnx")
+    cuda = CUDA in onnxruntime.get_available_providers()
     if device == "cuda" and not cuda:
         raise ConfigError("detector.device must be cpu or auto without onnxruntime-gpu and a GPU, found cuda")
     options = onnxruntime.SessionOptions()
@@ -80,18 +139,18 @@ def _loaded(path: Path, device: str) -> InferenceSession:
     options.inter_op_num_threads = 1
     options.log_severity_level = 3  # errors
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    providers = ["CUDAExecutionProvider"] * (cuda and device != "cpu") + ["CPUExecutionProvider"]
+    providers = [CUDA] * (cuda and device != "cpu") + ["CPUExecutionProvider"]
     try:
         session = onnxruntime.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:  # onnxruntime has no base of its own
-        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {one_line(error)}") from error
-    if device == "cuda" and "CUDAExecutionProvider" not in session.get_providers():
+    except Exception as error:  # onnxruntime's errors have no common base
+        raise DataError(f"{path} is not an ONNX file that onnxruntime can load: {in_one_line(error)}") from error
+    if device == "cuda" and CUDA not in session.get_providers():
         raise ConfigError("detector.device must be cpu or auto where CUDA cannot be started, found cuda")
     return session
 
 
 def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]:
-    """The only input, an image, and its shape. Raises DataError for a network with other inputs."""
+    """Return the only input, an image, and its shape. Raises DataError for other inputs."""
     found = ", ".join(map(_described, inputs))
     wanted = "expected one image (1, 3, H, W) or (1, H, W, 3)"
     if len(inputs) != 1:
@@ -105,10 +164,7 @@ def _image_input(path: Path, inputs: Sequence[NodeArg]) -> tuple[NodeArg, Shape]
 def _input_shape(
     path: Path, image: NodeArg, channels_last: bool, input_size: int, metadata: ExportMetadata
 ) -> tuple[int, int]:
-    """(height, width) in px of a network's input of this shape, 0 = any.
-
-    What is open comes from `input_size`, else from what the file says that it was exported for.
-    """
+    """Return (height, width) px of the input; open dimensions come from `input_size`, else from the file's metadata."""
     shape, described = _shape(image), _described(image)
     height, width = shape[1:3] if channels_last else shape[2:]
     if height and width:
@@ -129,21 +185,20 @@ def _described(tensor: NodeArg) -> str:
 
 
 def _shape(tensor: NodeArg) -> Shape:
-    """With 0 for any: such a dimension has a name, or none."""
-    return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)
+    return tuple(n if isinstance(n, int) else 0 for n in tensor.shape)  # an open dimension has a name, or None
 
 
-def find_file(path: Path, parameter: str = "detector.weights") -> Path:
-    """The file `path` of a parameter. A relative one is tried from the working folder, then from the project's."""
+def find_file(path: Path) -> Path:
+    """Return the file `path`; a relative path is searched in the working, then in the project folder."""
     for candidate in candidates(path):
         if candidate.is_file():
             return candidate
-    looked = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
-    raise DataError(f"{parameter}: there is no file {looked}; put the network there, or name another")
+    searched = " or ".join(str(candidate.resolve()) for candidate in candidates(path))
+    raise DataError(f"detector.weights: there is no file {searched}; put the network there, or name another")
 
 
 def checked_hash(path: Path, sha256: str) -> str:
-    """The SHA-256 (hex) of a file. Raises DataError when it cannot be read, or is not `sha256`; "" = whatever it is."""
+    """Return the SHA-256 (hex) of a file. Raises DataError if it is not `sha256`; "" = any."""
     try:
         found = path_hash(path)
     except OSError as error:
@@ -155,20 +210,20 @@ def checked_hash(path: Path, sha256: str) -> str:
 
 @dataclass(frozen=True)
 class ExportMetadata:
-    """Of a file that says nothing, or says it otherwise, all is empty."""
+    """Metadata that the exporter wrote to the file; empty if missing or in another form."""
 
     names: tuple[str, ...] = ()  # of the classes, in the order of the scores
-    image_size: tuple[int, int] = (0, 0)  # (height, width) px that it was exported for, 0 = not said
+    image_size: tuple[int, int] = (0, 0)  # (height, width) px of the export; 0 = unknown
     author: str = ""
 
     @classmethod
     def parse(cls, texts: Mapping[str, str]) -> ExportMetadata:
-        """From the file's own pairs, whose values are Python's or JSON's literals."""
+        """Parse the file's key-value pairs, whose values are Python or JSON literals."""
         return cls(_names(texts.get("names", "")), _size(texts.get("imgsz", "")), texts.get("author", ""))
 
 
 def _names(text: str) -> tuple[str, ...]:
-    """{0: "person", ...}, with numbers or numerals as keys."""
+    """Return the names of {0: "person", ...}, with numbers or numerals as keys."""
     names = _literal(text)
     if not isinstance(names, dict):
         return ()
@@ -177,7 +232,7 @@ def _names(text: str) -> tuple[str, ...]:
 
 
 def _size(text: str) -> tuple[int, int]:
-    """[height, width], or one number for both."""
+    """Return (height, width) of [height, width] or of one number for both."""
     sides = _literal(text)
     height, width = sides if isinstance(sides, list) and len(sides) == 2 else (sides, sides)
     if isinstance(height, int) and isinstance(width, int) and height > 0 and width > 0:
@@ -190,20 +245,3 @@ def _literal(text: str) -> object:
         return ast.literal_eval(text)
     except (ValueError, SyntaxError, MemoryError, RecursionError):
         return None
-
-
-Outputs = dict[str, Float32]
-
-
-def finite_outputs(path: Path, named: Iterable[tuple[str, Array]]) -> Outputs:
-    """The outputs by name in float32. Raises DataError when one holds numbers that are not finite."""
-    outputs = {name: np.asarray(array, np.float32) for name, array in named}
-    for name, array in outputs.items():
-        if not np.isfinite(array).all():
-            raise DataError(f"{path}: the output {name} holds values that are not finite")
-    return outputs
-
-
-def one_line(error: Exception) -> str:
-    """The beginning of what a library's exception says, for a message: some add a whole trace."""
-    return in_one_line(error)[:300]

@@ -1,4 +1,4 @@
-"""Detections that were computed before: an ablation over refiners and fusers runs its network once."""
+"""Cache of detections on disk: an ablation over refiners and fusers runs its network once."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 from omegaconf import DictConfig
+from pycocotools import mask as coco
 
 from framework.config.validation import checked_path
-from framework.data import Bool, DeferredTruth, Detections, Frame, FrameTruth, Int32
-from framework.detection.domain import domain_of
+from framework.data import DeferredTruth, Detections, Frame, FrameTruth
 from framework.detection.masks.binary_masks import tight_boxes
 from framework.detection.stored.fingerprint import fingerprint
 from framework.errors import ConfigError, DataError
@@ -25,13 +25,13 @@ from framework.interfaces import Detector
 
 log = logging.getLogger(__name__)
 
-FORMAT = 2  # of the entries: another one makes other keys, so that no entry is ever misread
-CHECKSUM_BYTES = 32  # SHA-256 of an entry's place and content, before the content
+FORMAT = 2  # of the entries; part of the keys, so that entries of another format are never found
+CHECKSUM_BYTES = 32  # SHA-256 of an entry's name and content, in front of the content
 SUFFIX = ".detections"
 LARGEST_ENTRY = 2**30  # bytes; a thousand masks of 1 MB of run lengths
-FRAME_FIELDS = tuple(field.name for field in fields(Frame))
 EMBEDDINGS, SPACE = "embeddings", "embedding_space"  # of Detections, in entries that have them
-KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored as they are
+FRAME_FIELDS = tuple(field.name for field in fields(Frame))
+KEPT = ("boxes", "scores", "class_probabilities")  # of Detections: arrays that are stored unchanged
 
 
 class CacheMode(Enum):
@@ -44,29 +44,28 @@ class CacheMode(Enum):
 
 @runtime_checkable
 class ReadsFields(Protocol):
-    """A detector that looks at some fields of a frame only, and so shares more of the cache."""
+    """A detector whose detections depend only on some fields of a frame, so that more frames share an entry."""
 
     reads: tuple[str, ...]  # names of fields of Frame
 
 
 @runtime_checkable
 class Fingerprinted(Protocol):
-    """A detector that gets weights by a name from the network, or through an address in a str: it adds their hash."""
+    """A detector whose weights are not identified by its parameters, for example a name on the network."""
 
     def fingerprint(self) -> str:
-        """A hash of all that the detections depend on beside the frame, `fingerprint(self)` included."""
+        """Return a hash of everything besides the frame that the detections depend on, `fingerprint(self)` included."""
 
 
 @dataclass
 class CachedDetector(Detector):
-    """Answers from a folder for the frames that `detector` has seen before, to the bit; asks it for the others.
+    """Returns stored detections, byte-identical, for frames that `detector` has seen before.
 
-    An entry is found by what the answer depends on: the detector's fingerprint, its classes, and the fields of the
-    frame that it reads, all unless it says so. So a changed parameter, weight or image misses, and the same image of
-    another video hits.
-    Several processes may share a folder: entries are written whole, and two that write one write the same. A damaged
-    entry is named in the log and computed again. Entries are never removed here; whoever needs the disk may delete any.
-    It takes one frame at a time, whatever `detector` can: of equal frames at once, each would count as a miss.
+    The key of an entry consists of the detector's fingerprint, its classes, and the fields of the frame that it reads.
+    So another parameter, weight or image misses, and the same image in another video hits. Several processes may share
+    a folder: writes are atomic, and equal keys have equal entries. A damaged entry is logged and computed again.
+    Entries are never removed here; they can be deleted at any time. Frames are processed one at a time even if
+    `detector` is concurrent, because equal frames at once would each count as a miss.
     """
 
     detector: Detector
@@ -74,11 +73,8 @@ class CachedDetector(Detector):
     mode: CacheMode = CacheMode.READ_WRITE
 
     def __post_init__(self) -> None:
-        self.classes = self.detector.classes
-        self.domain = domain_of(self.detector)
-        self.reads = self.detector.reads if isinstance(self.detector, ReadsFields) else FRAME_FIELDS
-        unknown = set(self.reads) - set(FRAME_FIELDS)
-        if unknown:
+        self.classes, self.domain, self.reads = self.detector.classes, self.detector.domain, fields_read(self.detector)
+        if unknown := set(self.reads) - set(FRAME_FIELDS):
             raise ConfigError(f"{type(self.detector).__name__}.reads names no field of Frame: {', '.join(unknown)}")
         self.hits = 0
         self.misses = 0
@@ -105,10 +101,6 @@ class CachedDetector(Detector):
             self._write(path, detections)
         return detections
 
-    def metrics(self) -> dict[str, int]:
-        """The keys for metrics.json. A frame that the detector refused is neither a hit nor a miss."""
-        return {"detection_cache.hits": self.hits, "detection_cache.misses": self.misses}
-
     def _read(self, path: Path) -> Detections | None:
         if not is_there(path):
             return None
@@ -134,50 +126,54 @@ class CachedDetector(Detector):
 
 
 def _checksum(path: Path, content: bytes) -> bytes:
-    """Of an entry: one that was moved to another frame's or detector's place does not hold."""
+    """Return the SHA-256 of an entry's name and content, which fails for an entry moved to another key."""
     return hashlib.sha256(f"{path.parent.name}/{path.name}\n".encode() + content).digest()
 
 
+def fields_read(detector: Detector) -> tuple[str, ...]:
+    """Return the fields of Frame that the detections depend on; all unless the detector declares them."""
+    return detector.reads if isinstance(detector, ReadsFields) else FRAME_FIELDS
+
+
 def identity_of(detector: Detector) -> str:
-    """The fingerprint that the detector has of its own, else that of its class, code and parameters."""
+    """Return the detector's own fingerprint, else that of its class, code and parameters."""
     if not isinstance(detector, Fingerprinted):
         return fingerprint(detector)
     try:
         return detector.fingerprint()
-    except AttributeError as error:  # once Detector itself had one, and those who added to it asked super()
+    except AttributeError as error:  # plugins written when Detector had this method call super()
         raise ConfigError(f"{type(detector).__name__}.fingerprint: {error}; call {fingerprint.__module__}'s") from error
 
 
 def with_cache(detector: Detector, config: DictConfig) -> Detector:
-    """`detector` behind the cache that `detection_cache` and `detection_cache_dir` at the top of the config ask for."""
+    """Return `detector` with the cache of the config's `detection_cache` and `detection_cache_dir`."""
     asked = config.detection_cache
-    named = "off" if asked is False else asked  # an unquoted off is YAML's false
+    named = "off" if asked is False else asked  # YAML reads an unquoted off as false
     modes = {mode.value: mode for mode in CacheMode}
     if named not in modes:
         raise ConfigError(f"detection_cache must be one of {', '.join(modes)}, found {asked!r}")
     if modes[named] is CacheMode.OFF:
         return detector
-    return CachedDetector(detector, cache_directory(config.detection_cache_dir), modes[named])
+    if config.detection_cache_dir is not None:
+        directory = checked_path("detection_cache_dir", config.detection_cache_dir)
+    else:
+        import platformdirs
+
+        directory = Path(platformdirs.user_cache_dir("instancemap", appauthor=False)) / "detections"
+    return CachedDetector(detector, directory, modes[named])
 
 
 def cache_metrics(detector: Detector) -> Mapping[str, int]:
-    """Hits and misses of a detector behind a cache; nothing for another one."""
-    return detector.metrics() if isinstance(detector, CachedDetector) else {}
-
-
-def cache_directory(chosen: str | None) -> Path:
-    """The folder chosen, or the one that the system has for such things."""
-    if chosen is not None:
-        return checked_path("detection_cache_dir", chosen)
-    import platformdirs
-
-    return Path(platformdirs.user_cache_dir("instancemap", appauthor=False)) / "detections"
+    """Return the hits and misses for metrics.json, empty without a cache. A frame with an error is neither."""
+    if not isinstance(detector, CachedDetector):
+        return {}
+    return {"detection_cache.hits": detector.hits, "detection_cache.misses": detector.misses}
 
 
 def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
-    """SHA-256 (hex) of these fields of a frame. Faster than BLAKE2 wherever the processor knows SHA.
+    """Return the SHA-256 (hex) of these fields of a frame; with SHA instructions it is faster than BLAKE2.
 
-    Truth that is not rendered yet counts by its origin, so that a hit spares the rendering.
+    Truth that is not rendered yet is identified by its origin, so that a hit avoids rendering.
     """
     digest = hashlib.sha256()
     for name in sorted(reads):
@@ -188,21 +184,20 @@ def frame_hash(frame: Frame, reads: tuple[str, ...]) -> str:
                 digest.update(f"of {value.origin};".encode())
             else:
                 add_array(digest, value.instance_ids)
-            # repr tells None from "None", and no order of insertion
+            # repr distinguishes None from "None"; sorting removes the insertion order
             digest.update(repr(sorted(value.class_names.items())).encode())
         elif isinstance(value, np.ndarray):
             add_array(digest, value)
-        else:  # numbers, the camera and None: Python writes floats so that they read back exactly
+        else:  # numbers, the camera and None: repr of a float is exact
             digest.update(f"{value!r};".encode())
     return digest.hexdigest()
 
 
 def pack(detections: Detections) -> bytes:
-    """An entry: safetensors with the arrays as they are, and each mask's run lengths inside its tight box.
+    """Return an entry: safetensors with the arrays, and the run lengths of each mask inside its tight box.
 
-    The rows of a mask stand for the columns of COCO's format: nothing has to be transposed, here or in `unpack`.
+    The runs go along rows, not columns as in COCO's format, so that nothing is transposed.
     """
-    from pycocotools import mask as coco
     from safetensors.numpy import save
 
     boxes = tight_boxes(detections.masks).astype(np.int32)
@@ -227,26 +222,22 @@ def pack(detections: Detections) -> bytes:
 
 
 def unpack(content: bytes, classes: tuple[str, ...]) -> Detections:
-    """The detections of an entry whose checksum holds."""
+    """Return the detections of an entry with a valid checksum."""
     from safetensors.numpy import load
 
     stored = load(content)
-    masks = _unpack_masks(stored["runs"].tobytes(), stored["run_bytes"], stored["mask_boxes"], stored["shape"])
-    # copies: arrays that a later stage could not write to would be a difference
-    arrays = {name: stored[name].copy() for name in KEPT}
-    embeddings = stored[EMBEDDINGS].copy() if EMBEDDINGS in stored else None
-    space = stored[SPACE].tobytes().decode() if SPACE in stored else ""
-    exact = bool(stored["exact"][0])
-    return Detections(masks=masks, classes=classes, exact=exact, embeddings=embeddings, embedding_space=space, **arrays)
-
-
-def _unpack_masks(runs: bytes, run_bytes: Int32, boxes: Int32, shape: Int32) -> Bool:
-    from pycocotools import mask as coco
-
-    masks = np.zeros((len(boxes), *shape.tolist()), np.bool_)
+    boxes, runs = stored["mask_boxes"], stored["runs"].tobytes()
+    masks = np.zeros((len(boxes), *stored["shape"].tolist()), np.bool_)
     end = 0
-    for mask, (x1, y1, x2, y2), length in zip(masks, boxes.tolist(), run_bytes.tolist(), strict=True):
+    for mask, (x1, y1, x2, y2), length in zip(masks, boxes.tolist(), stored["run_bytes"].tolist(), strict=True):
         start, end = end, end + length
-        columns = coco.decode({"size": [x2 - x1 + 1, y2 - y1 + 1], "counts": runs[start:end]})
-        mask[y1 : y2 + 1, x1 : x2 + 1] = columns.T
-    return masks
+        rows = coco.decode({"size": [x2 - x1 + 1, y2 - y1 + 1], "counts": runs[start:end]}).T
+        mask[y1 : y2 + 1, x1 : x2 + 1] = rows
+    return Detections(
+        masks=masks,
+        classes=classes,
+        exact=bool(stored["exact"][0]),
+        embeddings=stored[EMBEDDINGS].copy() if EMBEDDINGS in stored else None,
+        embedding_space=stored[SPACE].tobytes().decode() if SPACE in stored else "",
+        **{name: stored[name].copy() for name in KEPT},  # writable, as the detector's own arrays
+    )

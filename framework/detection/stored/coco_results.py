@@ -1,7 +1,7 @@
-"""COCO's result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
+"""COCO result files: a JSON list with an object for each detection of each image (cocodataset.org/#format-results).
 
-Beside COCO's own keys an entry may have `category_name`, and `class_probabilities`: the whole distribution. pycocotools
-reads such a file only beside the annotations of its images, and trusts its entries.
+In addition to COCO's keys an entry may have `category_name` and `class_probabilities`, the whole distribution. Not read
+by pycocotools, which requires the annotations of the images and does not validate entries.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from framework.detection.stored.stored_detection import (
     read_probabilities,
     read_score,
 )
-from framework.errors import ConfigError, DataError
+from framework.errors import ConfigError, DataError, errors_of
 from framework.files.atomic_write import written_whole
 from framework.files.json_file import read_json
 from framework.vocabulary.label_spaces import COCO, COCO_BY_ID, NO_CLASS
 
-MOST_DIGITS = 18  # of a frame's number
+MOST_DIGITS = 18  # of a frame number
 
 
 class CategoryIds(Enum):
-    """What `category_id` counts."""
+    """The numbering of `category_id`."""
 
     COCO_91 = "the ids of COCO's annotation files: 1 to 90, with gaps"
     FROM_ONE = "the labels, from 1"
     FROM_ZERO = "the labels, from 0"
 
     def of(self, labels: Sequence[str]) -> list[int]:
-        """The id of each label. Raises ConfigError where the labels are not those that the ids belong to."""
+        """Return the id of each label. Raises ConfigError if the labels do not have these ids."""
         if self is not CategoryIds.COCO_91:
             return list(range(len(labels))) if self is CategoryIds.FROM_ZERO else list(range(1, len(labels) + 1))
         if tuple(labels) != COCO:
@@ -51,10 +51,10 @@ class CategoryIds(Enum):
 
 
 def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[StoredDetection]:
-    """The detections of a result file, in its order. Raises DataError, naming file and entry, for what cannot be used.
+    """Return the detections of a result file, in its order. Raises DataError, naming file and entry, for invalid ones.
 
-    `segmentation` is run lengths (packed or a list) or polygons. `image_id` is `Frame.index`, as a number or as the
-    name of the image's file ("color/000012.png"). `category_id` counts only where there is no `category_name`.
+    `segmentation`: run lengths (packed or a list) or polygons. `image_id`: `Frame.index`, as a number or as the image's
+    file name ("color/000012.png"). `category_id` is used only without `category_name`.
     """
     entries = read_json(path)
     if not isinstance(entries, list):
@@ -69,12 +69,10 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
             raise DataError(f"{where}: expected an object, found {entry!r}")
         if names is None and entry.get("category_name") is None:
             names = dict(zip(ids.of(labels), labels, strict=True))
-        try:
+        with errors_of(where):
             found.append(_read_entry(where, entry, index, names or {}))
             if isinstance(entry["image_id"], str):
                 _check_folder(folders, found[-1].frame, PurePosixPath(entry["image_id"]))
-        except DataError as error:
-            raise DataError(f"{where}: {error}") from error
     return found
 
 
@@ -100,7 +98,7 @@ def _read_entry(
 
 
 def _check_folder(folders: dict[int, PurePosixPath], frame: int, image: PurePosixPath) -> None:
-    """Raises DataError where a frame's detections are of images in several folders, so of several sequences."""
+    """Raise DataError if a frame has images in several folders, which means several sequences."""
     other = folders.setdefault(frame, image.parent)
     if image.parent != other:
         raise DataError(f"{image} and another image in {other}/ are both frame {frame}; a file is of one sequence")
@@ -157,7 +155,7 @@ def _read_polygons(found: Sequence[Any]) -> Polygons:
 
 
 class ResultWriter:
-    """Writes the entries of a result file, frame by frame."""
+    """Writer of a result file, frame by frame."""
 
     def __init__(self, file: TextIO, classes: tuple[str, ...]) -> None:
         self._file = file
@@ -167,10 +165,10 @@ class ResultWriter:
         self.frames = 0
 
     def write(self, frame: int, detections: Detections) -> None:
-        """Adds the detections of frame number `frame`."""
+        """Write the detections of frame number `frame`."""
         height, width = detections.masks.shape[1:]
         best = detections.class_probabilities.argmax(axis=1).tolist()
-        boxes = detections.boxes.astype(np.float64)  # in which x + width is x2 again
+        boxes = detections.boxes.astype(np.float64)  # so that x + width is exactly x2
         for k, counts in enumerate(encode(detections.masks)):
             x1, y1, x2, y2 = boxes[k].tolist()
             entry = {
@@ -190,7 +188,7 @@ class ResultWriter:
 
 @contextmanager
 def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]:
-    """A result file of a detector with these classes, there once the body has succeeded and not before."""
+    """Write a result file of a detector with these classes, atomically when the block ends."""
     with written_whole(path) as temporary, temporary.open("w", encoding="utf-8") as file:
         file.write("[\n")
         yield ResultWriter(file, classes)
@@ -198,5 +196,5 @@ def results_file(path: Path, classes: tuple[str, ...]) -> Iterator[ResultWriter]
 
 
 def _shortest(values: Float32) -> list[float]:
-    """The numbers with as few digits as tell one float32 from the next: half the file, and the same bits again."""
+    """Return the numbers with the fewest digits that identify a float32, which halves the file."""
     return [float(text) for text in values.astype(str)]

@@ -1,4 +1,4 @@
-"""What a detector's answers depend on beside the frame, as one hash."""
+"""Fingerprint of a detector: one hash of everything besides the frame that its detections depend on."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from framework.files.hashing import path_hash
 from framework.files.search_paths import candidates
 
 LIBRARIES = ("numpy", "opencv-python-headless", "torch", "onnxruntime", "transformers")
-"""Another version may give other last digits."""
+"""Libraries whose version may change the last digits."""
 
-SHARED_SOURCES = ("detection/**/*.py", "vocabulary/label_spaces.*")  # in framework/: what detectors are built from
+SHARED_SOURCES = ("detection/**/*.py", "vocabulary/label_spaces.*")  # in framework/: the code that detectors share
 NOT_GIVEN = Path()  # what `path: ""` in a config becomes
 
 
 def fingerprint(detector: object) -> str:
-    """SHA-256 (hex) of a dataclass instance's class, code, parameters and of the files that its Path parameters name.
+    """Return the SHA-256 (hex) of a dataclass instance's class, code and parameters.
 
-    Code is the module of its class and of each base class, framework.detection, and the versions of the numerical
-    libraries. A path counts by what is there, not by its name: a relative one is looked for in the working, then in the
-    project folder, and of a folder every file below it is read. So does a str that names a file or folder.
-    `device: auto` counts as the device that it means. The number of threads is not part of it.
+    Code is the modules of its class and base classes, framework.detection, and the versions of numerical libraries. A
+    Path, or a str that names an existing file or folder, is identified by its content, with all files below a folder;
+    relative paths are searched in the working, then in the project folder. `device: auto` is identified by the device
+    that is used. The number of threads is not included.
 
-    Raises ConfigError when a path does not exist, or code has no file (a notebook's): such a class must say itself what
-    identifies it, with a method `fingerprint`.
+    Raises ConfigError for a missing path, and for code without a file (a notebook's): such a class needs its own method
+    `fingerprint`.
     """
     kind = type(detector)
     digest = hashlib.sha256()
@@ -48,8 +48,7 @@ def _code(kind: type) -> Iterator[str]:
         yield path_hash(Path(source))
     framework = Path(__file__).resolve().parents[2]
     for pattern in SHARED_SOURCES:
-        for source in sorted(framework.glob(pattern)):
-            yield path_hash(source)
+        yield from map(path_hash, sorted(framework.glob(pattern)))
     for library in LIBRARIES:
         try:
             yield f"{library} {importlib.metadata.version(library)}"
@@ -71,29 +70,21 @@ def _parameters(detector: object) -> Iterator[str]:
             if isinstance(value, str) and _is_path(value):
                 yield f"{field.name} {content_hash(Path(value))}"
         if field.name == "device" and value in ("auto", "cuda"):
-            yield _device()
+            import torch
+
+            yield torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
 
 
 def _is_path(value: str) -> bool:
-    """Whether a parameter that may be a name or a path (labels, a model) is a path, and not a word like `auto`."""
-    return value not in ("", ".") and any(_exists(candidate) for candidate in candidates(Path(value)))
-
-
-def _exists(path: Path) -> bool:
+    """Return whether a str parameter names an existing path, and is not a name such as `auto`."""
     try:
-        return path.exists()
-    except (OSError, ValueError):  # too long for a file's name
+        return value not in ("", ".") and any(candidate.exists() for candidate in candidates(Path(value)))
+    except (OSError, ValueError):  # too long for a file name
         return False
 
 
-def _device() -> str:
-    import torch
-
-    return torch.cuda.get_device_name() if torch.cuda.is_available() else "cpu"
-
-
 def content_hash(path: Path) -> str:
-    """`path_hash` of where a path leads; "" for one that is not given."""
+    """Return `path_hash` of the file or folder that a path leads to; "" for an empty path."""
     if path == NOT_GIVEN:
         return ""
     found = next((candidate for candidate in candidates(path) if candidate.exists()), None)

@@ -1,4 +1,4 @@
-"""A folder of masks: for each frame NNNNNN.png with instance ids, and NNNNNN.json that says what they are."""
+"""A folder of masks: for each frame NNNNNN.png with instance ids and NNNNNN.json with their classes and scores."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from framework.detection.stored.stored_detection import (
     read_probabilities,
     read_score,
 )
-from framework.errors import DataError
+from framework.errors import DataError, errors_of
 from framework.files.image_files import read_uint16
 from framework.files.json_file import read_json
 
@@ -28,7 +28,7 @@ LARGEST_ID = np.iinfo(np.uint16).max
 
 @dataclass(frozen=True)
 class InstanceOfImage(Segmentation):
-    """The pixels of an image that hold an id."""
+    """The pixels of an image with an id."""
 
     path: Path
     id: int
@@ -41,10 +41,10 @@ class InstanceOfImage(Segmentation):
 
 
 def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetection]:
-    """The detections of a folder of masks. Raises DataError, naming file and entry, for what cannot be used.
+    """Return the detections of a folder of masks. Raises DataError, naming file and entry, for invalid ones.
 
-    NNNNNN is `Frame.index`; the PNG has one channel of 16 bits; the JSON is a list of {"id", "class", "score"} and,
-    where known, "class_probabilities". Ids that it does not list are no detections. Masks cannot overlap here.
+    NNNNNN is `Frame.index`; the PNG has one channel of 16 bits; the JSON is a list of {"id", "class", "score"} and
+    optionally "class_probabilities". Ids that are not listed are no detections. Masks cannot overlap.
     """
     index = {name: k for k, name in enumerate(labels)}
     found: list[StoredDetection] = []
@@ -59,23 +59,16 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
         ids: set[int] = set()
         for k, entry in enumerate(_read_list(description)):
             where = f"{description}, entry {k}"
-            try:
+            with errors_of(where):
                 instance = _read_id(entry.get("id"))
                 if instance in ids:
                     raise DataError(f"id {instance} is there twice")
                 ids.add(instance)
+                label, score = read_label(entry.get("class"), index), read_score(entry.get("score"))
+                probabilities = read_probabilities(entry.get("class_probabilities"), index)
                 found.append(
-                    StoredDetection(
-                        where=where,
-                        frame=frame,
-                        label=read_label(entry.get("class"), index),
-                        score=read_score(entry.get("score")),
-                        segmentation=InstanceOfImage(path, instance),
-                        probabilities=read_probabilities(entry.get("class_probabilities"), index),
-                    )
+                    StoredDetection(where, frame, label, score, InstanceOfImage(path, instance), probabilities)
                 )
-            except DataError as error:
-                raise DataError(f"{where}: {error}") from error
     alone = [path for path in sorted(folder.glob("*.json")) if not path.with_suffix(".png").exists()]
     if alone:
         raise DataError(f"{alone[0]} has no image {alone[0].stem}.png beside it")

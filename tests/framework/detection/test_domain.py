@@ -1,4 +1,4 @@
-"""A network that knows rendered rooms alone says so, once, wherever it is shown something else."""
+"""A detector for rendered rooms logs one warning for images of another domain."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from framework.api import Mapper
 from framework.commands.running.detect import write_detections
 from framework.commands.running.show_refinement import detected
 from framework.datasets.scenenn.scenenn import MADE_BY, SceneNN
-from framework.detection.domain import RENDERED_ROOMS, domain_of
+from framework.detection.domain import RENDERED_ROOMS
 from framework.detection.stored.cache import CachedDetector
 from framework.interfaces import Detector, RGBDSequence
 from framework.pipeline import Pipeline
@@ -22,7 +22,7 @@ from framework.synthetic.sequence import Synthetic
 from tests.support import option_files, registered
 from tests.support.scenes.corner_room import CornerRoom, GivenPose, GridFuser, KeepAll, SphereDetector
 
-SAID = "trained on rendered rooms alone"
+WARNING_TEXT = "trained on rendered rooms only"
 
 
 @dataclass
@@ -43,10 +43,10 @@ def mapped(detector: Detector, sequence: RGBDSequence) -> None:
     Pipeline(detector, GivenPose(), KeepAll(), GridFuser()).run(sequence)
 
 
-def test_a_run_warns_once_in_one_line_that_says_what_to_use(caplog: pytest.LogCaptureFixture) -> None:
+def test_run_outside_domain_warns_once_with_fix(caplog: pytest.LogCaptureFixture) -> None:
     mapped(OfRooms(), CornerRoom())
     [line] = warnings(caplog)
-    assert SAID in line
+    assert WARNING_TEXT in line
     assert "corner_room" in line
     assert line.endswith("use detector=maskrcnn2go")
     assert "\n" not in line
@@ -55,19 +55,19 @@ def test_a_run_warns_once_in_one_line_that_says_what_to_use(caplog: pytest.LogCa
 @pytest.mark.parametrize(
     ("detector", "sequence"), [(OfRooms(), RenderedCorner()), (SphereDetector(), CornerRoom())], ids=["rooms", "any"]
 )
-def test_nothing_is_said_where_the_pictures_fit(
+def test_run_inside_domain_does_not_warn(
     detector: Detector, sequence: RGBDSequence, caplog: pytest.LogCaptureFixture
 ) -> None:
     mapped(detector, sequence)
     assert warnings(caplog) == []
 
 
-def test_the_commands_that_only_detect_warn_too(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_detection_commands_outside_domain_warn(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     write_detections(tmp_path / "found.json", OfRooms(), CornerRoom())
-    assert [SAID in line for line in warnings(caplog)] == [True]
+    assert [WARNING_TEXT in line for line in warnings(caplog)] == [True]
     caplog.clear()
     detected(CornerRoom(), OfRooms(), None)
-    assert [SAID in line for line in warnings(caplog)] == [True]
+    assert [WARNING_TEXT in line for line in warnings(caplog)] == [True]
     caplog.clear()
     write_detections(tmp_path / "found.json", OfRooms(), RenderedCorner())
     detected(RenderedCorner(), OfRooms(), 0)
@@ -75,27 +75,25 @@ def test_the_commands_that_only_detect_warn_too(tmp_path: Path, caplog: pytest.L
 
 
 @pytest.mark.parametrize(("choice", "lines"), [(["detector=mask_rcnn_rooms"], 1), ([], 0)])
-def test_a_mapper_warns_since_it_does_not_know_the_frames(
+def test_mapper_warns_because_frames_are_unknown(
     choice: list[str], lines: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     mapper = Mapper(*choice, "device=cpu", "tracker=ground_truth", "refiner=identity", "fuser.voxel_size=0.04")
     for frame in CornerRoom(frames=2):
         mapper.add(frame)
-    assert [SAID in line for line in warnings(caplog)] == [True] * lines
+    assert [WARNING_TEXT in line for line in warnings(caplog)] == [True] * lines
 
 
-def test_the_network_of_the_rooms_is_for_rendered_rooms_and_the_others_are_for_all(
-    ready: Callable[[str, str], Any], tmp_path: Path
-) -> None:
+def test_only_rooms_detector_has_a_domain(ready: Callable[[str, str], Any], tmp_path: Path) -> None:
     rooms = registered.built("detector", "mask_rcnn_rooms", "device=cpu")
-    assert domain_of(rooms) == RENDERED_ROOMS
-    assert domain_of(CachedDetector(rooms, tmp_path)) == RENDERED_ROOMS
+    assert rooms.domain == RENDERED_ROOMS
+    assert CachedDetector(rooms, tmp_path).domain == RENDERED_ROOMS
     for name in ("mask_rcnn", "maskrcnn2go", "simulated", "ground_truth"):
-        assert domain_of(ready("detector", name)) == ""
-    assert domain_of(CachedDetector(SphereDetector(), tmp_path)) == ""
+        assert ready("detector", name).domain == ""
+    assert CachedDetector(SphereDetector(), tmp_path).domain == ""
 
 
-def test_a_dataset_knows_whether_it_was_rendered(tmp_path: Path) -> None:
+def test_dataset_domain_marks_rendered_images(tmp_path: Path) -> None:
     """What `synthesize` writes says so; a folder of SceneNN itself does not."""
     assert Synthetic.domain == RENDERED_ROOMS
     option_files.overrides("dataset", "scenenn", tmp_path)

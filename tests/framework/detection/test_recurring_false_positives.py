@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from framework.data import Camera, Frame, FrameTruth
-from framework.detection.recurring_false_positives import CELL, KEYS, ghost_places
+from framework.detection.recurring_false_positives import CELL, KEYS, false_positive_cells
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
 
@@ -22,7 +22,7 @@ def wall(x: float, names: dict[int, str | None] | None = None, z: float = 3.0) -
 
 
 def test_a_place_keeps_its_key_and_its_rank() -> None:
-    here, there = ghost_places(wall(0.1), 0, 99), ghost_places(wall(0.35), 0, 99)
+    here, there = false_positive_cells(wall(0.1), 0, 99), false_positive_cells(wall(0.35), 0, 99)
     keys = [place.key for place in here]
     assert keys == sorted(set(keys))
     assert 1 <= keys[0] <= keys[-1] <= KEYS
@@ -34,7 +34,7 @@ def test_a_place_keeps_its_key_and_its_rank() -> None:
 def test_a_place_is_a_cell_and_its_middle_lies_in_it() -> None:
     for x in (0.0, 0.2):
         cells = set()
-        places = ghost_places(wall(x), 0, 99)
+        places = false_positive_cells(wall(x), 0, 99)
         for place in places:
             at = np.array(
                 [(place.u - CAMERA.cx) * place.z / CAMERA.fx + x, (place.v - CAMERA.cy) * place.z / CAMERA.fy]
@@ -44,14 +44,14 @@ def test_a_place_is_a_cell_and_its_middle_lies_in_it() -> None:
 
 
 def test_none_on_objects_of_a_known_class_and_without_poses() -> None:
-    assert all(place.u >= 80 for place in ghost_places(wall(0.0, {1: "bed"}), 0, 99))
-    assert any(place.u < 80 for place in ghost_places(wall(0.0, {1: None}), 0, 99))
+    assert all(place.u >= 80 for place in false_positive_cells(wall(0.0, {1: "bed"}), 0, 99))
+    assert any(place.u < 80 for place in false_positive_cells(wall(0.0, {1: None}), 0, 99))
     lost = wall(0.0)
-    assert ghost_places(Frame(0, 0.0, lost.color, lost.depth, CAMERA, truth=lost.truth), 0, 99) == []
-    assert ghost_places(wall(0.0, z=0.0), 0, 99) == []
+    assert false_positive_cells(Frame(0, 0.0, lost.color, lost.depth, CAMERA, truth=lost.truth), 0, 99) == []
+    assert false_positive_cells(wall(0.0, z=0.0), 0, 99) == []
 
 
 def test_another_seed_has_other_places_and_so_many_as_asked() -> None:
-    first, second = (ghost_places(wall(0.0), seed, 3) for seed in (0, 1))
+    first, second = (false_positive_cells(wall(0.0), seed, 3) for seed in (0, 1))
     assert len(first) == len(second) == 3
     assert [place.key for place in first] != [place.key for place in second]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from framework.detection.runtimes.onnx_network import ExportMetadata
-from framework.detection.segmentation_output import BoxKind, recognise
+from framework.detection.segmentation_output import BoxKind, detect_layout
 from framework.errors import DataError
 
 SHAPE = (64, 96)  # of the input
@@ -60,7 +60,7 @@ def seen(table, maps=None, **given):
         "metadata": ExportMetadata(),
         **given,
     }
-    layout = recognise(outputs, **arguments)
+    layout = detect_layout(outputs, **arguments)
     return layout, layout.read(outputs)
 
 
@@ -130,9 +130,9 @@ def test_two_classes_make_both_tables_equally_wide():
     layout, output = seen(below, classes=2)
     assert layout.suppressed
     assert output.candidates.class_scores.sum() == 0
-    quantised = dense(cells(), classes=2)
-    quantised[:, 4:6] = 0  # cells, where 8 bits have no smaller number
-    layout, _ = seen(quantised.transpose(0, 2, 1), classes=2)
+    quantized = dense(cells(), classes=2)
+    quantized[:, 4:6] = 0  # cells, where 8 bits have no smaller number
+    layout, _ = seen(quantized.transpose(0, 2, 1), classes=2)
     assert not layout.suppressed
 
 
@@ -157,7 +157,7 @@ MIXED = np.where((np.arange(126) % 3 > 0)[:, None], as_corners(cells()), cells()
 @pytest.mark.parametrize(
     ("table", "given", "message"),
     [
-        (dense(MIXED), {}, r"may be corners or centre and size .*detector\.boxes=CENTER or CORNER"),
+        (dense(MIXED), {}, r"may be corners or center and size .*detector\.boxes=CENTER or CORNER"),
         (dense(cells() / 8), {}, "neither in px of its input 64x96 nor in 0..1"),
         (dense(cells(), objectness=True), {}, r"11 columns .* shape \(1, 12, 126\): set detector.objectness=true"),
         (dense(cells()), {"objectness": True}, r"12 columns .* \(1, 11, 126\): set detector.objectness=false"),

@@ -96,7 +96,7 @@ def test_a_color_alone_is_a_query(embedded: Map) -> None:
 
 @pytest.mark.parametrize("query", ["a blob", "a wooden chair", "the"])
 def test_words_that_nobody_knows_are_named(embedded: Map, query: str) -> None:
-    with pytest.raises(DataError, match="its objects are bed, chair; colours are black, gray") as refused:
+    with pytest.raises(DataError, match="its objects are bed, chair; colors are black, gray") as refused:
         by_names(embedded, query)
     assert "'chair'" not in str(refused.value)
 
@@ -134,7 +134,7 @@ def test_the_command_says_by_what_it_answers(
     ("words", "fault"),
     [
         (["chair", "--by", "embeddings"], "has no embeddings: run with"),
-        (["flying saucer"], "no class of this map and no colour is called 'flying', 'saucer'"),
+        (["flying saucer"], "no class of this map and no color is called 'flying', 'saucer'"),
     ],
 )
 def test_what_cannot_be_answered_is_one_line(
@@ -231,5 +231,5 @@ def test_a_question_that_cannot_be_answered_is_refused(embedded: Map, run_withou
         query(instancemap.load_map(run_without / "map.npz"), "bed", by="embeddings")
     with pytest.raises(DataError, match=r"a map does not say of which model its embeddings are: name it by --model"):
         query(embedded, "bed")
-    with pytest.raises(DataError, match="no class of this map and no colour is called 'saucer'"):
+    with pytest.raises(DataError, match="no class of this map and no color is called 'saucer'"):
         query(embedded, "saucer", by="names")

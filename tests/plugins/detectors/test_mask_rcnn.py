@@ -8,10 +8,10 @@ import pytest
 import torch
 
 from framework.data import Camera, Frame
-from framework.detection.mask_rcnn import network as steps
 from framework.detection.mask_rcnn.network_file import save_network
 from framework.detection.masks.binary_masks import mask_overlaps, tight_boxes
 from framework.errors import ConfigError, DataError
+from plugins.detectors import mask_rcnn
 from plugins.detectors.mask_rcnn import MaskRCNNDetector
 from tests.support.networks.tiny_mask_rcnn import TINY, tiny_network, tiny_network_file
 
@@ -90,8 +90,8 @@ def test_blank_images_of_any_size_are_fine(detector, shape):
 
 def test_numbers_of_proposals_and_detections(path, monkeypatch):
     given = []
-    propose = steps.MaskRCNN.propose
-    monkeypatch.setattr(steps.MaskRCNN, "propose", lambda self, *a: given.append(propose(self, *a)) or (given[-1]))
+    propose = mask_rcnn.propose
+    monkeypatch.setattr(mask_rcnn, "propose", lambda *a: given.append(propose(*a)) or given[-1])
     few = MaskRCNNDetector(
         weights=path, device="cpu", proposals=7, max_detections=3, agnostic_nms=1.0, score_threshold=0.0
     )
@@ -112,7 +112,7 @@ def test_sides_are_the_networks_own_unless_given(path):
     assert MaskRCNNDetector(weights=path, device="cpu", long_side=200)._resize(wide).shape[2:] == (50, 200)
 
 
-def known_object(folder, extent, resized):
+def known_object(folder, monkeypatch, extent, resized):
     """A detector, at a scale, whose every proposal is a "chair" over the given box x1 y1 x2 y2 of a 160 x 120 image."""
     network = tiny_network(replace(TINY, short_side=resized, long_side=4 * resized))
     for parameter in network.roi_heads.parameters():
@@ -123,14 +123,14 @@ def known_object(folder, extent, resized):
     save_network(network, path, {})
     detector = MaskRCNNDetector(weights=path, device="cpu")
     box = np.array([extent], np.float32) * np.float32(resized / 120)
-    detector._network.propose = lambda *_: box
+    monkeypatch.setattr(mask_rcnn, "propose", lambda *_: box)
     return detector
 
 
 @pytest.mark.parametrize("resized", [60, 96, 120, 300])
-def test_a_box_is_where_it_was_whatever_the_scale(tmp_path, resized):
+def test_detect_at_any_scale_keeps_box_position(tmp_path, monkeypatch, resized):
     """Pixels u = 20..59, v = 30..89 have the borders 20..60, 30..90 in every resized image: nothing shifts."""
-    found = known_object(tmp_path, (20, 30, 60, 90), resized).detect(noise(6))
+    found = known_object(tmp_path, monkeypatch, (20, 30, 60, 90), resized).detect(noise(6))
     assert len(found) == 1
     expected = np.zeros((120, 160), bool)
     expected[30:90, 20:60] = True
@@ -158,7 +158,7 @@ def test_numbers_that_overflow_are_an_error_and_no_empty_answer(tmp_path):
 
 
 def test_no_proposals_are_no_detections(detector, monkeypatch):
-    monkeypatch.setattr(steps.MaskRCNN, "propose", lambda *_: np.zeros((0, 4), np.float32))
+    monkeypatch.setattr(mask_rcnn, "propose", lambda *_: np.zeros((0, 4), np.float32))
     assert len(detector.detect(noise(8))) == 0
 
 

@@ -10,7 +10,7 @@ import torch
 
 from framework.data import Camera, Frame
 from framework.detection.masks.binary_masks import mask_overlaps, tight_boxes
-from framework.detection.runtimes.caffe2_network import float_network, has_int8_kernels
+from framework.detection.runtimes.caffe2_network import has_int8_kernels, network_between
 from framework.errors import ConfigError, DataError
 from framework.files.search_paths import PROJECT_ROOT
 from framework.vocabulary.label_spaces import COCO
@@ -89,7 +89,7 @@ def test_mask_grids_are_the_channels_that_the_whole_graph_computes():
     """The shortcut computes one class a detection; the graph all 81."""
     detector = MaskRCNN2Go(device="cpu", int8=False)
     graph, tensors, _ = _read_network(WEIGHTS)
-    whole = float_network(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
+    whole = network_between(graph, tensors, ("_[mask]_pool5_int8",), ("mask_fcn_logits_up_int8",))
     pooled = torch.from_numpy(np.random.default_rng(10).normal(0, 0.3, (4, 128, 6, 6)).astype(np.float32))
     label = np.array([1, 80, 57, 57], np.int32)
     with torch.inference_mode():
@@ -120,7 +120,7 @@ def test_float_where_torch_has_no_kernels_for_integers(monkeypatch, caplog):
     monkeypatch.setattr(maskrcnn2go, "has_int8_kernels", lambda: False)
     caplog.set_level("INFO")
     detector = MaskRCNN2Go(device="cpu")
-    assert "so the network runs in float" in caplog.text
+    assert "the network runs in float" in caplog.text
     assert detector.fingerprint() != here
     frame = shared_picture("redkitchen", 0)
     np.testing.assert_array_equal(

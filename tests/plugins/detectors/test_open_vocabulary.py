@@ -12,8 +12,7 @@ import pytest
 import torch
 
 from framework.data import Camera, Frame
-from framework.detection.hub.box_prompted_masks import BoxPromptedMasks
-from framework.detection.hub.text_boxes import WordBoxes
+from framework.detection.hub.prompted_models import BoxPromptedMasks, TextPromptedBoxes
 from framework.errors import ConfigError, DataError
 from plugins.detectors.open_vocabulary import SOMETHING_ELSE, OpenVocabulary, word_distributions
 from tests.support import registered
@@ -45,6 +44,8 @@ def picture(shape: tuple[int, int]) -> Frame:
 class Saying:
     """In place of OWLv2: these boxes in px, with these probabilities of the words."""
 
+    dtype = torch.float32
+
     def __init__(self, shape: tuple[int, int], boxes: list[list[float]], probabilities: list[list[float]]) -> None:
         shares = (torch.tensor(boxes) + 0.5) / max(shape)  # of the square with the image in its upper left
         centers = (shares[:, :2] + shares[:, 2:]) / 2
@@ -59,6 +60,8 @@ class Saying:
 class Filling:
     """In place of a SAM: everything in the prompted box, in a grid of a quarter of the input's size."""
 
+    dtype = torch.float32
+
     def __call__(self, pixel_values: torch.Tensor, input_boxes: torch.Tensor, multimask_output: bool) -> Any:
         assert pixel_values.shape == (1, 3, SIDE, SIDE)
         assert not multimask_output
@@ -71,7 +74,7 @@ class Filling:
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_boxes_are_where_the_network_says(owlv2: Path, shape: tuple[int, int]) -> None:
-    boxes = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)
+    boxes = TextPromptedBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)
     wanted = [[4.5, 9.5, 24.5, 39.5], [30, 2, 55, 58]]
     boxes._network = Saying(shape, wanted, [[0.8, 0.1], [0.3, 0.6]])
     found, probabilities = boxes(picture(shape).color)
@@ -80,10 +83,16 @@ def test_boxes_are_where_the_network_says(owlv2: Path, shape: tuple[int, int]) -
 
 
 def test_the_image_lies_in_the_upper_left_of_a_gray_square(owlv2: Path) -> None:
-    boxes = WordBoxes(str(owlv2), "main", ("bed",), CPU, half_precision=False)
+    boxes = TextPromptedBoxes(str(owlv2), "main", ("bed",), CPU, half_precision=False)
     seen: list[torch.Tensor] = []
     saying = Saying((32, 64), [[0, 0, 9, 9]], [[0.5]])
-    boxes._network = lambda **given: seen.append(given["pixel_values"]) or saying(**given)
+
+    def record(**given: Any) -> Any:
+        seen.append(given["pixel_values"])
+        return saying(**given)
+
+    record.dtype = torch.float32
+    boxes._network = record
     boxes(np.full((32, 64, 3), 255, np.uint8))
     assert (seen[0][0, :, :31] > 1.5).all(), "white"
     np.testing.assert_allclose(seen[0][0, 0, 33:], (128 / 255 - 0.48145466) / 0.26862954, atol=1e-5)
@@ -93,7 +102,7 @@ def test_boxes_are_those_of_transformers(owlv2: Path) -> None:
     from transformers import AutoTokenizer, Owlv2ForObjectDetection
 
     color = np.random.default_rng(0).integers(0, 255, (SIDE, SIDE, 3)).astype(np.uint8)
-    found, probabilities = WordBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)(color)
+    found, probabilities = TextPromptedBoxes(str(owlv2), "main", ("red chair", "bed"), CPU, half_precision=False)(color)
     mean, std = np.array((0.48145466, 0.4578275, 0.40821073)), np.array((0.26862954, 0.26130258, 0.27577711))
     texts = ["a photo of a red chair", "a photo of a bed"]
     tokens = AutoTokenizer.from_pretrained(owlv2)(texts, padding="max_length", max_length=16, return_tensors="pt")
@@ -192,6 +201,6 @@ def test_a_tokenizer_of_two_files_is_read_as_owlv2_has_it(tmp_path: Path) -> Non
     (tmp_path / "merges.txt").write_text("#version: 0.2\n")
     special = {"bos_token": "<|startoftext|>", "eos_token": words[end], "unk_token": words[end], "pad_token": "!"}
     (tmp_path / "tokenizer_config.json").write_text(json.dumps({"tokenizer_class": "CLIPTokenizer", **special}))
-    tokens = WordBoxes(str(tmp_path), "main", ["cup"], CPU, half_precision=False)._tokens["input_ids"][0]
+    tokens = TextPromptedBoxes(str(tmp_path), "main", ["cup"], CPU, half_precision=False)._tokens["input_ids"][0]
     letters_of = [words[k] for k in tokens if k not in (0, end - 1, end)]
     assert "".join(letters_of).split("</w>") == ["a", "photo", "of", "a", "cup", ""]

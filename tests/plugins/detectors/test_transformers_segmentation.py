@@ -1,8 +1,8 @@
 """The transformers detector: on tiny random networks of each family, beside slow decodings and the models' own."""
 
-import builtins
 import json
 import math
+import sys
 from types import SimpleNamespace
 
 import numpy as np
@@ -335,14 +335,7 @@ def test_a_fixed_size_is_not_changed(folders):
 
 
 def test_a_missing_package_names_the_extra(monkeypatch):
-    original = builtins.__import__
-
-    def without(name, *arguments, **options):
-        if name == "transformers":
-            raise ImportError(name)
-        return original(name, *arguments, **options)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ConfigError, match=r"pip install instancemap\[transformers\]"):
         built("nowhere")
 

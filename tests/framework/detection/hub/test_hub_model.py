@@ -102,7 +102,7 @@ def fault(model="somebody/something"):
 def test_a_model_is_downloaded_once_with_its_licence_and_size_said(hub, caplog):
     with caplog.at_level("INFO", "framework"):
         folder = find_model("somebody/something", "main")
-    assert f"downloading somebody/something, 1 MB, licence apache-2.0, from {hub.address} into" in caplog.text
+    assert f"downloading somebody/something, 1 MB, license apache-2.0, from {hub.address} into" in caplog.text
     assert (folder / "model.safetensors").read_bytes() == WEIGHTS
     assert folder.name == COMMIT
     wanted = ["config.json", "preprocessor_config.json", "model.safetensors"]

@@ -68,7 +68,7 @@ def test_a_published_network_is_downloaded_once_with_its_licence_and_size_said(s
     offer(monkeypatch, f"{server.address}/network.pth")
     with caplog.at_level("INFO"):
         path = find_network(Path("offered"))
-    assert f"downloading {server.address}/network.pth, 5 MB, licence MIT, into {cache}" in caplog.text
+    assert f"downloading {server.address}/network.pth, 5 MB, license MIT, into {cache}" in caplog.text
     assert path == cache / "network.pth"
     assert path.read_bytes() == CONTENT
     assert find_network(Path("offered")) == path

@@ -1,11 +1,18 @@
-"""Box arithmetic against the formulas, written out for one box."""
+"""Box arithmetic against the formulas for one box; suppression against the quadratic algorithm."""
 
 import math
 
 import numpy as np
 import pytest
 
-from framework.detection.masks.boxes import LARGEST_LOG_SCALE, anchor_grid, clip, decode, to_original_image
+from framework.detection.masks.boxes import (
+    LARGEST_LOG_SCALE,
+    anchor_grid,
+    clip,
+    decode,
+    suppress_boxes,
+    to_original_image,
+)
 
 
 def decode_one(box, delta, extent):
@@ -59,3 +66,47 @@ def test_anchors_may_be_spaced_otherwise_along_y():
     anchors = np.array([[-8, -8, 8, 8]], np.float32)
     grid = anchor_grid(anchors, rows=2, columns=2, stride=(61, 64))
     np.testing.assert_array_equal(grid[3], anchors[0] + [64, 61, 64, 61])
+
+
+def iou(a, b, extent):
+    width = min(a[2], b[2]) - max(a[0], b[0]) + extent
+    height = min(a[3], b[3]) - max(a[1], b[1]) + extent
+    if width <= 0 or height <= 0:
+        return 0.0
+    area = [(c[2] - c[0] + extent) * (c[3] - c[1] + extent) for c in (a, b)]
+    return width * height / (sum(area) - width * height)
+
+
+def reference_nms(boxes, scores, threshold, classes, limit, extent):
+    left = sorted(range(len(boxes)), key=lambda i: -scores[i])
+    kept = []
+    while left and len(kept) < limit:
+        best = left.pop(0)
+        kept.append(best)
+        left = [i for i in left if classes[i] != classes[best] or iou(boxes[i], boxes[best], extent) <= threshold]
+    return kept
+
+
+@pytest.mark.parametrize("extent", [0.0, 1.0])
+@pytest.mark.parametrize("limit", [7, 1000])
+def test_suppress_boxes_matches_quadratic_algorithm(extent, limit):
+    rng = np.random.default_rng(2)
+    corners = rng.integers(0, 60, (120, 2))
+    boxes = np.hstack([corners, corners + rng.integers(5, 40, (120, 2))]).astype(np.float32)
+    scores = rng.permutation(120).astype(np.float32) / 120
+    classes = rng.integers(0, 3, 120).astype(np.int32)
+    kept = suppress_boxes(boxes, scores, 0.3, classes, limit, extent)
+    assert kept.tolist() == reference_nms(boxes, scores, 0.3, classes, limit, extent)
+
+
+def test_suppress_boxes_keeps_boxes_of_other_classes():
+    boxes = np.array([[0, 0, 9, 9], [0, 0, 9, 9], [0, 0, 9, 9]], np.float32)
+    scores = np.array([0.5, 0.9, 0.7], np.float32)
+    assert suppress_boxes(boxes, scores, 0.5).tolist() == [1]
+    assert suppress_boxes(boxes, scores, 0.5, np.array([0, 0, 1], np.int32)).tolist() == [1, 2]
+
+
+def test_suppress_boxes_keeps_input_order_of_ties():
+    boxes = np.array([[0, 0, 9, 9], [1, 0, 9, 9]], np.float32)
+    assert suppress_boxes(boxes, np.full(2, 0.5, np.float32), 0.5).tolist() == [0]
+    assert suppress_boxes(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), 0.5).shape == (0,)

@@ -5,7 +5,7 @@ import pytest
 from scipy import ndimage
 
 from framework.data import Camera
-from framework.detection.masks import masks_from_boxes_kernels
+from framework.detection.masks import masks_from_boxes, masks_from_boxes_kernels
 from framework.detection.masks.masks_from_boxes import masks_in_boxes
 
 CAMERA = Camera(160, 120, 150.0, 150.0, 79.5, 59.5)
@@ -101,11 +101,12 @@ def test_the_component_is_that_of_a_plain_labelling():
             hole = holes == k
             touches = hole[0].any() or hole[-1].any() or hole[:, 0].any() or hole[:, -1].any()
             if not touches and (
-                not depth[hole].any() or hole.sum() <= masks_from_boxes_kernels.CLOSED_HOLE * hole.size
+                not depth[hole].any() or hole.sum() <= masks_from_boxes.LARGEST_CLOSED_HOLE * hole.size
             ):
                 expected = expected | hole
         mask = np.zeros((30, 40), np.bool_)
         masks_from_boxes_kernels._grow(depth, weight_x, weight_y, 0.5, 1.5, 0.01, mask)
+        masks_from_boxes._close_holes(mask, depth > 0)
         np.testing.assert_array_equal(mask, expected)
 
 

@@ -9,11 +9,10 @@ import pytest
 import torch
 
 from framework.detection.runtimes.caffe2_network import (
-    Quantisation,
-    dequantised,
-    float_network,
+    Quantization,
+    dequantized_weights,
     has_int8_kernels,
-    int8_network,
+    network_between,
 )
 from framework.errors import DataError
 
@@ -22,7 +21,7 @@ pytestmark = pytest.mark.integration
 in_integers = pytest.mark.skipif(not has_int8_kernels(), reason="torch has no 8-bit convolutions for this processor")
 
 
-def quantised(rng, shape, zero_point=120):
+def quantized_values(rng, shape, zero_point=120):
     return rng.integers(0, 256, shape).astype(np.uint8), (0.01, zero_point)
 
 
@@ -33,19 +32,19 @@ def real(values, scale_zero):
 def run_one(kind, args, x_nhwc, tensors):
     """One operator through the graph interpreter, from and to NHWC as in the graph's own definition."""
     operator = {"type": kind, "inputs": ["x", *tensors], "outputs": ["y"], "args": args}
-    network = float_network([operator], tensors, ("x",), ("y",))
+    network = network_between([operator], tensors, ("x",), ("y",))
     (y,) = network(torch.from_numpy(x_nhwc.astype(np.float32)).permute(0, 3, 1, 2))
     return y.permute(0, 2, 3, 1).numpy() if y.ndim == 4 else y.numpy()
 
 
 @pytest.mark.parametrize(("stride", "pad", "group"), [(1, 1, 1), (2, 1, 1), (1, 1, 6), (2, 0, 3)])
 @pytest.mark.parametrize("relu", [False, True])
-def test_convolution_is_the_sum_over_the_window_of_dequantised_weights(stride, pad, group, relu):
+def test_convolution_is_the_sum_over_the_window_of_dequantized_weights_weights(stride, pad, group, relu):
     rng = np.random.default_rng(7)
     x = rng.normal(0, 1, (1, 7, 8, 6))
-    weight, weight_scale = quantised(rng, (6, 3, 3, 6 // group))
+    weight, weight_scale = quantized_values(rng, (6, 3, 3, 6 // group))
     bias, bias_scale = rng.integers(-200, 200, 6).astype(np.int32), (0.002, 0)
-    tensors = {"w": dequantised(weight, weight_scale), "b": dequantised(bias, bias_scale)}
+    tensors = {"w": dequantized_weights(weight, weight_scale), "b": dequantized_weights(bias, bias_scale)}
     args = {"kernel": 3, "stride": stride, "pad": pad, "group": group}
     y = run_one("Int8ConvRelu" if relu else "Int8Conv", args, x, tensors)
 
@@ -61,8 +60,8 @@ def test_convolution_is_the_sum_over_the_window_of_dequantised_weights(stride, p
 def test_transposed_convolution_adds_each_input_times_the_kernel(kernel, pad):
     rng = np.random.default_rng(8)
     x = rng.normal(0, 1, (1, 5, 6, 3))
-    weight, scale = quantised(rng, (3, kernel, kernel, 4))
-    tensors = {"w": dequantised(weight, scale), "b": torch.zeros(4)}
+    weight, scale = quantized_values(rng, (3, kernel, kernel, 4))
+    tensors = {"w": dequantized_weights(weight, scale), "b": torch.zeros(4)}
     y = run_one("Int8ConvTranspose", {"kernel": kernel, "stride": 2, "pad": pad}, x, tensors)
 
     expected, w = np.zeros((2 * 5 + kernel, 2 * 6 + kernel, 4)), real(weight, scale)
@@ -77,8 +76,8 @@ def test_fully_connected_mean_sum_and_relu():
     x = rng.normal(0, 1, (2, 3, 3, 5))
     mean = run_one("Int8AveragePool", {"kernel": 3, "stride": 1}, x, {})
     np.testing.assert_allclose(mean[:, 0, 0], x.mean(axis=(1, 2)), atol=1e-6)
-    weight, scale = quantised(rng, (4, 5))
-    tensors = {"w": dequantised(weight, scale), "b": torch.ones(4)}
+    weight, scale = quantized_values(rng, (4, 5))
+    tensors = {"w": dequantized_weights(weight, scale), "b": torch.ones(4)}
     np.testing.assert_allclose(
         run_one("Int8FC", {}, mean, tensors), mean[:, 0, 0] @ real(weight, scale).T + 1, atol=1e-5
     )
@@ -93,10 +92,10 @@ def test_a_network_runs_only_what_its_outputs_need():
         {"type": "Unknown", "inputs": ["y"], "outputs": ["elsewhere"], "args": {}},
         {"type": "Int8Sum", "inputs": ["x", "y"], "outputs": ["z"], "args": {}},
     ]
-    (z,) = float_network(graph, tensors, ("x",), ("z",))(torch.full((1, 1, 2, 2), 3.0))
+    (z,) = network_between(graph, tensors, ("x",), ("z",))(torch.full((1, 1, 2, 2), 3.0))
     assert (z == 6).all()
     with pytest.raises(DataError, match="the operator Unknown is not known"):
-        float_network(graph, tensors, ("x",), ("elsewhere",))
+        network_between(graph, tensors, ("x",), ("elsewhere",))
 
 
 # In integers
@@ -109,27 +108,27 @@ LAST = {  # what leaves a network is computed in float from the integers before:
 
 def integer_network(kind, args, weight, weight_scale, bias):
     """image -> x (uint8) -> y -> z = max(y, 0), and what the integers of y stand for."""
-    tensors = {"w": dequantised(weight, weight_scale), "b": torch.from_numpy(bias)}
-    result = Quantisation(0.05, 0 if kind == "Int8ConvRelu" else 128)
+    tensors = {"w": dequantized_weights(weight, weight_scale), "b": torch.from_numpy(bias)}
+    result = Quantization(0.05, 0 if kind == "Int8ConvRelu" else 128)
     operator = {
         "type": kind, "inputs": ["x", "w", "b"], "outputs": ["y"],
         "args": {**args, "Y_scale": result.scale, "Y_zero_point": result.zero_point},
     }  # fmt: skip
-    network = int8_network([IMAGE, operator, LAST], tensors, {"w": weight_scale[0]}, ("image",), ("z",))
+    network = network_between([IMAGE, operator, LAST], tensors, ("image",), ("z",), {"w": weight_scale[0]})
     return network, result
 
 
 @pytest.mark.parametrize("memory_format", [torch.contiguous_format, torch.channels_last])
 def test_numbers_are_rounded_to_the_nearest_and_halves_to_even_ones(memory_format):
-    quantisation = Quantisation(0.25, 100)
+    quantisation = Quantization(0.25, 100)
     steps = torch.arange(-1000, 1000).reshape(1, 5, 20, 20) / 2  # halves of steps, beyond both ends
-    found = quantisation.quantised((steps * 0.25).contiguous(memory_format=memory_format))
+    found = quantisation.quantize((steps * 0.25).contiguous(memory_format=memory_format))
     assert found.dtype == torch.uint8
     np.testing.assert_array_equal(found, np.clip(np.rint(steps.numpy() + 100), 0, 255))
     uneven = torch.from_numpy(np.random.default_rng(3).normal(0, 20, (3, 7, 5, 4)).astype(np.float32))
-    found = Quantisation(0.0312, 7).quantised(uneven)
+    found = Quantization(0.0312, 7).quantize(uneven)
     np.testing.assert_array_equal(found, (uneven * (1 / 0.0312)).add(7).round().clamp(0, 255).to(torch.uint8))
-    assert quantisation.quantised(uneven[:0]).shape == (0, 7, 5, 4)
+    assert quantisation.quantize(uneven[:0]).shape == (0, 7, 5, 4)
 
 
 @in_integers
@@ -195,7 +194,7 @@ def test_a_blob_between_blocks_is_rounded_for_a_convolution_and_not_for_a_sum():
         {"type": "Int8Conv", "inputs": ["a", "w", "b"], "outputs": ["c"], "args": convolution},
         {"type": "Int8Sum", "inputs": ["c", "x"], "outputs": ["y"], "args": one},
     ]  # fmt: skip
-    network = int8_network(graph, tensors, {"w": 1.0}, ("image",), ("y",))
+    network = network_between(graph, tensors, ("image",), ("y",), {"w": 1.0})
     x = torch.tensor([[[[0.011, 0.5, 1.2345]]]])
     np.testing.assert_allclose(network(x)[0], x + torch.round(x / 0.02) * 0.02, atol=1e-6)
 
@@ -206,4 +205,4 @@ def test_integers_without_a_scale_are_refused():
     args = {"kernel": 1, "stride": 1, "pad": 0, "Y_scale": 0.1, "Y_zero_point": 0}
     graph = [{"type": "Int8Conv", "inputs": ["x", "w", "b"], "outputs": ["y"], "args": args}, LAST]
     with pytest.raises(DataError, match="x goes into a convolution, and its integers have no scale"):
-        int8_network(graph, tensors, {"w": 1.0}, ("x",), ("z",))
+        network_between(graph, tensors, ("x",), ("z",), {"w": 1.0})

@@ -9,6 +9,7 @@ from enum import Enum
 from pathlib import Path
 
 import pytest
+import torch
 
 from framework.detection.stored import fingerprint as module
 from framework.detection.stored.fingerprint import content_hash, fingerprint
@@ -110,10 +111,11 @@ def test_code_without_a_file_cannot_be_told() -> None:
         fingerprint(dataclass(notebook)())
 
 
-def test_the_device_that_auto_means_counts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_device", lambda: "cpu")
+def test_fingerprint_auto_device_includes_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     on_cpu = fingerprint(Network(device="auto"))
-    monkeypatch.setattr(module, "_device", lambda: "NVIDIA H200")
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda: "NVIDIA H200")
     assert fingerprint(Network(device="auto")) != on_cpu
 
 

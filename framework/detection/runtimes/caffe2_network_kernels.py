@@ -1,4 +1,4 @@
-"""Numbers as 8-bit integers. A module without torch, which whoever compiles kernels need not load."""
+"""Kernels of caffe2_network.py, without torch, so that their compilation does not load it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ MOST = 255  # of uint8
 
 @njit(cache=True, nogil=True)
 def round_to_bytes(values, rounded, per_unit, zero_point):
-    """Fills rounded (N,) uint8 with values (N,) * per_unit + zero_point: in one pass, where torch makes five."""
+    """Write values (N,) * per_unit + zero_point to rounded (N,) uint8, in one pass where torch needs five."""
     for i in range(values.shape[0]):
         nearest = np.rint(values[i] * per_unit + zero_point)
         rounded[i] = np.uint8(np.int32(min(max(nearest, np.float32(0)), np.float32(MOST))))

@@ -1,4 +1,4 @@
-"""Kernels of nms.py."""
+"""Kernels of boxes.py."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def suppress_sorted(boxes, classes, order, iou, extent, limit):
-    """Compares each box with the survivors only: the limit makes that far fewer than all pairs."""
+    """Compare each box only with the survivors: with the limit, these are far fewer than all pairs."""
     survivors = np.empty(min(limit, len(boxes)), np.int32)
     n = 0
     for i in range(len(boxes)):
