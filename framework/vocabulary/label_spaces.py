@@ -76,9 +76,8 @@ def read_labels(name_or_path: str) -> tuple[str, ...]:
             f"labels must be one of {', '.join(SPACES)}, or a text file with one name per line, found {name_or_path}"
         ) from error
     names = tuple(line.strip() for line in lines)
-    if not all(names):  # skipping an empty line would shift the following names
-        empty = names.index("") + 1 if names else 1
-        raise ConfigError(f"labels: {path}, line {empty}: expected a name, found nothing")
+    if "" in names:  # skipping an empty line would shift the following names
+        raise ConfigError(f"labels: {path}, line {names.index('') + 1}: expected a name, found nothing")
     if not names:
         raise ConfigError(f"labels: {path} is empty; expected one name per line")
     return names

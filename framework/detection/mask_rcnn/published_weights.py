@@ -42,6 +42,11 @@ class PublishedNetwork:
         """The path in the user's cache."""
         return networks_folder() / self.url.rpartition("/")[2]
 
+    def digest_of(self, path: Path) -> str:
+        """Return as many digits of a file's hash as are published."""
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, self.algorithm).hexdigest()[: len(self.digest)]
+
 
 TORCHVISION = "https://download.pytorch.org/models/"
 DETECTRON2 = "https://dl.fbaipublicfiles.com/detectron2/COCO-InstanceSegmentation/"
@@ -85,14 +90,13 @@ def find_network(weights: Path) -> Path:
 def check(published: PublishedNetwork) -> None:
     """Raise DataError unless the cached file is the published one."""
     try:
-        with published.file.open("rb") as file:
-            found = hashlib.file_digest(file, published.algorithm).hexdigest()
+        found = published.digest_of(published.file)
     except OSError as error:
         raise DataError(f"{published.file} could not be read: {error.strerror}") from error
-    if not found.startswith(published.digest):
+    if found != published.digest:
         raise DataError(
-            f"{published.file} is damaged: its {published.algorithm} begins with {found[: len(published.digest)]},"
-            f" expected {published.digest}; delete it, and it is downloaded again from {published.url}"
+            f"{published.file} is damaged: its {published.algorithm} begins with {found}, expected {published.digest};"
+            f" delete it, and it is downloaded again from {published.url}"
         )
 
 
@@ -106,12 +110,10 @@ def download(published: PublishedNetwork) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise DataError(f"{path.parent} could not be made: {error.strerror}") from error
-    digest = hashlib.new(published.algorithm)
-    with written_whole(path) as temporary, temporary.open("wb") as file:
-        for block in _received(published, by_hand):
-            file.write(block)
-            digest.update(block)
-        found = digest.hexdigest()[: len(published.digest)]
+    with written_whole(path) as temporary:
+        with temporary.open("wb") as file:
+            file.writelines(_received(published, by_hand))
+        found = published.digest_of(temporary)
         if found != published.digest:
             raise DataError(
                 f"{published.url} is not what was published: its {published.algorithm} begins with {found},"

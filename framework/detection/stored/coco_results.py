@@ -72,7 +72,9 @@ def read_results(path: Path, labels: Sequence[str], ids: CategoryIds) -> list[St
         with errors_of(where):
             found.append(_read_entry(where, entry, index, names or {}))
             if isinstance(entry["image_id"], str):
-                _check_folder(folders, found[-1].frame, PurePosixPath(entry["image_id"]))
+                image, frame = PurePosixPath(entry["image_id"]), found[-1].frame
+                if (other := folders.setdefault(frame, image.parent)) != image.parent:
+                    raise DataError(f"{image} and another image in {other}/ are both frame {frame}; split by sequence")
     return found
 
 
@@ -95,13 +97,6 @@ def _read_entry(
         box=_read_box(entry.get("bbox")),
         exact=entry.get("exact") is True,
     )
-
-
-def _check_folder(folders: dict[int, PurePosixPath], frame: int, image: PurePosixPath) -> None:
-    """Raise DataError if a frame has images in several folders, which means several sequences."""
-    other = folders.setdefault(frame, image.parent)
-    if image.parent != other:
-        raise DataError(f"{image} and another image in {other}/ are both frame {frame}; a file is of one sequence")
 
 
 def _read_image_id(found: Any) -> int:
@@ -138,9 +133,8 @@ def _read_segmentation(found: Any) -> Segmentation:
         return RunLengths(pack(counts, shape), shape)
     if not isinstance(counts, str) or not counts.isascii():
         raise DataError("segmentation.counts must be a packed string or a list of run lengths")
-    packed = counts.encode()
-    check(packed, shape)
-    return RunLengths(packed, shape)
+    check(counts.encode(), shape)
+    return RunLengths(counts.encode(), shape)
 
 
 def _read_polygons(found: Sequence[Any]) -> Polygons:

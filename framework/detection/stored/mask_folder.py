@@ -57,7 +57,10 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
             raise DataError(f"{path} and {images[frame].name} are both of frame {frame}; keep one of them")
         description = path.with_suffix(".json")
         ids: set[int] = set()
-        for k, entry in enumerate(_read_list(description)):
+        entries = read_json(description)
+        if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+            raise DataError(f"{description} must hold a list of objects with id, class and score")
+        for k, entry in enumerate(entries):
             where = f"{description}, entry {k}"
             with errors_of(where):
                 instance = _read_id(entry.get("id"))
@@ -73,13 +76,6 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
     if alone:
         raise DataError(f"{alone[0]} has no image {alone[0].stem}.png beside it")
     return found
-
-
-def _read_list(path: Path) -> list[dict[str, object]]:
-    entries = read_json(path)
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise DataError(f"{path} must hold a list of objects with id, class and score")
-    return entries
 
 
 def _read_id(found: object) -> int:
