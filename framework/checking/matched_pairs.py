@@ -27,7 +27,6 @@ class MatchedPair:
 
     first: Frame
     second: Frame
-    step: int  # frames of the sequence from the first to the second
     points_first: Float32  # (M, 3) m, in the first camera
     pixels_first: Float32  # (M, 2)
     pixels_second: Float32  # (M, 2)
@@ -80,7 +79,7 @@ class Matcher:
             array[pose.inliers] for array in (points_first, pixels_first, pixels_second)
         )
         T_second_first = inverse(pose.T_world_camera)
-        return MatchedPair(first, second, step, points_first, pixels_first, pixels_second, T_second_first)
+        return MatchedPair(first, second, points_first, pixels_first, pixels_second, T_second_first)
 
     def _extract(self, k: int) -> tuple[Frame, Features] | None:
         try:

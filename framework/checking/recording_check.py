@@ -69,17 +69,18 @@ def check(sequence: RGBDSequence, farthest: float) -> RecordingCheck:
         text = f"{len(errors)} of {len(chosen)} cannot be read; the first: {errors[0]}"
         findings.append(Finding(Verdict.NOTE, "frames", text))
     depth_finding, median_depth = _check_depth(frames, farthest, _scale_of(sequence))
-    room = min(registration.LONGEST_DELAY, (count - 1) // 4)  # for frames before and after
+    longest = registration.LONGEST_DELAY
+    room = min(longest, (count - 1) // 4)  # for frames before and after
     edges = EdgeComparison(sequence, sorted({min(max(k, room), count - 1 - room) for k in chosen}))
-    by_delay = edges.by_delay()
+    by_delay = edges.alignments((delay, 1.0) for delay in range(-longest, longest + 1))
     best = max(by_delay, key=lambda alignment: alignment.strength).delay if by_delay else 0
     matcher = Matcher(sequence)
     starts = sorted({min(k, max(count - 2, 0)) for k in chosen})
     neighbors = [matcher.pair(k, 1) for k in starts if k + 1 < count]
     steps = np.array([pair.motion for pair in neighbors if pair is not None]) / sequence.camera.width
-    registration_finding, late = registration.judge(
-        by_delay, edges.by_zoom(best), depth_delay, float(np.median(steps)) if len(steps) else 0.0
-    )
+    by_zoom = edges.alignments((best, zoom) for zoom in registration.ZOOMS)
+    step = float(np.median(steps)) if len(steps) else 0.0
+    registration_finding, late = registration.judge(by_delay, by_zoom, depth_delay, step)
     if late:
         matcher = Matcher(DelayedDepth(sequence, late))
     pairs = list(matcher.pairs(starts))

@@ -38,7 +38,6 @@ class EdgeAlignment:
     zoom: float
     strength: float  # standard deviations of the gradient above its mean, at the best shift
     shift: tuple[float, float]  # (x, y), the best one, in fractions of the image's width
-    frames: int
 
     @property
     def moved(self) -> bool:
@@ -54,15 +53,8 @@ class EdgeComparison:
         self.chosen = chosen
         self._edges = lru_cache(maxsize=None)(self._find_edges)
 
-    def by_delay(self) -> list[EdgeAlignment]:
-        """Return the alignment of each delay that has enough edges."""
-        return self._alignments((delay, 1.0) for delay in range(-LONGEST_DELAY, LONGEST_DELAY + 1))
-
-    def by_zoom(self, delay: int) -> list[EdgeAlignment]:
-        """Return the alignment of each zoom that has enough edges."""
-        return self._alignments((delay, zoom) for zoom in ZOOMS)
-
-    def _alignments(self, candidates: Iterable[tuple[int, float]]) -> list[EdgeAlignment]:
+    def alignments(self, candidates: Iterable[tuple[int, float]]) -> list[EdgeAlignment]:
+        """Return the alignment of each delay and zoom that has enough edges."""
         found = []
         for delay, zoom in candidates:
             pairs = [(k, k + delay) for k in self.chosen if 0 <= k + delay < len(self.sequence)]
@@ -73,7 +65,7 @@ class EdgeComparison:
             mean = np.mean(known, axis=0)
             row, column = np.unravel_index(int(mean.argmax()), mean.shape)
             shift = (int(column) - LONGEST_SHIFT) / WIDTH, (int(row) - LONGEST_SHIFT) / WIDTH
-            found.append(EdgeAlignment(delay, zoom, float(mean.max()), shift, len(known)))
+            found.append(EdgeAlignment(delay, zoom, float(mean.max()), shift))
         return found
 
     def _correlation(self, of_color: int, of_depth: int, zoom: float) -> Float32 | None:

@@ -13,14 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from framework.datasets.calibration.camera_json import camera_of, read_json_object
-from framework.datasets.frames.sequence_reader import (
-    FRAME_RATE,
-    Contents,
-    RecordedFrame,
-    Recording,
-    numbered_images,
-    paired_images,
-)
+from framework.datasets.frames.numbered_images import numbered_images, paired_images
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording
 from framework.errors import DataError
 from framework.files.matrix_file import read_matrix_lines
 
@@ -40,12 +34,7 @@ class ReplicaNiceSlam(Recording):
             raise DataError(f'{path} must hold {{"camera": {{{", ".join(CAMERA_KEYS)}}}}}')
         camera, depth_scale = camera_of(path, content, CAMERA_KEYS)
         results, poses = self.folder / "results", read_matrix_lines(self.folder / "traj.txt")
-        images = paired_images(
-            numbered_images(results, (".jpg",)),
-            numbered_images(results, (".png",)),
-            lambda k: results / f"frame{k:06d}.jpg",
-            lambda k: results / f"depth{k:06d}.png",
-        )
+        images = paired_images(numbered_images(results, (".jpg",)), numbered_images(results, (".png",)))
         frames = []
         for k, pair in images.items():
             if k < len(poses):

@@ -27,14 +27,8 @@ import numpy as np
 
 from framework.data import Float64, FrameTruth, Int32, SceneTruth
 from framework.datasets.calibration.camera_json import read_camera, read_json_object
-from framework.datasets.frames.sequence_reader import (
-    FRAME_RATE,
-    Contents,
-    RecordedFrame,
-    Recording,
-    StoredImages,
-    numbered_images,
-)
+from framework.datasets.frames.numbered_images import numbered_images
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, Recording, StoredImages
 from framework.datasets.ground_truth.scene_truth import LabeledDepth, check_truth_voxel, fuse_scene_truth
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import is_there
@@ -63,7 +57,9 @@ class RgbdFolder(Recording):
 
     def open(self) -> Contents:
         path = self.folder / "camera.json"
-        _check_file(path)
+        if not path.is_file():
+            needs = "an RGB-D folder needs camera.json, color/ and depth/ (see docs/tutorials/own_data.md)"
+            raise DataError(f"{path} is missing; {needs}")
         camera, depth_scale, distortion = read_camera(path)
         color = numbered_images(self.folder / "color", (".jpg", ".jpeg", ".png"))
         depth = numbered_images(self.folder / "depth", (".png",))
@@ -129,13 +125,6 @@ def _recorded(images: StoredImages, index: int, line: TumLine | None, up: Float6
     return replace(RecordedFrame.posed(images, line.timestamp, line.pose), up=up)
 
 
-def _check_file(path: Path) -> None:
-    if not path.is_file():
-        raise DataError(
-            f"{path} is missing; an RGB-D folder needs camera.json, color/ and depth/ (see docs/tutorials/own_data.md)"
-        )
-
-
 def _check_same_frames(color: dict[int, Path], other: dict[int, Path]) -> None:
     """Raise DataError, with the first frame that has no partner, unless both have the same frame numbers."""
     unmatched = sorted(color.keys() ^ other.keys())
@@ -163,7 +152,6 @@ def _read_optional(path: Path, read: Callable[[Path], list[Entry]], name: str, f
 
 def _read_class_names(path: Path) -> dict[int, str | None]:
     class_names: dict[int, str | None] = {}
-    _check_file(path)
     for key, entry in read_json_object(path).items():
         if not (key.isascii() and key.isdigit() and len(key) <= MOST_DIGITS and 0 < int(key) <= LARGEST_ID):
             raise DataError(f"{path}: an instance id is a whole number from 1 to {LARGEST_ID}, found {key!r:.60}")

@@ -19,6 +19,7 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -93,7 +94,10 @@ class TumRgbd(Recording):
             log.info("%s: %d of %d color images have no depth image", self.name, len(color) - len(pairs), len(color))
         path = self.folder / "groundtruth.txt"
         truth = Trajectory.of(path, read_tum_lines(path) if is_there(path) else [], self.max_time_difference)
-        frames = [_recorded(color[i], depth[j], truth) for i, j in pairs]
+        frames = []
+        for i, j in pairs:
+            images, time = StoredImages.of_files(color[i].path, depth[j].path), color[i].timestamp
+            frames.append(RecordedFrame.posed(images, time, partial(truth.at, time)))
         return Contents(camera, source, depth_scale, frames, distortion if self.undistort else None)
 
     def _stored_camera(self) -> tuple[StoredCamera, Path | str]:
@@ -170,11 +174,6 @@ def associate(first: Sequence[float], second: Sequence[float], max_difference: f
             partner[i] = j
             taken.add(j)
     return sorted(partner.items(), key=lambda pair: first[pair[0]])
-
-
-def _recorded(color: ListedImage, depth: ListedImage, truth: Trajectory) -> RecordedFrame:
-    images = StoredImages.of_files(color.path, depth.path)
-    return RecordedFrame.posed(images, color.timestamp, lambda: truth.at(color.timestamp))
 
 
 def _first_of_each(path: Path, items: Sequence[Timed], name: str) -> list[Timed]:

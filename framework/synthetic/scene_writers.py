@@ -25,7 +25,7 @@ import numba
 from threadpoolctl import threadpool_limits
 from tqdm import tqdm
 
-from framework.datasets.scenenn.intrinsics import write_intrinsics
+from framework.datasets.scenenn.scene_files import write_intrinsics
 from framework.datasets.scenenn.scenenn import MADE_BY
 from framework.errors import ConfigError, DataError
 from framework.files.atomic_write import written_whole

@@ -14,8 +14,8 @@ import cv2
 import numpy as np
 
 from framework.data import Array, Box, Camera, Float32, Int32
+from framework.datasets.scenenn.scene_files import write_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
-from framework.datasets.scenenn.trajectory_log import write_trajectory_log
 from framework.errors import ConfigError
 from framework.files.atomic_write import written_whole
 from framework.files.ply import write_ply

@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from framework.datasets.frames.sequence_reader import numbered_images
+from framework.datasets.frames.numbered_images import numbered_images
 
 
 def feed(source: Path, target: Path, frames: int, hz: float) -> None:

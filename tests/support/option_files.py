@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 
 from framework.commands.running.detect import write_detections, write_labels
-from framework.datasets.scenenn.intrinsics import write_intrinsics
-from framework.datasets.scenenn.trajectory_log import write_trajectory_log
+from framework.datasets.scenenn.scene_files import write_intrinsics, write_trajectory_log
 from framework.files.tum_trajectory import write_tum
 from tests.support.recordings.recordings import write_color, write_depth
 from tests.support.recordings.scannet_files import shots, write_sens

@@ -17,7 +17,7 @@ from framework.commands.command_line import arguments, one_line_errors
 from framework.data import Array
 from framework.datasets.scenenn.oni import read_frames
 from framework.datasets.scenenn.oni_records import OniContents, Stream, read_contents
-from framework.datasets.scenenn.trajectory_log import MICROSECONDS, write_timestamps
+from framework.datasets.scenenn.scene_files import MICROSECONDS, write_timestamps
 from framework.errors import DataError
 from framework.files.atomic_write import written_whole
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -100,11 +99,7 @@ def distortion_of(path: Path, content: Mapping[str, Any]) -> Distortion | None:
     """Return the lens distortion in the content of a file, or None without one. Raises DataError."""
     if DISTORTION not in content:
         return None
-    values = content[DISTORTION]
-    if not isinstance(values, list) or len(values) != len(fields(Distortion)):
-        raise DataError(f"{path}: distortion must be [k1, k2, p1, p2, k3], found {str(values)[:60]}")
-    named = {f"{DISTORTION}[{k}]": value for k, value in enumerate(values)}
-    return Distortion(*numbers_of(path, named, *named))
+    return Distortion(*number_list(f"{path}: distortion [k1, k2, p1, p2, k3]", content[DISTORTION], 5))
 
 
 def _is_number(value: Any) -> bool:

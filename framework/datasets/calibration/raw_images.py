@@ -37,12 +37,12 @@ class Calibration:
 
     def color(self, raw: UInt8, name: Path | str) -> UInt8:
         """Return color (H, W, 3) of the pinhole camera. Raises FrameError, with `name`, for another size."""
-        self._check_size(name, raw.shape)
+        self.check_size(name, raw.shape)
         return self.lens.smooth(raw) if self.lens else raw
 
     def depth(self, raw: UInt16, name: Path | str) -> Float32:
         """Return depth (H, W) in m, 0 = no reading. Raises FrameError, with `name`, for another size."""
-        self._check_size(name, raw.shape)
+        self.check_size(name, raw.shape)
         depth = raw.astype(np.float32)
         depth /= np.float32(self.depth_scale)
         depth[raw == NO_READING] = 0
@@ -52,20 +52,11 @@ class Calibration:
 
     def labels(self, raw: UInt16, name: Path | str) -> UInt16:
         """Return labels (H, W), not interpolated. Raises FrameError, with `name`, for another size."""
-        self._check_size(name, raw.shape)
+        self.check_size(name, raw.shape)
         return self.lens.exact(raw) if self.lens else raw
 
-    def fault_of_size(self, name: Path | str, shape: tuple[int, ...]) -> str:
-        """Return what is wrong with the size of an image, "" = nothing."""
-        if shape[:2] == self.camera.shape:
-            return ""
-        expected = f"{self.source} says {_size(self.camera.shape)}; color, depth and camera must agree"
-        return f"{name} is {_size(shape)}, but {expected}"
-
-    def _check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
-        if fault := self.fault_of_size(name, shape):
-            raise FrameError(fault)
-
-
-def _size(shape: tuple[int, ...]) -> str:
-    return f"{shape[1]}x{shape[0]}"
+    def check_size(self, name: Path | str, shape: tuple[int, ...]) -> None:
+        """Raise FrameError, with `name`, unless an image has the size of the camera."""
+        if shape[:2] != self.camera.shape:
+            expected = f"{self.source} says {self.camera.width}x{self.camera.height}"
+            raise FrameError(f"{name} is {shape[1]}x{shape[0]}, but {expected}; color, depth and camera must agree")

@@ -9,7 +9,7 @@ from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import count
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 from framework.config.validation import check_bounds
 from framework.data import Frame, UInt8, UInt16
@@ -23,27 +23,6 @@ LONGEST_SILENCE = 5.0  # s; a camera that runs and sends nothing for so long is 
 
 Images = TypeVar("Images")
 log = logging.getLogger(__name__)
-
-
-class CameraDevice(Protocol):
-    """A camera of one vendor. The methods raise one of `errors` where the library does."""
-
-    errors: tuple[type[Exception], ...]
-
-    def start(self) -> None:
-        """Start to send frames."""
-
-    def stop(self) -> None:
-        """Stop after a successful start."""
-
-    def wait(self) -> Any:
-        """Return both images, not registered yet; None = none came within WAIT_MS."""
-
-    def calibration(self, images: Any) -> Calibration | None:
-        """Return the calibration of the color camera; None = these images do not contain it."""
-
-    def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
-        """Return copies of color (H, W, 3), RGB, and the depth (H, W) registered to it; None = not sent."""
 
 
 @dataclass
@@ -61,10 +40,27 @@ class DepthCamera(LiveVideo):
         check_bounds(self, width=(64, 4096), height=(64, 4096), fps=(1, 300))
         check_max_depth(self.max_depth)
         self.name = "_".join(filter(None, (self.brand.lower(), self.serial)))
+        self.errors: tuple[type[Exception], ...] = (RuntimeError,)  # that the library raises
 
     @abstractmethod
-    def device(self) -> CameraDevice:
-        """Return the camera, not started yet. Raises ConfigError without the library."""
+    def start(self) -> None:
+        """Start to send frames. Raises ConfigError without the library."""
+
+    @abstractmethod
+    def stop(self) -> None:
+        """Stop after a successful start."""
+
+    @abstractmethod
+    def wait(self) -> Any:
+        """Return both images, not registered yet; None = none came within WAIT_MS."""
+
+    @abstractmethod
+    def calibrate(self, images: Any) -> Calibration | None:
+        """Return the calibration of the color camera; None = these images do not contain it."""
+
+    @abstractmethod
+    def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
+        """Return copies of color (H, W, 3), RGB, and the depth (H, W) registered to it; None = not sent."""
 
     def distortion(self, coefficients: Sequence[float], model: object, brown_conrady: object) -> Distortion | None:
         """Return the lens distortion; None = there is none, or it is of an unsupported model, which is logged."""
@@ -77,25 +73,37 @@ class DepthCamera(LiveVideo):
         return Distortion(*coefficients[:5])
 
     def frames(self) -> Generator[FrameReader | None]:
-        device = self.device()
         try:
-            device.start()
-        except device.errors as error:
+            self.start()
+        except self.errors as error:
             which = f"the device {self.serial}" if self.serial else "a device"
             asked = f"{which} with {self.width}x{self.height} at {self.fps} Hz"
             raise DataError(f"{self.brand}: {asked} could not be started: {in_one_line(error)}") from error
         number = count()
         calibration: Calibration | None = None
         try:
-            for images in images_of(self.brand, partial(_wait, self.brand, device)):
+            for images in images_of(self.brand, self.wait):
                 if images is not None and calibration is None:
-                    calibration = device.calibration(images)
+                    calibration = self.calibrate(images)
                 if images is None or calibration is None:
                     yield None
                 else:
-                    yield partial(_read, device, images, next(number), time.time(), calibration)
+                    yield partial(self._frame, images, next(number), time.time(), calibration)
+        except self.errors as error:
+            raise DataError(f"{self.brand}: {in_one_line(error)}") from error
         finally:
-            device.stop()
+            self.stop()
+
+    def _frame(self, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
+        """Raises FrameError if one of the two images is missing, or they cannot be registered."""
+        try:
+            color, depth = self.read(images)
+        except self.errors as error:
+            raise FrameError(f"frame {number}: {in_one_line(error)}") from error
+        if color is None or depth is None:
+            raise FrameError(f"frame {number}: the camera has sent no {'color' if color is None else 'depth'}")
+        color = calibration.color(color, f"frame {number}: color")
+        return Frame(number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera)
 
 
 def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images | None]:
@@ -108,22 +116,3 @@ def images_of(name: str, wait: Callable[[], Images | None]) -> Generator[Images 
         elif time.monotonic() - last_time > LONGEST_SILENCE:
             raise DataError(f"{name}: no frame has come for {LONGEST_SILENCE:g} s; is the camera still connected?")
         yield images
-
-
-def _wait(brand: str, device: CameraDevice) -> Any:
-    try:
-        return device.wait()
-    except device.errors as error:
-        raise DataError(f"{brand}: {in_one_line(error)}") from error
-
-
-def _read(device: CameraDevice, images: Any, number: int, timestamp: float, calibration: Calibration) -> Frame:
-    """Raises FrameError if one of the two images is missing, or they cannot be registered."""
-    try:
-        color, depth = device.read(images)
-    except device.errors as error:
-        raise FrameError(f"frame {number}: {in_one_line(error)}") from error
-    if color is None or depth is None:
-        raise FrameError(f"frame {number}: the camera has sent no {'color' if color is None else 'depth'}")
-    color = calibration.color(color, f"frame {number}: color")
-    return Frame(number, timestamp, color, calibration.depth(depth, f"frame {number}: depth"), calibration.camera)

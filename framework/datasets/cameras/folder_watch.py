@@ -15,8 +15,8 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Generator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Generator, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -24,7 +24,8 @@ from framework.config.validation import check_bounds
 from framework.data import Frame
 from framework.datasets.calibration.camera_json import read_camera, read_json_object
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
-from framework.datasets.frames.sequence_reader import StoredImages, check_one_number, number_of
+from framework.datasets.frames.numbered_images import check_one_number, number_of
+from framework.datasets.frames.sequence_reader import StoredImages
 from framework.errors import DataError, FrameError
 from framework.files.atomic_write import read_bytes
 from framework.files.image_files import LARGEST_FILE, check_image
@@ -67,9 +68,9 @@ class FolderWatch(LiveVideo):
             began = time.monotonic()
             # checked first: files that were written before `end` count
             over = (self.folder / "end").exists() or 0 < self.idle_timeout < began - last_arrival
-            for arrival in arrivals.look(to_the_end=over):
+            for number, images in arrivals.look(to_the_end=over):
                 last_time, last_arrival = max(time.time(), last_time + CLOCK_TICK), began
-                yield partial(arrival.read, last_time, calibration)
+                yield partial(_read, number, images, last_time, calibration)
             if over:
                 return
             yield None
@@ -91,21 +92,13 @@ class FolderWatch(LiveVideo):
         return Calibration(camera, path, depth_scale, self.max_depth, distortion)
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """A frame that is complete, or that is skipped."""
-
-    number: int
-    images: StoredImages | None
-    fault: str = ""  # why it cannot be used
-
-    def read(self, timestamp: float, calibration: Calibration) -> Frame:
-        """Return the frame. Raises FrameError if it cannot be used."""
-        if self.images is None:
-            raise FrameError(self.fault)
-        color = calibration.color(self.images.color(), self.images.color_name)
-        depth = calibration.depth(self.images.depth(), self.images.depth_name)
-        return Frame(self.number, timestamp, color, depth, calibration.camera)
+def _read(number: int, images: StoredImages | str, timestamp: float, calibration: Calibration) -> Frame:
+    """The frame. Raises FrameError if it cannot be used."""
+    if isinstance(images, str):
+        raise FrameError(images)
+    color = calibration.color(images.color(), images.color_name)
+    depth = calibration.depth(images.depth(), images.depth_name)
+    return Frame(number, timestamp, color, depth, calibration.camera)
 
 
 class Arrivals:
@@ -116,43 +109,41 @@ class Arrivals:
         self._last = -1  # number of the last complete or skipped frame
         self._halves: set[int] = set()  # numbers that were skipped with one image
 
-    def look(self, to_the_end: bool = False) -> list[Arrival]:
-        """Return the new frames up to the newest complete one, or all that have a file, in ascending order."""
+    def look(self, to_the_end: bool) -> Iterator[tuple[int, StoredImages | str]]:
+        """Yield the new frames up to the newest complete one, or all that have a file, in ascending order.
+
+        A frame is its number and images, or why it cannot be used.
+        """
         self._color.look()
         self._depth.look()
         color, depth = self._color.waiting, self._depth.waiting
         both, any_of = sorted(color.keys() & depth.keys()), sorted(color.keys() | depth.keys())
         newest = next((n for n in reversed(both) if _is_whole(color[n]) and _is_whole(depth[n])), -1)
         newest = max(newest, self._last)  # a frame that comes after its successors is skipped
-        passed = any_of if to_the_end else [number for number in any_of if number <= newest]
-        return [arrival for number in passed if (arrival := self._arrival(number, newest))]
-
-    def _arrival(self, number: int, newest: int) -> Arrival | None:
-        """None for the second image of a frame that was skipped."""
-        color, depth = self._color.waiting.pop(number, None), self._depth.waiting.pop(number, None)
-        if number in self._halves:
-            self._halves.remove(number)
-            return None
-        if color is None or depth is None:
-            self._halves.add(number)
-        if number <= self._last:
-            return Arrival(number, None, f"{color or depth} came after frame {self._last}")
-        self._last = number
-        if color is None or depth is None:
-            until = f"when frame {newest} was" if newest > number else "in the end"
-            return Arrival(number, None, f"{color or depth}: the other image of this frame was not there {until}")
-        return Arrival(number, StoredImages.of_files(color, depth))
+        for number in any_of if to_the_end else [number for number in any_of if number <= newest]:
+            color_file, depth_file = color.pop(number, None), depth.pop(number, None)
+            if number in self._halves:  # the second image of a skipped frame
+                self._halves.remove(number)
+                continue
+            if color_file is None or depth_file is None:
+                self._halves.add(number)
+            if number <= self._last:
+                yield number, f"{color_file or depth_file} came after frame {self._last}"
+                continue
+            self._last = number
+            if color_file is None or depth_file is None:
+                until = f"when frame {newest} was" if newest > number else "in the end"
+                yield number, f"{color_file or depth_file}: the other image of this frame was not there {until}"
+            else:
+                yield number, StoredImages.of_files(color_file, depth_file)
 
 
-@dataclass
 class NewImages:
     """The images of a folder that are not assigned to frames yet."""
 
-    folder: Path
-    suffixes: Sequence[str]
-    waiting: dict[int, Path] = field(default_factory=dict)  # by number
-
-    def __post_init__(self) -> None:
+    def __init__(self, folder: Path, suffixes: Sequence[str]) -> None:
+        self.folder, self.suffixes = folder, suffixes
+        self.waiting: dict[int, Path] = {}  # by number
         self._names: set[str] = set()
         self._first: Path | None = None
 

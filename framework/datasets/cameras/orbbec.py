@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
-from framework.datasets.cameras.device_frames import WAIT_MS, CameraDevice, DepthCamera
+from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera
 from framework.errors import import_optional
 
 MILLIMETERS = 1000.0  # per meter: the unit of the library's depth scale
@@ -21,39 +21,25 @@ class Orbbec(DepthCamera):
 
     brand = "Orbbec"
 
-    def device(self) -> CameraDevice:
-        return OrbbecDevice(import_optional("pyorbbecsdk", "reads Orbbec cameras", "orbbec"), self)
-
-
-class OrbbecDevice:
-    """An Orbbec camera, by its library."""
-
-    def __init__(self, library: Any, video: Orbbec) -> None:
-        self._ob, self._video = library, video
-        self.errors: tuple[type[Exception], ...] = (library.OBError, RuntimeError)
-        self._pipeline: Any = None
-        self._color: Any = None  # the mode of the color stream
-        self._align = library.AlignFilter(align_to_stream=library.OBStreamType.COLOR_STREAM)
-
     def start(self) -> None:
-        ob, video = self._ob, self._video
+        ob = import_optional("pyorbbecsdk", "reads Orbbec cameras", "orbbec")
+        self.errors = (ob.OBError, RuntimeError)
+        self._align: Any = ob.AlignFilter(align_to_stream=ob.OBStreamType.COLOR_STREAM)
         devices = ob.Context().query_devices()
         if devices.get_count() == 0:
             raise RuntimeError("no device is connected")
-        serial = video.serial
-        device = devices.get_device_by_serial_number(serial) if serial else devices.get_device_by_index(0)
-        self._pipeline = ob.Pipeline(device)
-        self._color = self._mode(ob.OBSensorType.COLOR_SENSOR, ob.OBFormat.RGB, video.width, video.height)
+        device = devices.get_device_by_serial_number(self.serial) if self.serial else devices.get_device_by_index(0)
+        self._pipeline: Any = ob.Pipeline(device)
+        color_modes = self._pipeline.get_stream_profile_list(ob.OBSensorType.COLOR_SENSOR)
+        depth_modes = self._pipeline.get_stream_profile_list(ob.OBSensorType.DEPTH_SENSOR)
+        self._color = color_modes.get_video_stream_profile(self.width, self.height, ob.OBFormat.RGB, self.fps)
+        depth = depth_modes.get_video_stream_profile(0, 0, ob.OBFormat.Y16, self.fps)  # size 0 = any
         config = ob.Config()
         config.enable_stream(self._color)
-        config.enable_stream(self._mode(ob.OBSensorType.DEPTH_SENSOR, ob.OBFormat.Y16, 0, 0))
+        config.enable_stream(depth)
         config.set_frame_aggregate_output_mode(ob.OBFrameAggregateOutputMode.FULL_FRAME_REQUIRE)
+        self._brown_conrady = ob.OBCameraDistortionModel.BROWN_CONRADY
         self._pipeline.start(config)
-
-    def _mode(self, sensor: Any, pixels: Any, width: int, height: int) -> Any:
-        """A mode of a sensor; size 0 = any."""
-        modes = self._pipeline.get_stream_profile_list(sensor)
-        return modes.get_video_stream_profile(width, height, pixels, self._video.fps)
 
     def stop(self) -> None:
         self._pipeline.stop()
@@ -61,17 +47,15 @@ class OrbbecDevice:
     def wait(self) -> Any:
         return self._pipeline.wait_for_frames(WAIT_MS)
 
-    def calibration(self, images: Any) -> Calibration | None:
+    def calibrate(self, images: Any) -> Calibration | None:
         depth = images.get_depth_frame()
         if depth is None:  # only depth frames contain their unit
             return None
-        found = self._color.get_intrinsic()
+        found, lens = self._color.get_intrinsic(), self._color.get_distortion()
         camera = Camera(found.width, found.height, found.fx, found.fy, found.cx, found.cy)
-        lens = self._color.get_distortion()
         coefficients = (lens.k1, lens.k2, lens.p1, lens.p2, lens.k3, lens.k4, lens.k5, lens.k6)
-        distortion = self._video.distortion(coefficients, lens.model, self._ob.OBCameraDistortionModel.BROWN_CONRADY)
-        units = MILLIMETERS / depth.get_depth_scale()
-        return Calibration(camera, self._video.name, units, self._video.max_depth, distortion)
+        distortion = self.distortion(coefficients, lens.model, self._brown_conrady)
+        return Calibration(camera, self.name, MILLIMETERS / depth.get_depth_scale(), self.max_depth, distortion)
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)

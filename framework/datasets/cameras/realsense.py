@@ -9,7 +9,7 @@ import numpy as np
 
 from framework.data import Camera, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration
-from framework.datasets.cameras.device_frames import WAIT_MS, CameraDevice, DepthCamera
+from framework.datasets.cameras.device_frames import WAIT_MS, DepthCamera
 from framework.errors import import_optional
 
 
@@ -19,42 +19,30 @@ class RealSense(DepthCamera):
 
     brand = "RealSense"
 
-    def device(self) -> CameraDevice:
-        return RealSenseDevice(import_optional("pyrealsense2", "reads RealSense cameras", "realsense"), self)
-
-
-class RealSenseDevice:
-    """A RealSense camera, by its library."""
-
-    errors: tuple[type[Exception], ...] = (RuntimeError,)
-
-    def __init__(self, library: Any, video: RealSense) -> None:
-        self._rs, self._video = library, video
-        self._pipeline = library.pipeline()
-        self._align = library.align(library.stream.color)
-        self._profile: Any = None  # of the started pipeline
-
     def start(self) -> None:
-        rs, video, config = self._rs, self._video, self._rs.config()
-        if video.serial:
-            config.enable_device(video.serial)
-        config.enable_stream(rs.stream.depth, video.width, video.height, rs.format.z16, video.fps)
-        config.enable_stream(rs.stream.color, video.width, video.height, rs.format.rgb8, video.fps)
-        self._profile = self._pipeline.start(config)
+        self._rs = rs = import_optional("pyrealsense2", "reads RealSense cameras", "realsense")
+        self._pipeline: Any = rs.pipeline()
+        self._align: Any = rs.align(rs.stream.color)
+        config = rs.config()
+        if self.serial:
+            config.enable_device(self.serial)
+        config.enable_stream(rs.stream.depth, self.width, self.height, rs.format.z16, self.fps)
+        config.enable_stream(rs.stream.color, self.width, self.height, rs.format.rgb8, self.fps)
+        self._profile: Any = self._pipeline.start(config)
 
     def stop(self) -> None:
         self._pipeline.stop()
 
     def wait(self) -> Any:
-        there, images = self._pipeline.try_wait_for_frames(WAIT_MS)
-        return images if there else None
+        received, images = self._pipeline.try_wait_for_frames(WAIT_MS)
+        return images if received else None
 
-    def calibration(self, images: Any) -> Calibration:
+    def calibrate(self, images: Any) -> Calibration:
         found = self._profile.get_stream(self._rs.stream.color).as_video_stream_profile().get_intrinsics()
         camera = Camera(found.width, found.height, found.fx, found.fy, found.ppx, found.ppy)
         unit = self._profile.get_device().first_depth_sensor().get_depth_scale()
-        distortion = self._video.distortion(found.coeffs, found.model, self._rs.distortion.brown_conrady)
-        return Calibration(camera, self._video.name, 1 / unit, self._video.max_depth, distortion)
+        distortion = self.distortion(found.coeffs, found.model, self._rs.distortion.brown_conrady)
+        return Calibration(camera, self.name, 1 / unit, self.max_depth, distortion)
 
     def read(self, images: Any) -> tuple[UInt8 | None, UInt16 | None]:
         registered = self._align.process(images)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import logging
 import math
-import re
 import zlib
 from abc import abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import pairwise
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from framework.config.validation import require
-from framework.data import Array, Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
+from framework.data import Camera, Float32, Float64, Frame, FrameTruth, UInt8, UInt16
 from framework.datasets.calibration.raw_images import Calibration, check_max_depth
 from framework.datasets.calibration.undistortion import Distortion
 from framework.datasets.frames.conventions import DepthReading, PoseReading
@@ -157,15 +156,14 @@ class Recording(RGBDSequence):
         return self.calibration.depth(images.depth(), images.depth_name)
 
     def _check_first_image(self) -> None:
-        """Raise DataError for a first image of the wrong size: all others would be skipped one by one."""
+        """Raise FrameError for a first image of the wrong size: all others would be skipped one by one."""
         images = self.contents.frames[self.chosen[0]].images
         for name, read in ((images.color_name, images.color), (images.depth_name, images.depth)):
             try:
                 shape = read().shape
             except FrameError:
                 continue  # damaged or of a wrong type: counted when the frame is read
-            if fault := self.calibration.fault_of_size(name, shape):
-                raise DataError(fault)
+            self.calibration.check_size(name, shape)
 
 
 def delay_poses(frames: Sequence[RecordedFrame], delay: int) -> Sequence[RecordedFrame]:
@@ -241,74 +239,3 @@ def choose_frames(
     kept = max(1, round(frame_fraction * len(chosen)))
     order = np.random.default_rng([seed, _STREAM]).permutation(len(chosen))
     return tuple(chosen[k] for k in np.sort(order[:kept]).tolist())
-
-
-def numbered_images(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Return the folder's images by the number at the end of their names, in ascending order.
-
-    Raises DataError if there is none, a name has no number, two have the same, or the names differ in other digits
-    as well, such as the decimals of a time.
-    """
-    if not folder.is_dir():
-        raise DataError(f"the folder {folder} is missing")
-    files: dict[int, Path] = {}
-    for path in sorted(folder.iterdir()):
-        if path.suffix.lower() not in suffixes or path.name.startswith("."):
-            continue
-        number = number_of(path)
-        if number is None:
-            raise DataError(f"{path}: the file name must end in the frame's number, like 000000{path.suffix}")
-        if number in files:
-            raise DataError(f"{path} and {files[number].name} have the same frame number {number}")
-        files[number] = path
-    check_one_number(list(files.values()))
-    if not files:
-        raise DataError(f"{folder} holds no image ({', '.join(suffixes)})")
-    return dict(sorted(files.items()))
-
-
-def paired_images(
-    colors: Mapping[int, Path],
-    depths: Mapping[int, Path],
-    color_name: Callable[[int], Path],
-    depth_name: Callable[[int], Path],
-) -> dict[int, StoredImages]:
-    """Return the images of each frame by its number. Reading a missing one raises FrameError."""
-    return {
-        k: StoredImages.of_files(colors.get(k) or color_name(k), depths.get(k) or depth_name(k))
-        for k in sorted(colors.keys() | depths.keys())
-    }
-
-
-def first_size(paths: Iterable[Path], read: Callable[[Path], Array]) -> tuple[int, int]:
-    """Return (width, height) in px of the first image that can be read. Raises DataError if none can."""
-    errors = []
-    for path in paths:
-        try:
-            height, width = read(path).shape[:2]
-        except FrameError as error:
-            errors.append(str(error))
-            continue
-        return width, height
-    raise DataError(f"no image can be read: {errors[0]}")
-
-
-def number_of(path: Path) -> int | None:
-    """Return the number at the end of an image's name, or None without one."""
-    digits = path.stem[len(_before_number(path)) :]
-    return int(digits) if digits else None
-
-
-def check_one_number(files: Sequence[Path]) -> None:
-    """Raise DataError if the names of images differ in more than the number at their end."""
-    for path in files:
-        before, of_first = _before_number(path), _before_number(files[0])
-        if before != of_first and re.search("[0-9]", before + of_first):
-            raise DataError(
-                f"{path.parent}: {files[0].name} and {path.name} differ in more than one number; number the frames in "
-                "their order, 000000.png, 000001.png ..."
-            )
-
-
-def _before_number(path: Path) -> str:
-    return path.stem.rstrip("0123456789")

@@ -39,51 +39,39 @@ def fuse_scene_truth(
     two equal ones, and the mean of the points that voted for it. Points are in the order in which their voxels were
     first seen. Memory depends on the surface, not on the number of views.
     """
-    table = _VoteTable()
+    slots, taken = Slots.empty(INITIAL_CAPACITY), 0
     for view in views:
-        table.add(view, ground_truth_spacing)
-    points, ids = table.elect()
-    return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
-
-
-class _VoteTable:
-    """Votes for (voxel, instance id)."""
-
-    def __init__(self) -> None:
-        self.taken = 0
-        self.slots = Slots.empty(INITIAL_CAPACITY)
-
-    def add(self, view: LabeledDepth, ground_truth_spacing: float) -> None:
-        while 2 * (self.taken + view.depth.size) > len(self.slots.keys):  # at worst, each pixel needs a new slot
-            larger = Slots.empty(2 * len(self.slots.keys))
-            move_slots(self.slots, larger)
-            self.slots = larger
+        while 2 * (taken + view.depth.size) > len(slots.keys):  # at worst, each pixel needs a new slot
+            larger = Slots.empty(2 * len(slots.keys))
+            move_slots(slots, larger)
+            slots = larger
         camera = view.camera
-        self.taken = vote(
+        taken = vote(
             np.ascontiguousarray(view.depth),
             np.ascontiguousarray(view.instance_ids),
             np.array([camera.fx, camera.fy, camera.cx, camera.cy]),
             np.ascontiguousarray(view.T_world_camera),
             1.0 / ground_truth_spacing,
-            self.slots,
-            self.taken,
+            slots,
+            taken,
         )
-        if self.taken < 0:
+        if taken < 0:
             farthest = KEY_OFFSET * ground_truth_spacing
             raise DataError(f"ground truth: a point lies more than {farthest:.0f} m from the origin")
+    points, ids = _elect(slots)
+    return SceneTruth(points_world=points, instance_ids=ids, class_names=dict(class_names))
 
-    def elect(self) -> tuple[Float32, Int32]:
-        """Return each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
-        keys, ids, votes, sums, first = self.slots
-        taken = np.flatnonzero(votes)
-        best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]
-        voxel = keys[best_first]
-        is_best = np.ones(len(voxel), np.bool_)
-        is_best[1:] = voxel[1:] != voxel[:-1]
-        winners = best_first[is_best]
-        voxel_of_entry = np.cumsum(is_best) - 1
-        seen = np.full(len(winners), np.iinfo(np.int64).max)
-        np.minimum.at(seen, voxel_of_entry, first[best_first])
-        winners = winners[np.argsort(seen, kind="stable")]
-        points = sums[winners] / votes[winners, None]
-        return points.astype(np.float32), ids[winners]
+
+def _elect(slots: Slots) -> tuple[Float32, Int32]:
+    """Each voxel's mean point (V, 3) and majority id (V,), in the order of first sight."""
+    keys, ids, votes, sums, first = slots
+    taken = np.flatnonzero(votes)
+    best_first = taken[np.lexsort((ids[taken], -votes[taken], keys[taken]))]
+    voxel = keys[best_first]
+    is_best = np.ones(len(voxel), np.bool_)
+    is_best[1:] = voxel[1:] != voxel[:-1]
+    winners = best_first[is_best]
+    seen = np.minimum.reduceat(first[best_first], np.flatnonzero(is_best)) if len(winners) else winners
+    winners = winners[np.argsort(seen, kind="stable")]
+    points = sums[winners] / votes[winners, None]
+    return points.astype(np.float32), ids[winners]

@@ -24,15 +24,8 @@ import numpy as np
 
 from framework.data import Camera
 from framework.datasets.calibration.color_registration import ColorRegistration, registered_images
-from framework.datasets.frames.sequence_reader import (
-    FRAME_RATE,
-    Contents,
-    RecordedFrame,
-    StoredImages,
-    first_size,
-    numbered_images,
-    paired_images,
-)
+from framework.datasets.frames.numbered_images import first_size, numbered_images, paired_images
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, StoredImages
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording
 from framework.datasets.scannet.scannet_annotation import (
     FIRST_LABEL_TABLE,
@@ -122,9 +115,7 @@ def _exported_contents(folder: Path) -> Contents:
         _warn_of_parallax(intrinsic, read_matrix(extrinsics[0]), read_matrix(extrinsics[1]), depth_camera)
     with errors_of(intrinsic):
         registration = ColorRegistration(color_camera, depth_camera)
-    images = paired_images(
-        colors, depths, lambda k: folder / "color" / f"{k}.jpg", lambda k: folder / "depth" / f"{k}.png"
-    )
+    images = paired_images(colors, depths)
     frames = [_exported_frame(folder, k, registered_images(pair, registration)) for k, pair in images.items()]
     return Contents(depth_camera, intrinsic / "intrinsic_depth.txt", DEPTH_SCALE, frames)
 

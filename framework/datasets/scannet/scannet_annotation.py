@@ -59,8 +59,12 @@ def read_labeled_mesh(mesh: Path, segs: Path, aggregation: Path, nyu40: Mapping[
     present, segment_of_vertex = np.unique(segments, return_inverse=True)
     groups = read_aggregation(aggregation)
     spellings = _spellings(nyu40)
-    if nyu40:
-        _check_names(aggregation, groups, spellings)
+    strange = sorted({group.label for group in groups if _spelled(group.label, spellings) not in spellings})
+    if nyu40 and strange:
+        raise DataError(
+            f"{aggregation}: {', '.join(f'{label!r:.60}' for label in strange)}: in no label table; add a line to"
+            f" {LABEL_TABLE}, or put {FIRST_LABEL_TABLE} beside it, which has the names of ScanNet's first release"
+        )
     unlabeled = max((group.object_id + 2 for group in groups), default=1)
     instance_of_segment = np.full(len(present), unlabeled, np.int32)
     class_names: dict[int, str | None] = {}
@@ -135,15 +139,6 @@ def _spelled(label: str, spellings: Mapping[str, str]) -> str:
 
 def _letters(name: str) -> str:
     return re.sub(r"[\W_]", "", name)
-
-
-def _check_names(path: Path, groups: Sequence[SegGroup], spellings: Mapping[str, str]) -> None:
-    unknown = sorted({group.label for group in groups if _spelled(group.label, spellings) not in spellings})
-    if unknown:
-        raise DataError(
-            f"{path}: {', '.join(f'{label!r:.60}' for label in unknown)}: in no label table; add a line to"
-            f" {LABEL_TABLE}, or put {FIRST_LABEL_TABLE} beside it, which has the names of ScanNet's first release"
-        )
 
 
 def _group(where: str, group: Any) -> SegGroup:

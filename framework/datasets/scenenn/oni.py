@@ -1,23 +1,67 @@
-"""The frames of an OpenNI recording (.oni): color and depth, paired as by SceneNN's own play-back."""
+"""The frames of an OpenNI recording (.oni): color and depth, paired as by SceneNN's own play-back.
+
+OpenNI 2's C library plays the images. A damaged file can crash it.
+"""
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
+import os
 import signal
 from collections import deque
-from collections.abc import Generator, Iterable, Iterator, Mapping
-from contextlib import closing
+from collections.abc import Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from framework.data import UInt8, UInt16
 from framework.datasets.scenenn.oni_records import Images, OniContents, Stream, playable
-from framework.datasets.scenenn.openni import OniImage, play
-from framework.errors import DataError, InstanceMapError, errors_of
+from framework.errors import ConfigError, DataError, InstanceMapError, errors_of
 
 LARGEST_TIME_DIFFERENCE = 33_000  # us, of the two images of a frame, as in SceneNN's play-back
 WAITING = 30  # images of one stream that wait for the other, 1 s: the rest of the file may lack it
+LIBRARIES = ("libOpenNI2.so.0", "libOpenNI2.so", "libOpenNI2.dylib", "OpenNI2.dll")
+LONGEST_PATH = 255  # bytes, of OpenNI 2
+PATIENCE = 10_000  # ms without an image until the player counts as stuck
+
+# OniCAPI.h, OniCEnums.h and OniCProperties.h of OpenNI 2.2
+API_VERSION = 2002
+OK, TIME_OUT = 0, 102
+SENSORS = {Stream.DEPTH: 3, Stream.COLOR: 2}
+DEPTH_1_MM, DEPTH_100_UM, RGB888 = 100, 101, 200
+PLAYBACK_SPEED, PLAYBACK_REPEAT = 100, 101
+MANUAL = -1.0  # speed: images come on request, so that none is lost
+
+
+class _VideoMode(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_int) for name in ("pixel_format", "width", "height", "fps")]
+
+
+class _Frame(ctypes.Structure):
+    _fields_ = [
+        ("data_size", ctypes.c_int),
+        ("data", ctypes.c_void_p),
+        ("sensor", ctypes.c_int),
+        ("timestamp", ctypes.c_uint64),
+        *((name, ctypes.c_int) for name in ("index", "width", "height")),
+        ("mode", _VideoMode),
+        *((name, ctypes.c_int) for name in ("cropped", "crop_x", "crop_y", "stride")),
+    ]
+
+
+@dataclass(frozen=True)
+class OniImage:
+    """One image of a recording."""
+
+    stream: Stream
+    time: int  # us
+    pixels: npt.NDArray[Any]  # (H, W) uint16 mm of depth, 0 = no reading; (H, W, 3) uint8 RGB of color
 
 
 @dataclass(frozen=True)
@@ -100,3 +144,88 @@ def _deliver(sender: Connection, path: Path, streams: Mapping[Stream, Images]) -
         sender.send(error)
     except BrokenPipeError:
         return  # the receiver is closed
+
+
+def play(path: Path, streams: Mapping[Stream, Images]) -> Generator[OniImage]:
+    """Yield the images that OpenNI 2 finds in a file, up to the last of each stream, without damaged ones."""
+    openni = _library()
+    file = os.fsencode(path)
+    if len(file) > LONGEST_PATH:
+        raise DataError(f"OpenNI 2 takes paths of at most {LONGEST_PATH} bytes; move it")
+    with ExitStack() as stack:
+        _check(openni.oniInitialize(API_VERSION), openni, "OpenNI 2 does not start")
+        stack.callback(openni.oniShutdown)
+        device = ctypes.c_void_p()
+        _check(openni.oniDeviceOpen(file, ctypes.byref(device)), openni, "OpenNI 2 does not open it")
+        stack.callback(openni.oniDeviceClose, device)
+        for name, value in ((PLAYBACK_REPEAT, ctypes.c_int(False)), (PLAYBACK_SPEED, ctypes.c_float(MANUAL))):
+            status = openni.oniDeviceSetProperty(device, name, ctypes.byref(value), ctypes.sizeof(value))
+            _check(status, openni, "OpenNI 2 does not take a property of its play-back")
+        handles = []
+        for stream in Stream:
+            handle = ctypes.c_void_p()
+            status = openni.oniDeviceCreateStream(device, SENSORS[stream], ctypes.byref(handle))
+            _check(status, openni, f"OpenNI 2 finds no {stream.name.lower()} in it")
+            stack.callback(openni.oniStreamDestroy, handle)
+            handles.append(handle)
+        for handle in handles:
+            _check(openni.oniStreamStart(handle), openni, "OpenNI 2 does not play it")
+        yield from _images(openni, handles, streams)
+
+
+def _images(openni: Any, handles: Sequence[ctypes.c_void_p], streams: Mapping[Stream, Images]) -> Generator[OniImage]:
+    """The images of `handles`, which are in the order of Stream."""
+    waited = (ctypes.c_void_p * len(handles))(*handles)
+    last = dict.fromkeys(Stream, 0)
+    while any(last[stream] < streams[stream].last for stream in Stream):
+        which = ctypes.c_int()
+        status = openni.oniWaitForAnyStream(waited, len(handles), ctypes.byref(which), PATIENCE)
+        if status == TIME_OUT:
+            reached = ", ".join(f"{stream.name.lower()} {last[stream]} of {streams[stream].last}" for stream in Stream)
+            raise DataError(f"it is damaged, OpenNI 2 plays no further than {reached}")
+        _check(status, openni, "OpenNI 2 does not play it")
+        stream = list(Stream)[which.value]
+        frame = ctypes.POINTER(_Frame)()
+        status = openni.oniStreamReadFrame(handles[which.value], ctypes.byref(frame))
+        _check(status, openni, "OpenNI 2 does not play it")
+        try:
+            last[stream], time = frame.contents.index, frame.contents.timestamp
+            pixels = _pixels(stream, frame.contents)
+        finally:
+            openni.oniFrameRelease(frame)
+        if pixels is not None:
+            yield OniImage(stream, time, pixels)
+
+
+def _pixels(stream: Stream, frame: _Frame) -> npt.NDArray[Any] | None:
+    """A copy of the pixels; None if OpenNI delivers fewer than the image has."""
+    pixel_format, shape = frame.mode.pixel_format, (frame.height, frame.width)
+    if frame.data_size < frame.stride * frame.height:
+        return None
+    rows = np.frombuffer(ctypes.string_at(frame.data, frame.stride * frame.height), np.uint8).reshape(frame.height, -1)
+    if stream == Stream.COLOR and pixel_format == RGB888:
+        return rows[:, : 3 * frame.width].reshape(*shape, 3)
+    if stream == Stream.DEPTH and pixel_format in (DEPTH_1_MM, DEPTH_100_UM):
+        depth = np.ascontiguousarray(rows[:, : 2 * frame.width]).view(np.uint16)
+        return depth if pixel_format == DEPTH_1_MM else ((depth.astype(np.uint32) + 5) // 10).astype(np.uint16)
+    raise DataError(
+        f"OpenNI 2 gives {stream.name.lower()} in its pixel format {pixel_format};"
+        f" expected {RGB888} (RGB) for color, {DEPTH_1_MM} (1 mm) or {DEPTH_100_UM} (100 um) for depth"
+    )
+
+
+def _library() -> Any:
+    for name in LIBRARIES:
+        try:
+            openni = ctypes.CDLL(name)
+        except OSError:
+            continue
+        openni.oniGetExtendedError.restype = ctypes.c_char_p
+        return openni
+    raise ConfigError("OpenNI 2 is not installed: apt-get install libopenni2-0")
+
+
+def _check(status: int, openni: Any, failure: str) -> None:
+    if status != OK:
+        reason = " ".join((openni.oniGetExtendedError() or b"").decode(errors="replace").split())
+        raise DataError(f"{failure}: {reason or f'status {status}'}")

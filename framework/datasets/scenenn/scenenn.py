@@ -23,19 +23,11 @@ from pathlib import Path
 import numpy as np
 
 from framework.data import Camera
-from framework.datasets.frames.sequence_reader import (
-    FRAME_RATE,
-    Contents,
-    RecordedFrame,
-    StoredImages,
-    first_size,
-    numbered_images,
-    paired_images,
-)
+from framework.datasets.frames.numbered_images import first_size, numbered_images, paired_images
+from framework.datasets.frames.sequence_reader import FRAME_RATE, Contents, RecordedFrame, StoredImages
 from framework.datasets.ground_truth.labeled_mesh import LabeledMesh, LabeledRecording
-from framework.datasets.scenenn.intrinsics import read_intrinsics
+from framework.datasets.scenenn.scene_files import TrajectoryLog, read_intrinsics, read_timestamps, read_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import LARGEST_ID, Annotated, read_annotation
-from framework.datasets.scenenn.trajectory_log import TrajectoryLog, read_timestamps, read_trajectory_log
 from framework.detection.domain import RENDERED_ROOMS
 from framework.errors import DataError
 from framework.files.atomic_write import is_there, read_text
@@ -72,12 +64,7 @@ class SceneNN(LabeledRecording):
             self.domain = RENDERED_ROOMS
         number = self.folder.resolve().name
         colors = numbered_images(self.folder / "image", (".png", ".jpg", ".jpeg"))
-        images = paired_images(
-            colors,
-            numbered_images(self.folder / "depth", (".png",)),
-            lambda k: self.folder / "image" / f"image{k:05d}.png",
-            lambda k: self.folder / "depth" / f"depth{k:05d}.png",
-        )
+        images = paired_images(colors, numbered_images(self.folder / "depth", (".png",)))
         log_file = self.folder / "trajectory.log"
         poses = read_trajectory_log(log_file) if is_there(log_file) else None
         times = _optional_times(self.folder / "timestamp.txt", list(images))

@@ -25,8 +25,6 @@ CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 IMU, TRANSFORMS = "sensor_msgs/msg/Imu", "tf2_msgs/msg/TFMessage"
 ODOMETRY, POSE = "nav_msgs/msg/Odometry", "geometry_msgs/msg/PoseStamped"
 
-TRANSFORMS_DEFINITION = "geometry_msgs/TransformStamped[] transforms"
-
 COLOR_CHANNELS = {  # of 8 bits: their number, and the indices of R, G, B
     "rgb8": (3, (0, 1, 2)),
     "bgr8": (3, (2, 1, 0)),
@@ -63,7 +61,8 @@ class RosBag:
         self._is_ros1 = path.suffix.lower() == ".bag"
         self._types = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if self._is_ros1 else typesys.Stores.LATEST)
         if TRANSFORMS not in self._types.types:  # rosbags lacks it in ROS 1
-            self._types.register(typesys.get_types_from_msg(TRANSFORMS_DEFINITION, TRANSFORMS))
+            definition = "geometry_msgs/TransformStamped[] transforms"
+            self._types.register(typesys.get_types_from_msg(definition, TRANSFORMS))
         try:
             self._reader = (rosbag1 if self._is_ros1 else rosbag2).Reader(path)
             self._reader.open()

@@ -5,7 +5,8 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import takewhile
+from pathlib import PurePosixPath
+from posixpath import commonpath
 
 from framework.errors import ConfigError, DataError
 from framework.importing.bags.ros_messages import CAMERA_INFO, COMPRESSED, IMAGE, ODOMETRY, POSE, RosBag
@@ -15,12 +16,8 @@ DEPTH = re.compile("depth", re.IGNORECASE)
 NEITHER = re.compile("infra|(^|/|_)ir(/|_|$)|disparity|confidence|mask|label|fisheye|theora|points", re.IGNORECASE)
 REGISTERED = re.compile("aligned|registered|to_color|to_rgb", re.IGNORECASE)  # depth in the color camera
 OPTIONS = {"color": "--color", "depth": "--depth", "camera_info": "--camera-info", "poses": "--poses"}
-KINDS = {
-    "color": (IMAGE, COMPRESSED),
-    "depth": (IMAGE, COMPRESSED),
-    "camera_info": (CAMERA_INFO,),
-    "poses": (ODOMETRY, POSE),
-}
+IMAGES, POSES = (IMAGE, COMPRESSED), (ODOMETRY, POSE)
+KINDS = {"color": IMAGES, "depth": IMAGES, "camera_info": (CAMERA_INFO,), "poses": POSES}
 
 
 @dataclass(frozen=True)
@@ -45,13 +42,13 @@ class Topics:
 
 def found_topics(bag: RosBag, given: Topics) -> Topics:
     """Return all topics, found if not given. Raises DataError or ConfigError, with the option, if none fits."""
-    images = [topic for topic in bag.topics(IMAGE, COMPRESSED) if not NEITHER.search(topic)]
+    images = [topic for topic in bag.topics(*IMAGES) if not NEITHER.search(topic)]
     depth = given.depth or _one(bag, "depth", [topic for topic in images if DEPTH.search(topic)], REGISTERED)
     color = given.color or _one(bag, "color", [topic for topic in images if not DEPTH.search(topic)], COLOR)
     info = given.camera_info or camera_info_of(bag, color)
     if not info:
         raise DataError(f"{bag.path} has no {CAMERA_INFO} beside {color}; name one with --camera-info")
-    posed = bag.topics(ODOMETRY, POSE)
+    posed = bag.topics(*POSES)
     if len(posed) > 1 and not given.poses:
         raise ConfigError(f"{bag.path} has several topics with poses: {', '.join(posed)}; choose one with --poses")
     topics = replace(given, color=color, depth=depth, camera_info=info, poses=given.poses or "".join(posed))
@@ -67,17 +64,13 @@ def found_topics(bag: RosBag, given: Topics) -> Topics:
 
 def camera_info_of(bag: RosBag, image: str) -> str:
     """Return the only CameraInfo, or the nearest to a topic of images in the tree of names; "" = there is none."""
-    shared = {topic: _shared(topic, image) for topic in bag.topics(CAMERA_INFO)}
+    infos = bag.topics(CAMERA_INFO)
+    folders = {topic: f"/{topic.strip('/').rpartition('/')[0]}" for topic in (image, *infos)}
+    shared = {topic: len(PurePosixPath(commonpath([folders[topic], folders[image]])).parts) for topic in infos}
     if len(shared) == 1:
         return next(iter(shared))
-    best = max(shared.values(), default=0)
-    return min((topic for topic, count in shared.items() if count == best), key=len) if best else ""
-
-
-def _shared(topic: str, other: str) -> int:
-    """The number of folders that two names have in common, from the left."""
-    pairs = zip(topic.strip("/").split("/")[:-1], other.strip("/").split("/")[:-1], strict=False)
-    return len(list(takewhile(lambda pair: pair[0] == pair[1], pairs)))
+    best = max(shared.values(), default=1)  # 1 = nothing but the root
+    return min((topic for topic, count in shared.items() if count == best), key=len) if best > 1 else ""
 
 
 def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Pattern[str]) -> str:
@@ -87,5 +80,5 @@ def _one(bag: RosBag, name: str, candidates: Sequence[str], preferred: re.Patter
     if len(left) == 1:
         return left[0]
     problem = f"several topics may be its {name}: {', '.join(left)}" if left else f"no topic can be its {name}"
-    existing = ", ".join(bag.topics(IMAGE, COMPRESSED)) or "none"
+    existing = ", ".join(bag.topics(*IMAGES)) or "none"
     raise ConfigError(f"{bag.path}: {problem}; choose one with {OPTIONS[name]}. Its topics of images: {existing}")

@@ -13,6 +13,7 @@ Corrected files are preferred. Up comes from the recorded poses: the world's y a
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,20 +24,10 @@ from framework.data import Float64
 from framework.datasets.calibration.camera_json import numbers_of, pinhole, read_json_object
 from framework.errors import DataError
 from framework.files.image_files import read_color, read_uint8, read_uint16
-from framework.importing.source import (
-    FAIRLY_SURE,
-    SURE,
-    UNSURE,
-    DeviceFrame,
-    Format,
-    Source,
-    arkit_pose,
-    arkit_up,
-    meters,
-)
+from framework.importing.source import DeviceFrame, Format, Source, arkit_pose, arkit_up, meters
 
 MICROSECONDS = 1e6  # per second
-HIGH = 255  # in the images of confidence
+LEVELS = (1, 255)  # in the images of confidence, of medium and high
 ROWS = [f"t_{row}{column}" for row in range(3) for column in range(4)]
 
 
@@ -51,7 +42,8 @@ def recognized(path: Path) -> bool:
 
 def open_source(path: Path) -> Source:
     folder = keyframes(path)
-    stems = sorted((entry.stem for entry in (folder / "cameras").glob("*.json") if _is_time(entry.stem)), key=int)
+    stems = [entry.stem for entry in (folder / "cameras").glob("*.json")]
+    stems = sorted((stem for stem in stems if re.fullmatch("[0-9]{1,18}", stem)), key=int)
     if not (folder / "depth").is_dir() or not stems:
         raise DataError(f"{path} has no depth/ or no cameras: Polycam keeps them with a LiDAR and in developer mode")
     frames = [partial(_read, folder, stem) for stem in stems]
@@ -75,7 +67,7 @@ def _read(folder: Path, stem: str) -> DeviceFrame:
         camera=pinhole(camera, width, height, *numbers_of(camera, contents[camera], "fx", "fy", "cx", "cy")),
         color=color,
         depth=meters(read_uint16(depth)),
-        confidence=_levels(read_uint8(confidence)) if confidence.exists() else None,
+        confidence=np.digitize(read_uint8(confidence), LEVELS).astype(np.uint8) if confidence.exists() else None,
         T_world_camera=_pose(posed, contents[posed]),
         up=arkit_up(_pose(as_recorded, contents[as_recorded])),
     )
@@ -85,14 +77,6 @@ def _pose(path: Path, content: dict[str, Any]) -> Float64:
     """T_world_camera (4, 4). Raises DataError, with the file."""
     rows = np.reshape(numbers_of(path, content, *ROWS), (3, 4))
     return arkit_pose(path, np.vstack([rows, [[0, 0, 0, 1]]]))
-
-
-def _levels(stored: np.typing.NDArray[np.uint8]) -> np.typing.NDArray[np.uint8]:
-    return np.where(stored == 0, UNSURE, np.where(stored == HIGH, SURE, FAIRLY_SURE)).astype(np.uint8)
-
-
-def _is_time(stem: str) -> bool:
-    return stem.isascii() and stem.isdigit() and len(stem) <= 18
 
 
 FORMAT = Format("polycam", "a folder with keyframes/, Polycam's raw data", recognized, open_source)

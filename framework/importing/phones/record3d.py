@@ -41,6 +41,9 @@ BYTES_A_BLOCK = 20_000  # of an image, at least; the compressor ends a block aft
 UNTURNED = 1e-3  # sine of half the angle: a hand-held phone is never so exactly along the axes of the world
 MOST_BLOCKS = 8  # more than these: each may unpack to 27 MB, whatever it claims
 
+_load_openexr = partial(import_optional, "OpenEXR", "reads Record3D's depth", "phone")
+_load_lzfse = partial(import_optional, "lzfse", "unpacks Record3D's .r3d files", "phone")
+
 
 def open_folder(path: Path) -> Source:
     _load_openexr()
@@ -82,7 +85,7 @@ class ExrFolder:
 
 
 class R3dFile:
-    """The images of an .r3d file, by the number of the frame. Reading raises DataError."""
+    """The images of an .r3d file, with the methods of `ExrFolder`."""
 
     def __init__(self, path: Path) -> None:
         """Raises DataError, with the file, if it is no zip."""
@@ -94,21 +97,17 @@ class R3dFile:
         self._members = set(self._zip.namelist())
 
     def color(self, number: int) -> UInt8:
-        """Return color (H, W, 3), RGB."""
         name = f"rgbd/{number}.jpg"
         return decode_color(f"{self.path}: {name}", self.read(name, LARGEST_FILE))
 
     def depth(self, number: int, shape: tuple[int, int]) -> Float32:
-        """Return depth (h, w) in m, 0 = no reading."""
         return readings(self._unpacked(f"rgbd/{number}.depth", "<f4", shape).astype(np.float32))
 
     def confidence(self, number: int, shape: tuple[int, int]) -> UInt8 | None:
-        """Return the confidence (h, w) of depth, 0 to 2; None = not known."""
         name = f"rgbd/{number}.conf"
         return np.asarray(self._unpacked(name, "u1", shape), np.uint8) if name in self._members else None
 
     def name(self, number: int) -> str:
-        """Return the place of a frame, for messages."""
         return f"{self.path}: rgbd/{number}.depth"
 
     def read(self, name: str, most: int) -> bytes:
@@ -234,14 +233,6 @@ def _read_exr(path: Path, data: bytes, shape: tuple[int, int]) -> np.typing.NDAr
     if image.shape != shape or image.dtype not in (np.float16, np.float32):
         raise FrameError(f"{path} must hold floats, found {image.dtype}")
     return np.asarray(image, np.float32)
-
-
-def _load_openexr() -> Any:
-    return import_optional("OpenEXR", "reads Record3D's depth", "phone")
-
-
-def _load_lzfse() -> Any:
-    return import_optional("lzfse", "unpacks Record3D's .r3d files", "phone")
 
 
 def _is_export(path: Path) -> bool:

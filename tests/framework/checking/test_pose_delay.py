@@ -45,9 +45,7 @@ def pairs_of(true: Sequence[Float64], stored: Sequence[Float64 | None], noise: f
         pixels = project(CAMERA, points).astype(np.float32)
         moved = project(CAMERA, transform(T_second_first, points)) + chosen.normal(scale=noise, size=(60, 2))
         pairs.append(
-            MatchedPair(
-                first, second, step, points.astype(np.float32), pixels, moved.astype(np.float32), T_second_first
-            )
+            MatchedPair(first, second, points.astype(np.float32), pixels, moved.astype(np.float32), T_second_first)
         )
     return pairs
 

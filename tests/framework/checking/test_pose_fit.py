@@ -30,7 +30,7 @@ def pair(
     first, second = (Frame(k, k / 30, *BLANK, CAMERA, stored(T)) for k, T in enumerate((T_world_first, T_world_second)))
     pixels = project(CAMERA, points).astype(np.float32)
     moved = project(CAMERA, transform(T_second_first, points)).astype(np.float32)
-    return MatchedPair(first, second, 1, points.astype(np.float32), pixels, moved, T_second_first)
+    return MatchedPair(first, second, points.astype(np.float32), pixels, moved, T_second_first)
 
 
 def walk(seed: int, pan_only: bool = False) -> list[Float64]:

@@ -16,9 +16,9 @@ from framework.config.composition import composed
 from framework.data import Camera
 from framework.datasets.scannet.scannet import ScanNet
 from framework.datasets.scannet.scannet_annotation import read_aggregation
-from framework.datasets.scenenn.intrinsics import write_intrinsics
 from framework.datasets.scenenn.oni import read_frames
 from framework.datasets.scenenn.oni_records import Stream, read_contents
+from framework.datasets.scenenn.scene_files import write_intrinsics
 from framework.datasets.seven_scenes import BASELINE, COLOR_CAMERA, SevenScenes, register
 from framework.datasets.tum_rgbd import PUBLISHED, Intrinsics, TumRgbd
 from framework.errors import DataError, FrameError

@@ -14,9 +14,8 @@ from framework.api import load_map
 from framework.datasets.calibration.camera_json import read_json_object
 from framework.datasets.scannet.scannet_annotation import read_label_table
 from framework.datasets.scannet.sens_file import open_sens
-from framework.datasets.scenenn.intrinsics import read_intrinsics
+from framework.datasets.scenenn.scene_files import read_intrinsics, read_timestamps, read_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import read_annotation
-from framework.datasets.scenenn.trajectory_log import read_timestamps, read_trajectory_log
 from framework.detection.mask_rcnn.checkpoint import read_network
 from framework.detection.mask_rcnn.detectron2_checkpoint import read_pickle
 from framework.detection.stored.coco_results import CategoryIds, read_results

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from framework.data import check_rigid
+from framework.datasets.scenenn.scene_files import read_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import read_annotation
-from framework.datasets.scenenn.trajectory_log import read_trajectory_log
 from framework.errors import ConfigError
 from framework.files.image_files import read_color, read_uint16
 from framework.files.ply import PlyMesh, read_ply

@@ -8,7 +8,7 @@ import pytest
 
 from framework.commands.recordings import convert_oni
 from framework.datasets.scenenn.oni import OniFrame
-from framework.datasets.scenenn.trajectory_log import read_timestamps
+from framework.datasets.scenenn.scene_files import read_timestamps
 from framework.errors import DataError
 from tests.framework.datasets.scenenn.test_oni import colors, depths, played, recording
 from tests.support.recordings.oni_file import OniFile

@@ -35,10 +35,10 @@ def test_the_distortion_of_a_lens() -> None:
 
 @pytest.mark.parametrize("value", [0.1, [0.1, 0.2, 0, 0], [0.1] * 8, {"k1": 0.1}, None])
 def test_a_distortion_of_other_than_five_numbers_is_refused(value: object) -> None:
-    with pytest.raises(DataError, match=r"c\.json: distortion must be \[k1, k2, p1, p2, k3\], found"):
+    with pytest.raises(DataError, match=r"c\.json: distortion \[k1, k2, .* must be a list of 5 numbers, found"):
         distortion_of(Path("c.json"), {"distortion": value})
 
 
-def test_a_coefficient_that_is_no_number_is_named() -> None:
-    with pytest.raises(DataError, match=r"c\.json: distortion\[2\] must be a number"):
+def test_coefficient_that_is_text_is_refused() -> None:
+    with pytest.raises(DataError, match=r"c\.json: distortion .* 5 numbers, found .*'0\.2'"):
         distortion_of(Path("c.json"), {"distortion": [0.1, 0, "0.2", 0, 0]})

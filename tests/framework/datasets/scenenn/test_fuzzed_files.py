@@ -17,9 +17,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from framework.datasets.scenenn.intrinsics import read_intrinsics
+from framework.datasets.scenenn.scene_files import read_intrinsics, read_timestamps, read_trajectory_log
 from framework.datasets.scenenn.scenenn_annotation import read_annotation
-from framework.datasets.scenenn.trajectory_log import read_timestamps, read_trajectory_log
 from framework.files.image_files import read_color, read_uint16
 from framework.files.ply import read_ply
 from tests.support.recordings.damaged_files import EXAMPLES, check, damaged

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from framework.data import Camera
-from framework.datasets.scenenn.intrinsics import read_intrinsics, write_intrinsics
+from framework.datasets.scenenn.scene_files import read_intrinsics, write_intrinsics
 from framework.errors import DataError
 
 ASUS = (544.47329, 544.47329, 320.0, 240.0)

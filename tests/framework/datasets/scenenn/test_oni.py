@@ -6,10 +6,9 @@ import signal
 import numpy as np
 import pytest
 
-from framework.datasets.scenenn import oni, openni
-from framework.datasets.scenenn.oni import LARGEST_TIME_DIFFERENCE, WAITING, pair, read_frames
+from framework.datasets.scenenn import oni
+from framework.datasets.scenenn.oni import LARGEST_TIME_DIFFERENCE, LIBRARIES, WAITING, OniImage, pair, read_frames
 from framework.datasets.scenenn.oni_records import Images, Stream, read_contents
-from framework.datasets.scenenn.openni import LIBRARIES, OniImage
 from framework.errors import ConfigError, DataError
 from tests.support.recordings.oni_file import COLOR, DEPTH, YUV422, Node, OniFile, crash
 
@@ -64,7 +63,7 @@ def test_openni_unpacks_its_codecs(tmp_path):
 
 @played
 def test_depth_in_tenths_of_a_millimetre_is_rounded_to_millimetres(tmp_path):
-    frames = frames_of(OniFile(recording(pixel_format=openni.DEPTH_100_UM)).write(tmp_path / "a.oni"))
+    frames = frames_of(OniFile(recording(pixel_format=oni.DEPTH_100_UM)).write(tmp_path / "a.oni"))
     expected = np.floor(np.array(depths()) / 10 + 0.5)
     np.testing.assert_array_equal([frame.depth_mm for frame in frames], expected)
 
@@ -90,11 +89,11 @@ def test_other_pixels_than_depth_and_rgb_are_refused(tmp_path):
 
 @played
 def test_a_player_that_is_stuck_is_not_waited_for(tmp_path, monkeypatch):
-    monkeypatch.setattr(openni, "PATIENCE", 200)
+    monkeypatch.setattr(oni, "PATIENCE", 200)
     path = OniFile(recording()).write(tmp_path / "a.oni")
     streams = {stream: Images(node=1, count=9, last=9) for stream in Stream}
     with pytest.raises(DataError, match="OpenNI 2 plays no further than depth 4 of 9, color 4 of 9"):
-        list(openni.play(path, streams))
+        list(oni.play(path, streams))
 
 
 def test_a_player_that_crashes_is_an_error_of_one_line(tmp_path, monkeypatch):
@@ -106,19 +105,19 @@ def test_a_player_that_crashes_is_an_error_of_one_line(tmp_path, monkeypatch):
 
 
 def test_without_openni_the_package_is_named(tmp_path, monkeypatch):
-    monkeypatch.setattr(openni, "LIBRARIES", ("libNotThere.so",))
+    monkeypatch.setattr(oni, "LIBRARIES", ("libNotThere.so",))
     with pytest.raises(ConfigError, match="OpenNI 2 is not installed: apt-get install libopenni2-0"):
-        next(openni.play(tmp_path / "a.oni", {}))
+        next(oni.play(tmp_path / "a.oni", {}))
 
 
 @played
 def test_a_path_that_openni_would_cut_is_refused(tmp_path):
     with pytest.raises(DataError, match="paths of at most 255 bytes"):
-        next(openni.play(tmp_path / ("a" * 250 + ".oni"), {}))
+        next(oni.play(tmp_path / ("a" * 250 + ".oni"), {}))
 
 
 def image(stream, time, shape=(2, 3)):
-    return OniImage(stream, 1, time, np.zeros(shape))
+    return OniImage(stream, time, np.zeros(shape))
 
 
 def times_of(frames):

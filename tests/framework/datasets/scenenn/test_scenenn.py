@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from framework.data import Camera
-from framework.datasets.scenenn.intrinsics import write_intrinsics
+from framework.datasets.scenenn.scene_files import write_intrinsics, write_timestamps, write_trajectory_log
 from framework.datasets.scenenn.scenenn import SceneNN, SceneNNSensor
 from framework.datasets.scenenn.scenenn_annotation import Annotated, write_annotation
-from framework.datasets.scenenn.trajectory_log import write_timestamps, write_trajectory_log
 from framework.errors import DataError, FrameError
 from framework.files.ply import write_ply
 

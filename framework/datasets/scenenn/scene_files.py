@@ -1,12 +1,14 @@
-"""SceneNN's files with poses and times.
+"""SceneNN's text files: poses, times and intrinsics.
 
 trajectory.log      each frame: a header of three integers, four rows of T_world_camera in meters
 timestamp.txt       each frame: its number (from 1), the times of color and depth in microseconds
+asus.ini            lines of a key and a value: fx, fy, cx, cy
 """
 
 from __future__ import annotations
 
 import math
+import re
 from codecs import BOM_UTF8
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from framework.data import Float64, check_rigid
+from framework.data import Camera, Float64, check_rigid
 from framework.errors import DataError
 from framework.files.atomic_write import MOST_TEXT, read_bytes, written_whole
 from framework.files.number_lines import SHOWN, number, read_lines
@@ -25,6 +27,10 @@ LARGEST_FRAME = 2**31 - 2  # frame+1 is an int32 as well
 BLOCK = 5  # lines of a frame
 LAST_ROW = "0.000000 0.000000 0.000000 1.000000"  # as in the published files
 MICROSECONDS = 1e6  # per second
+INTRINSICS = ("fx", "fy", "cx", "cy")  # px
+SIZES = {"cx": "depth_width", "cy": "depth_height"}  # px, whose half replaces a missing center
+POSITIVE = {"fx", "fy", *SIZES.values()}
+LARGEST_INTRINSICS = 2**20  # bytes; of a file of intrinsics, which has some hundred
 
 
 @dataclass(frozen=True)
@@ -152,3 +158,44 @@ def write_timestamps(path: Path, times: Mapping[int, float], color_times: Mappin
         for image, time in times.items():
             color_time = time if color_times is None else color_times[image]
             file.write(f"{image} {round(color_time * MICROSECONDS)} {round(time * MICROSECONDS)}\n")
+
+
+def read_intrinsics(path: Path) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy in px, from lines `key value`, `key = value` or `key: value`.
+
+    Keys may be in upper case; comments (# or ;), section headers and other keys are ignored. Without cx or cy, half of
+    depth_width or depth_height is used, as in ethz-asl/scenenn_to_rosbag. Raises DataError, with the file and the line,
+    if a key is missing or repeated, or its value is not finite, or not positive for focal lengths and sizes.
+    """
+    values: dict[str, float] = {}
+    lines = read_bytes(path, LARGEST_INTRINSICS).removeprefix(BOM_UTF8).decode("latin-1").splitlines()
+    for n, line in enumerate(lines, start=1):
+        content = re.split("[#;]", line)[0].strip()
+        key, text = (*re.split(r"\s*[=:]\s*|\s+", content.lower(), maxsplit=1), "")[:2]
+        if key not in POSITIVE and key not in INTRINSICS:
+            continue
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value) or (key in POSITIVE and value <= 0):
+            wanted = "a positive number" if key in POSITIVE else "a number"
+            raise DataError(f"{path}, line {n}: {key} must be {wanted} of pixels, found {text[:40]!r}")
+        if key in values:
+            raise DataError(f"{path}, line {n}: {key} is there a second time")
+        values[key] = value
+    for center, size in SIZES.items():
+        if size in values:
+            values.setdefault(center, values[size] / 2)
+    missing = [key for key in INTRINSICS if key not in values]
+    if missing:
+        raise DataError(f"{path} has no line with {missing[0]}; it must give {', '.join(INTRINSICS)}")
+    return values["fx"], values["fy"], values["cx"], values["cy"]
+
+
+def write_intrinsics(path: Path, camera: Camera) -> None:
+    """Write the camera's intrinsics atomically, without loss of digits."""
+    sizes = {"depth_width": camera.width, "depth_height": camera.height}
+    values = sizes | {key: getattr(camera, key) for key in INTRINSICS}
+    with written_whole(path) as temporary:
+        temporary.write_text("".join(f"{key} {value!r}\n" for key, value in values.items()), encoding="ascii")

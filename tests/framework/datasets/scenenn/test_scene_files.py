@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from framework.data import check_rigid
-from framework.datasets.scenenn.trajectory_log import read_trajectory_log, write_trajectory_log
+from framework.datasets.scenenn.scene_files import read_trajectory_log, write_trajectory_log
 from framework.errors import DataError
 from framework.geometry import exp_se3
 
