@@ -60,7 +60,7 @@ class Quantization(NamedTuple):
     zero_point: int
 
     def quantize(self, x: Tensor) -> Tensor:
-        """Return x (N, C, H W) on the CPU as uint8, rounded to nearest."""
+        """Return x (N, C, H, W) on the CPU as uint8, rounded to nearest."""
         channels_last = x.permute(0, 2, 3, 1).contiguous()
         rounded = torch.empty_like(channels_last, dtype=torch.uint8)
         flat = channels_last.numpy().reshape(-1), rounded.numpy().reshape(-1)

@@ -74,7 +74,7 @@ def read_mask_folder(folder: Path, labels: Sequence[str]) -> list[StoredDetectio
                 )
     alone = [path for path in sorted(folder.glob("*.json")) if not path.with_suffix(".png").exists()]
     if alone:
-        raise DataError(f"{alone[0]} has no image {alone[0].stem}.png beside it")
+        raise DataError(f"{alone[0]} has no image {alone[0].stem}.png next to it")
     return found
 
 
