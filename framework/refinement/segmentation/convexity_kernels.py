@@ -84,16 +84,6 @@ def _add_offset(
         see[c] += we * e
 
 
-@njit(cache=True, nogil=True)
-def _gates(inverse: Float32, noise: Noise, slope: np.float32, gate: Float32, gate_slope: Float32) -> None:
-    """Set the tolerance of inverse depth at a row's cells: by noise, and per cell of distance."""
-    for c in range(len(inverse)):
-        d = inverse[c]
-        if d > 0:
-            gate[c] = _noise_at(d, noise)
-            gate_slope[c] = slope * d
-
-
 @njit(cache=True, nogil=True, parallel=True)
 def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -> Float32:
     """Return (4, rows, columns) a, b, c of inverse depth a x + b y + c around each cell, and its mean squared residual.
@@ -104,8 +94,10 @@ def fit_planes(inverse: Float32, window: int, noise: Noise, slope: np.float32) -
     fits = np.zeros((4, rows, columns), np.float32)
     for row in prange(rows):
         r = int(np.int64(row))  # prange counts in unsigned numbers
-        gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-        _gates(inverse[r], noise, slope, gate, gate_slope)
+        gate, gate_slope = np.zeros(columns, np.float32), np.zeros(columns, np.float32)  # noise, and slope per cell
+        for c in range(columns):
+            if inverse[r, c] > 0:
+                gate[c], gate_slope[c] = _noise_at(inverse[r, c], noise), slope * inverse[r, c]
         sums = np.zeros((10, columns), np.float32)
         for dy in range(-window, window + 1):
             for dx in range(-window, window + 1):
